@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from crossgrad_core.commands import RunConfig, UserError, configured
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
+from crossgrad_plugins.compare.load_runs import without_length
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.settings import ABSENT, Settings, settings_of
-from crossgrad_plugins.compare.source import without_length
 from crossgrad_plugins.sweep.best import LENGTHS
 from crossgrad_plugins.sweep.grid import Choice, Grid
 from crossgrad_plugins.sweep.layout import Layout
@@ -71,7 +71,7 @@ class Asked:
         if asked.max_views is None:
             return found.get("steps") == asked.steps
         # A run writes a length in views down in steps.
-        views = ViewPlan.parsed(str(found.get("views_per_step") or 1))
+        views = ViewsPerStepSpec.parsed(str(found.get("views_per_step") or 1))
         return asked.max_views == found.get("max_views") or (
             views.steps_of(asked.max_views) == found.get("steps")
         )

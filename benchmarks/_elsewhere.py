@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from crossgrad_core.commands import UserError, configured, fingerprint, read_scene, write_atomically
-from crossgrad_core.run.afterwards import figures
-from crossgrad_core.run.afterwards.how import How
+from crossgrad_core.run.postprocess import evaluate
+from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.scene.fingerprint import mark_of
 from crossgrad_core.system.text_files import read_json
@@ -135,9 +135,9 @@ class Table:
         print(folder, file=sys.stderr, flush=True)
         how = How(threads=1)
         if self.file:
-            result = figures.evaluated_file(folder, folder / PLY, how, on)[0]
+            result = evaluate.evaluated_file(folder, folder / PLY, how, on)[0]
         else:
-            result = figures.evaluated_on(folder, on, how)[0]
+            result = evaluate.evaluated_on(folder, on, how)[0]
         write_per_view(folder, result, self.path.name)
         origin = {**self._wanted(), "table": _digest(self.path)}
         write_atomically(self.path.with_suffix(".json"), f"{json.dumps(origin)}\n".encode())

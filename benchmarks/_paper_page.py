@@ -10,9 +10,9 @@ from _paper_runs import CAMERAS, Results, number, probe_rows, probed
 from _paper_verdicts import PSNR, Answer, Outcome, answers, figure_of, paired
 
 from crossgrad_plugins.compare.contrasts import judged
+from crossgrad_plugins.compare.narrative import claim
 from crossgrad_plugins.compare.ranking import noise, standings
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.words import claim
 
 #: Arms whose runs carry probes of the gradients.
 WATCHED = ("one view, 2x stretched", "symmetric")

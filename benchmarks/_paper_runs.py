@@ -12,8 +12,8 @@ from _paper_data import Reading
 from crossgrad_core.commands import find_runs, read_rows
 from crossgrad_plugins.compare.checks.scenes import check_scenes
 from crossgrad_plugins.compare.contrasts import Runs
+from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.sweep.grid import Grid, choices, scene_name
 
 #: Rows of diagnostics.csv that join blocks.

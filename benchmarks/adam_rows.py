@@ -17,7 +17,7 @@ import torch
 from _machine import facts
 
 from crossgrad_core.contract.adam_state import AdamRule, AdamState
-from crossgrad_core.gradients.by_rows import by_rows
+from crossgrad_core.gradients.sparse_rows import sparse_rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
@@ -43,7 +43,7 @@ def milliseconds(count: int, share: float, most: float, reps: int) -> float:
         start = perf_counter()
         rows_late.catch_up("x", param, state, rows[own].to(torch.int32))
         step = counted("x", param, state, 1e-3, AdamRule(), 1.0)
-        rows_late.step("x", param, by_rows(rows[own], values[own], param.shape), state, step)
+        rows_late.step("x", param, sparse_rows(rows[own], values[own], param.shape), state, step)
         times.append(perf_counter() - start)
     return 1e3 * median(times[CHOICES:])
 

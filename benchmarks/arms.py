@@ -18,10 +18,10 @@ from _asked import of_earlier_grids, only
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.checks.scenes import check_scenes
 from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
+from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.narrative import verdict_text
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.source import read_runs
-from crossgrad_plugins.compare.words import verdict_text
 
 PSNR = Quantity.of("psnr")
 #: Overall, and the regimes as scenes call them.

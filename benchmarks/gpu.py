@@ -38,9 +38,9 @@ from scale import STEP, Cell, Run
 
 from crossgrad_core.commands import assemble, begin, configured, read_scene
 from crossgrad_core.run.results.reading import read_run
-from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.targets import target_at
+from crossgrad_core.training.rollback import RollbackGuard
+from crossgrad_core.training.view_target import target_at
 
 if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
@@ -101,8 +101,8 @@ class Short:
         torch.cuda.empty_cache()
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
-        setup.rasterizer.burn_in("cuda")
-        keeper = Keeper(state)  # A run holds a copy to which it can go back.
+        setup.rasterizer.self_test("cuda")
+        keeper = RollbackGuard(state)  # A run holds a copy to which it can go back.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)

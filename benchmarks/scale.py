@@ -235,12 +235,12 @@ class Run:
 
     def __init__(self, cell: Cell, **options: object) -> None:
         from crossgrad_core.commands import begin
-        from crossgrad_core.training.keeper import Keeper
+        from crossgrad_core.training.rollback import RollbackGuard
 
         self.setup = setup_of(cell, **options)
         self.state: TrainState = begin(self.setup)
         self.state.step = STEP
-        self.keeper = Keeper(self.state)
+        self.keeper = RollbackGuard(self.state)
 
     def step(self) -> tuple[float, float]:
         """Takes a step; seconds of the CPU and of the clock."""

@@ -93,7 +93,7 @@ class Trainer:
             for name, tensor in self.parameters.items()
         }
         gaussians = self.backbone.decode(tensors, camera, self.phase)
-        demand = OnDemand(frozenset(self.backbone.passed_on), self._bring)
+        demand = OnDemand(frozenset(self.backbone.passthrough), self._bring)
         gaussians = replace(gaussians, on_demand=demand)
         render = self.rasterizer.render(gaussians, camera, torch.zeros(3))
         yield "render"
@@ -107,18 +107,18 @@ class Trainer:
         yield "adam"
 
     def _bring(self, rows: Tensor | None) -> None:
-        for name in self.backbone.passed_on.values():
+        for name in self.backbone.passthrough.values():
             self.late.catch_up(name, self.parameters[name], self.state, rows)
 
     def _optimize(self) -> None:
         gradients = {name: tensor.grad for name, tensor in self.parameters.items()}
-        by_rows = {name: gradients.pop(name) for name in self.backbone.passed_on.values()}
+        sparse_rows = {name: gradients.pop(name) for name in self.backbone.passthrough.values()}
         moved = torch.empty_like(self.parameters["means"])
         tensors = {**self.parameters, "means": moved}
         adam_step(tensors, gradients, self.state, self.rates, from_zero={"means"})
         axes = [self.parameters[name] for name in self.backbone.axes]
         step_along_axes(self.parameters["means"], moved, *axes)
-        for name, gradient in by_rows.items():
+        for name, gradient in sparse_rows.items():
             if gradient is None:
                 continue
             param = self.parameters[name]

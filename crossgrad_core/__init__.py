@@ -12,7 +12,7 @@ from crossgrad_core.system.version import VERSION
 if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Camera
     from crossgrad_core.errors import RunFailedError, UserError
-    from crossgrad_core.run.door import resume, run
+    from crossgrad_core.run.api import resume, run
     from crossgrad_core.run.trained import Run, open  # noqa: A004
 
 __version__ = VERSION
@@ -24,7 +24,7 @@ _HOMES = {
     "RunFailedError": "crossgrad_core.errors",
     "UserError": "crossgrad_core.errors",
     "open": "crossgrad_core.run.trained",
-    "resume": "crossgrad_core.run.door",
+    "resume": "crossgrad_core.run.api",
 }
 
 __all__ = ["Camera", "Run", "RunFailedError", "UserError", "__version__", "open", "resume", "run"]

@@ -22,6 +22,7 @@ from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_
 from crossgrad_core.registry.strays import Stray, strays
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
+from crossgrad_core.system.check_writable import check_file, check_folder, check_new
 from crossgrad_core.system.checksums import (
     changed_files,
     check_unchanged,
@@ -36,15 +37,14 @@ from crossgrad_core.system.files import (
     text_bytes,
     write_atomically,
 )
-from crossgrad_core.system.grouped import GroupedCommand
-from crossgrad_core.system.interrupts import exit_code, listened_to, tell, way_on
+from crossgrad_core.system.help_groups import GroupedCommand
+from crossgrad_core.system.interrupts import exit_code, resume_hint, signal_names, tell
 from crossgrad_core.system.progress import Progress
 from crossgrad_core.system.startup import announce, finish
 from crossgrad_core.system.tables import table_bytes, write_table
 from crossgrad_core.system.terminal import controls_of, is_live
 from crossgrad_core.system.text_files import parse_number, read_rows
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.system.writability import check_file, check_folder, check_new
 from crossgrad_core.wording import (
     count,
     did_you_mean,
@@ -62,21 +62,21 @@ if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
     from crossgrad_core.run.assemble import DEFAULT_STEPS, accepts, assemble
-    from crossgrad_core.run.opening import opened as open_run
+    from crossgrad_core.run.load_run import opened as open_run
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
     from crossgrad_core.run.usual_densifier import usual_densifier
     from crossgrad_core.run.usual_resolution import counts_as_short
-    from crossgrad_core.run.usual_views import view_plan_of
+    from crossgrad_core.run.usual_views import views_per_step_spec_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.dropout import photos_per_point, usual_dropout
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-    from crossgrad_core.training.frozen import view_gradients
+    from crossgrad_core.training.growth_budget import usual_budget
     from crossgrad_core.training.model import model_of
+    from crossgrad_core.training.probe_gradients import view_gradients
     from crossgrad_core.training.rates import shows_few_times
-    from crossgrad_core.training.room import usual_budget
     from crossgrad_core.training.schedules import counting_of
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
@@ -139,7 +139,6 @@ __all__ = [
     "is_live",
     "layered",
     "listed",
-    "listened_to",
     "load_command",
     "load_component",
     "load_entry",
@@ -160,9 +159,11 @@ __all__ = [
     "read_scene",
     "read_settings",
     "resolved",
+    "resume_hint",
     "sentences",
     "showable",
     "shows_few_times",
+    "signal_names",
     "singular",
     "strays",
     "summary",
@@ -176,8 +177,7 @@ __all__ = [
     "usual_densifier",
     "usual_dropout",
     "view_gradients",
-    "view_plan_of",
-    "way_on",
+    "views_per_step_spec_of",
     "with_article",
     "with_steps",
     "write_atomically",
@@ -210,18 +210,18 @@ _LATE: Final = {
     "layered": "run.settings",
     "merged": "run.settings",
     "model_of": "training.model",
-    "open_run": "run.opening:opened",
+    "open_run": "run.load_run:opened",
     "panels_of": "run.results.panel_layout",
     "photos_per_point": "training.dropout",
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
     "shows_few_times": "training.rates",
-    "usual_budget": "training.room",
+    "usual_budget": "training.growth_budget",
     "usual_densifier": "run.usual_densifier",
     "usual_dropout": "training.dropout",
-    "view_plan_of": "run.usual_views",
-    "view_gradients": "training.frozen",
+    "views_per_step_spec_of": "run.usual_views",
+    "view_gradients": "training.probe_gradients",
 }
 
 
@@ -274,7 +274,7 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
         UserError: A setting does not exist or has a wrong value.
     """
     from crossgrad_core.run.app import with_defaults
-    from crossgrad_core.run.opening import parsed
+    from crossgrad_core.run.load_run import parsed
 
     return with_defaults(parsed(settings))
 
@@ -331,7 +331,7 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
         UserError: As `assemble`, or a setting would change nothing.
     """
     from crossgrad_core.run import assemble as assembling
-    from crossgrad_core.run import settings_for_nothing as nothing
+    from crossgrad_core.run import unused_settings as nothing
     from crossgrad_core.training import step
 
     setup = assembling.assemble(config, scene, reader)

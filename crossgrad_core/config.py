@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator,
 
 from crossgrad_core import defaults
 from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS, TRAINING, Flag
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import ScheduleMode, Unit
 
@@ -182,7 +182,7 @@ class RunConfig(BaseModel):
     )
     densify_until: int | None = Field(None, ge=0, description="... and before this")
     densify_every: int | None = Field(None, ge=1, description="interval of its edits, likewise")
-    fewest_edits: int | None = Field(
+    min_refinements: int | None = Field(
         None,
         ge=0,
         description="edits that any run has, warm-up and interval giving way. Default: 6 where "
@@ -194,10 +194,10 @@ class RunConfig(BaseModel):
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
     )
-    sh_after: float | None = Field(
+    sh_start: float | None = Field(
         None, ge=0, le=1, description="share of the run before the SH degree grows"
     )
-    size_bound: float | None = Field(
+    max_scale_ratio: float | None = Field(
         None,
         ge=0,
         description="most that a standard deviation may be of the distance to the nearest training "
@@ -206,7 +206,7 @@ class RunConfig(BaseModel):
     sh_every: int | None = Field(
         None, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
     )
-    density_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
+    densify_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(
             "all",
             description="Whose statistics density control gets: of all views of a step, of one of "
@@ -228,12 +228,12 @@ class RunConfig(BaseModel):
         description="decay of Adam's second moment; where it is given, rates are those of runs "
         "that show photos often",
     )
-    position_steps: Annotated[Literal["extent", "size"] | None, Flag("extent|size", TRAINING)] = (
-        Field(
-            None,
-            description="How far positions step: by a share of the scene's extent, as published, "
-            "or along the axes of each Gaussian, by a share of their lengths. Default: auto.",
-        )
+    position_lr: Annotated[
+        Literal["extent", "per-axis"] | None, Flag("extent|per-axis", TRAINING)
+    ] = Field(
+        None,
+        description="How far positions step: by a share of the scene's extent, as published, "
+        "or along the axes of each Gaussian, by a share of their lengths. Default: auto.",
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",
@@ -260,14 +260,14 @@ class RunConfig(BaseModel):
         "separate",
         description="One backward pass per view, or one for all views. Default: separate.",
     )
-    final_decay: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
+    lr_tail: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
         None,
         ge=0,
         le=1,
         description="Over the last share of the steps, rates that are constant as published fade. "
         "Default: auto.",
     )
-    final_rate: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
+    lr_tail_factor: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
     average: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
         None,
         ge=0,
@@ -324,7 +324,7 @@ class RunConfig(BaseModel):
     stop_after: Annotated[int | None, Flag("STEP", RESULTS)] = Field(
         None, ge=1, description="Stops after this step with a checkpoint; --resume continues."
     )
-    max_dropped: int = Field(
+    max_nonfinite_blocks: int = Field(
         100, ge=1, description="stop after so many blocks were dropped as non-finite"
     )
 
@@ -373,7 +373,7 @@ class RunConfig(BaseModel):
         """A number as a number, and a change of K in its one form."""
         if value is None:
             return None
-        return ViewPlan.parsed(str(value)).setting
+        return ViewsPerStepSpec.parsed(str(value)).setting
 
     @field_validator("background")
     @classmethod
@@ -389,9 +389,13 @@ class RunConfig(BaseModel):
         return value
 
     @property
-    def view_plan(self) -> ViewPlan | None:
+    def view_plan(self) -> ViewsPerStepSpec | None:
         """How many views the steps have; None where it is left to the sampler."""
-        return None if self.views_per_step is None else ViewPlan.parsed(str(self.views_per_step))
+        return (
+            None
+            if self.views_per_step is None
+            else ViewsPerStepSpec.parsed(str(self.views_per_step))
+        )
 
     @property
     def operators(self) -> tuple[ComponentChoice, ...]:

@@ -12,27 +12,27 @@ from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
-    Aggregated,
-    Densified,
+    AggregateResult,
     DensifyContext,
-    Draw,
+    DensifyResult,
     EvaluationReport,
     Model,
     OperatorContext,
     PixelContext,
     RegularizeContext,
-    Regularized,
+    RegularizeResult,
     RenderedView,
     RenderOnRequest,
     RequestedRender,
     RunInfo,
     SampleContext,
-    Sampled,
+    SampleResult,
     ScaleContext,
-    Scaled,
+    ScaleResult,
     StepContext,
     StepRecord,
     ViewRecord,
+    ViewSample,
 )
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter, Rounding
@@ -56,14 +56,14 @@ from crossgrad_core.contract.gramian_operator import (
     transformed,
 )
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
-from crossgrad_core.contract.images import eight_bit, masked, unit_range
+from crossgrad_core.contract.images import masked, to_uint8, unit_range
 from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.poses import footprint_of, radial_distances, without_rounding
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
@@ -78,7 +78,7 @@ from crossgrad_core.contract.schedule import (
     Schedule,
     shortness,
 )
-from crossgrad_core.contract.selection import HasIdleOptions, Selection
+from crossgrad_core.contract.selection import HasUnusedOptions, Selection
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.contract.start import MorePoints, Start
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
@@ -115,17 +115,16 @@ __all__ = [
     "SHORTEST_ANCHOR_INTERVAL",
     "AfterStepContext",
     "AggregateContext",
-    "Aggregated",
+    "AggregateResult",
     "Backbone",
     "Block",
     "BlockKind",
     "Camera",
     "Compared",
     "Component",
-    "Densified",
     "Densifier",
     "DensifyContext",
-    "Draw",
+    "DensifyResult",
     "Edit",
     "EvaluationReport",
     "Exporter",
@@ -139,7 +138,7 @@ __all__ = [
     "GramianOperator",
     "Granularity",
     "Grouping",
-    "HasIdleOptions",
+    "HasUnusedOptions",
     "IncompatibleSelectionError",
     "Json",
     "LearningRate",
@@ -165,7 +164,7 @@ __all__ = [
     "Reader",
     "Regrouping",
     "RegularizeContext",
-    "Regularized",
+    "RegularizeResult",
     "Render",
     "RenderOnRequest",
     "RenderedView",
@@ -177,10 +176,10 @@ __all__ = [
     "Rule",
     "RunInfo",
     "SampleContext",
-    "Sampled",
+    "SampleResult",
     "Sampler",
     "ScaleContext",
-    "Scaled",
+    "ScaleResult",
     "Scene",
     "SceneOptions",
     "Schedule",
@@ -195,8 +194,9 @@ __all__ = [
     "UserError",
     "View",
     "ViewCounts",
-    "ViewPlan",
     "ViewRecord",
+    "ViewSample",
+    "ViewsPerStepSpec",
     "Weighting",
     "apply_to_parameters",
     "atomic_file",
@@ -206,7 +206,6 @@ __all__ = [
     "component_name",
     "controls_of",
     "diagonals",
-    "eight_bit",
     "evaluation_line",
     "figures",
     "footprint_of",
@@ -233,6 +232,7 @@ __all__ = [
     "showable",
     "shows_bar",
     "size_text",
+    "to_uint8",
     "transformed",
     "unit_range",
     "vertex_properties",

@@ -24,8 +24,8 @@ class AnalyticSplatting(Vanilla):
 
     response: ClassVar[Response] = "analytic"
     plain: ClassVar[bool] = False
-    own_dilation: ClassVar[bool] = True
-    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    sets_dilation: ClassVar[bool] = True
+    passthrough: ClassVar[Mapping[str, str]] = Vanilla.passthrough
     axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     @override

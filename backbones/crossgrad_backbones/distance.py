@@ -30,7 +30,7 @@ from crossgrad_core.plugin import (
     Parameters,
     Phase,
     RegularizeContext,
-    Regularized,
+    RegularizeResult,
     Scene,
     Selection,
     hookimpl,
@@ -53,7 +53,7 @@ class DistanceConditioned(Vanilla):
     """
 
     plain: ClassVar[bool] = False
-    passed_on: ClassVar[Mapping[str, str]] = {"sh_rest": "f_rest"}
+    passthrough: ClassVar[Mapping[str, str]] = {"sh_rest": "f_rest"}
     axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     condition_scales: bool = Field(True, description="scales depend on the distance")
@@ -68,12 +68,12 @@ class DistanceConditioned(Vanilla):
     )
 
     @override
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
         if self._conditioned():
-            return super().idle_options(selection)
+            return super().unused_options(selection)
         why = "nothing depends on the distance (condition_* = false); leave it out"
         names = ("lr_share", "l2_weight", "smoothness_weight")
-        return {**super().idle_options(selection), **dict.fromkeys(names, why)}
+        return {**super().unused_options(selection), **dict.fromkeys(names, why)}
 
     def _conditioned(self) -> tuple[Conditioned, ...]:
         chosen = (self.condition_scales, self.condition_opacities, self.condition_colors)
@@ -139,7 +139,7 @@ class DistanceConditioned(Vanilla):
         return {**parameters, **sums}
 
     @hookimpl
-    def crossgrad_regularize(self, context: RegularizeContext) -> Regularized | None:
+    def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
         """Both penalties on the weights, once per step."""
         names = [each.weights for each in self._conditioned()]
         if context.gaussians is not None or not names:
@@ -148,7 +148,9 @@ class DistanceConditioned(Vanilla):
             penalty(context.parameters[name], self.l2_weight, self.smoothness_weight)
             for name in names
         ]
-        return Regularized(torch.stack(penalties).sum() * context.step / context.schedule.total)
+        return RegularizeResult(
+            torch.stack(penalties).sum() * context.step / context.schedule.total
+        )
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:

@@ -18,7 +18,7 @@ from crossgrad_core.plugin import (
     AfterStepContext,
     Block,
     Camera,
-    Densified,
+    DensifyResult,
     Edit,
     Gaussians,
     LearningRate,
@@ -45,8 +45,8 @@ class MipSplatting(Vanilla):
 
     response: ClassVar[Response] = "antialiased"
     plain: ClassVar[bool] = False
-    own_dilation: ClassVar[bool] = True
-    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    sets_dilation: ClassVar[bool] = True
+    passthrough: ClassVar[Mapping[str, str]] = Vanilla.passthrough
     axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
@@ -79,12 +79,12 @@ class MipSplatting(Vanilla):
         return filter_widths(parameters["means"], cameras, self.near, parity=self.parity)
 
     @hookimpl
-    def crossgrad_after_step(self, context: AfterStepContext) -> Densified | None:
+    def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
         """Renews the filter while nothing else does."""
         if context.edited or not renews(context.schedule, context.step):
             return None
         widths = self._widths(context.parameters, context.scene)
-        return Densified(Edit(values={"filter": Rows(widths)}))
+        return DensifyResult(Edit(values={"filter": Rows(widths)}))
 
     @override
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:

@@ -13,8 +13,8 @@ from typing_extensions import override
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
 from crossgrad_backbones.levels import fitting
 from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
+from crossgrad_backbones.levels.init_anchors import init_anchors, visible_share
 from crossgrad_backbones.levels.lattice import Lattice
-from crossgrad_backbones.levels.planting import planted, visible_share
 from crossgrad_core.plugin import (
     Block,
     Camera,
@@ -74,8 +74,8 @@ class Octree(AnchorBackbone):
     coarse_factor: float = Field(1.5, ge=1, description="each opening comes faster by this factor")
 
     @override
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        idle = dict(super().idle_options(selection))
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        idle = dict(super().unused_options(selection))
         if self.base_layer >= 0:
             idle["middle_cell"] = "base_layer sets the cells; leave one of the two out"
         if not self.progressive:
@@ -108,10 +108,10 @@ class Octree(AnchorBackbone):
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
         centers = scene.centers
         lattice = self._lattice(scene.points, centers)
-        anchors = planted(scene.points, lattice, everywhere=self.plant_everywhere)
+        anchors = init_anchors(scene.points, lattice, everywhere=self.plant_everywhere)
         shares = lattice.shares(anchors.positions, anchors.levels, torch.from_numpy(centers))
-        lattice = lattice.weeding(visible_share(shares, self.visible_threshold))
-        anchors = anchors.kept(lattice.lasting(shares))
+        lattice = lattice.with_prune_threshold(visible_share(shares, self.visible_threshold))
+        anchors = anchors.kept(lattice.keep_levels(shares))
         finest = float(lattice.cells(lattice.levels - 1))
         positions, spacings = anchors.positions.numpy(), anchors.spacings.numpy()
         return {

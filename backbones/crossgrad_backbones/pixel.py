@@ -13,5 +13,5 @@ class PixelGS(Vanilla):
     """
 
     default_densifier: ClassVar[str] = "pixel"
-    passed_on: ClassVar[Mapping[str, str]] = Vanilla.passed_on
+    passthrough: ClassVar[Mapping[str, str]] = Vanilla.passthrough
     axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes

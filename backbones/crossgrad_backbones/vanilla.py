@@ -34,7 +34,7 @@ class Vanilla(Backbone):
     """
 
     plain: ClassVar[bool] = True
-    passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc", "sh_rest": "f_rest"}
+    passthrough: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc", "sh_rest": "f_rest"}
     positions: ClassVar[str] = "means"
     axes: ClassVar[tuple[str, str] | tuple[()]] = ("scales", "quats")
 
@@ -48,8 +48,8 @@ class Vanilla(Backbone):
     lr_f_dc: float = Field(2.5e-3, ge=0, description="learning rate of SH band 0")
     lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if self.sh_degree > 0:
             return {}
         return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave it out"}

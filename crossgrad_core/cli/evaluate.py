@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
+from crossgrad_core.cli.run_options import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
 
 Ply = Annotated[
@@ -35,8 +35,8 @@ def evaluate(
 ) -> None:
     """Evaluate the held-out views of a run again."""
     announce()
-    from crossgrad_core.run.afterwards import figures
-    from crossgrad_core.run.afterwards.how import How
+    from crossgrad_core.run.postprocess import evaluate
+    from crossgrad_core.run.postprocess.open_options import How
 
     how = How(device, threads, accept_scene)
-    figures.evaluate(run, how, ply, on)
+    evaluate.evaluate(run, how, ply, on)

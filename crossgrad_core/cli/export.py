@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
+from crossgrad_core.cli.run_options import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.system.startup import announce
 
 
@@ -46,10 +46,10 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 ) -> None:
     """Write the trained scene to a file that viewers open."""
     announce()
-    from crossgrad_core.run.afterwards import files
-    from crossgrad_core.run.afterwards.how import How
+    from crossgrad_core.run.postprocess import export
+    from crossgrad_core.run.postprocess.open_options import How
 
     how = How(device, threads, accept_scene)
-    files.export(
+    export.export(
         run, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )

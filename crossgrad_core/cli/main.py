@@ -14,7 +14,7 @@ from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.system.files import is_too_long, path_too_long
-from crossgrad_core.system.grouped import GroupedCommand
+from crossgrad_core.system.help_groups import GroupedCommand
 from crossgrad_core.system.startup import finish
 from crossgrad_core.system.version import VERSION
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from crossgrad_core.cli.of_a_run import AcceptScene, Device, RunFolder, Threads
+from crossgrad_core.cli.run_options import AcceptScene, Device, RunFolder, Threads
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.startup import announce
 
@@ -31,7 +31,8 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     on: Annotated[
         Path | None,
         typer.Option(
-            metavar="SCENE", help="Draw the views of another capture of the place, as eval does."
+            metavar="SCENE",
+            help="ViewSample the views of another capture of the place, as eval does.",
         ),
     ] = None,
     path: Annotated[
@@ -62,14 +63,14 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
             todo="leave out --frames, or draw a ladder",
         )
     announce()
-    from crossgrad_core.run.afterwards import pictures
-    from crossgrad_core.run.afterwards.how import How
+    from crossgrad_core.run.postprocess import render
+    from crossgrad_core.run.postprocess.open_options import How
 
     how = How(device, threads, accept_scene)
     if path is not None:
-        pictures.fly(run, path, frames=frames, out=out, how=how)
+        render.render_path(run, path, frames=frames, out=out, how=how)
         return
-    pictures.render(run, split=split or "test", out=out, how=how, on=on)
+    render.render(run, split=split or "test", out=out, how=how, on=on)
 
 
 def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:

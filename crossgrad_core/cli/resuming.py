@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.resumable import CHANGEABLE
+from crossgrad_core.run.changeable_settings import CHANGEABLE
 from crossgrad_core.wording import listed
 
 #: What only this start of the command is asked.

@@ -27,8 +27,8 @@ class Backbone(Component):
         response: How its Gaussians fill a pixel.
         plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
             PLY loses nothing.
-        own_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
-        passed_on: Field of the Gaussians -> tensor that `decode` hands over as this field (or not
+        sets_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
+        passthrough: Field of the Gaussians -> tensor that `decode` hands over as this field (or not
             at all) and does not read: only the rows that are drawn need to be up to date. It
             holds for the very class that says so, not for those that inherit from it.
         positions: Tensor [N, 3] of the primitives' positions in the local frame, by which they are
@@ -46,8 +46,8 @@ class Backbone(Component):
     default_densifier: ClassVar[str] = defaults.DENSIFIER
     response: ClassVar[Response] = "plain"
     plain: ClassVar[bool] = False
-    own_dilation: ClassVar[bool] = False
-    passed_on: ClassVar[Mapping[str, str]] = {}
+    sets_dilation: ClassVar[bool] = False
+    passthrough: ClassVar[Mapping[str, str]] = {}
     positions: ClassVar[str] = ""
     axes: ClassVar[tuple[str, str] | tuple[()]] = ()
 
@@ -55,8 +55,8 @@ class Backbone(Component):
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
         # A class that inherits it may read in `decode` what its parent only hands over.
-        if "passed_on" not in vars(cls):
-            cls.passed_on = {}
+        if "passthrough" not in vars(cls):
+            cls.passthrough = {}
         # ... and hold its sizes and rotations in another way.
         if "axes" not in vars(cls):
             cls.axes = ()

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Draw:
+class ViewSample:
     """The views of one step.
 
     Attributes:
@@ -228,7 +228,7 @@ class ScaleContext(StepContext):
         last: Record of the step before, None in the first one.
     """
 
-    draw: Draw
+    draw: ViewSample
     last: StepRecord | None
 
     @property
@@ -321,7 +321,7 @@ class DensifyContext(StepContext):
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
-        share: Number of these over that of all views of the step; 1 but for `--density-views`.
+        share: Number of these over that of all views of the step; 1 but for `--densify-views`.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
         may_grow: [P] bool, the primitives that may grow; None where all may.
@@ -371,21 +371,21 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Sampled(Answer):
+class SampleResult(Answer):
     """Answer of `crossgrad_sample_views`."""
 
-    draw: Draw
+    draw: ViewSample
 
 
 @dataclass(frozen=True)
-class Scaled(Answer):
+class ScaleResult(Answer):
     """Answer of `crossgrad_choose_scales`: one scale in (0, 1] for each drawn view."""
 
     scales: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Aggregated(Answer):
+class AggregateResult(Answer):
     """Answer of `crossgrad_aggregate_gradients`.
 
     Attributes:
@@ -398,14 +398,14 @@ class Aggregated(Answer):
 
 
 @dataclass(frozen=True, eq=False)
-class Regularized(Answer):
+class RegularizeResult(Answer):
     """Answer of `crossgrad_regularize`: a scalar to be minimised besides the photometric loss."""
 
     loss: Tensor
 
 
 @dataclass(frozen=True, eq=False)
-class Densified(Answer):
+class DensifyResult(Answer):
     """Answer of `crossgrad_densify` and `crossgrad_after_step`: an edit, or NO_EDIT."""
 
     edit: Edit
@@ -497,9 +497,9 @@ class OperatorContext:
         present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
             columns of the others are zero in the Gramian; an operator must give them weight 0.
         unit: Unit roundoff of the gradients' type: no result needs to be closer.
-        remainders: Works out [B, K, K], what rounding to float64 took from the Gramians; both
-            together have twice the digits. It takes another, slower pass over the gradients: for
-            Gramians so close to singular that their own rounding shows. None where it is not known.
+        rounding_residuals: Works out [B, K, K], what rounding to float64 took from the Gramians.
+            Both together have twice the digits. It takes another, slower pass over the gradients,
+            for Gramians so close to singular that their own rounding shows. None if unknown.
         scales: K scales at which losses and gradients were taken; empty where all are 1.
     """
 
@@ -512,5 +512,5 @@ class OperatorContext:
     reference_distance: float
     present: NDArray[np.bool_]
     unit: float = 2.0**-24
-    remainders: Callable[[], NDArray[np.float64]] | None = None
+    rounding_residuals: Callable[[], NDArray[np.float64]] | None = None
     scales: tuple[float, ...] = ()

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.component import Component, with_state
-from crossgrad_core.contract.contexts import Densified, DensifyContext
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import DensifyContext, DensifyResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit
@@ -62,8 +62,8 @@ class Densifier(Component):
         """
 
     @hookimpl
-    def crossgrad_densify(self, context: DensifyContext) -> Densified:
+    def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
         """Answers the seam with this densifier's edit."""
         answer = self.densify(context, context.state(STATE))
         edit, state = with_state(answer, Edit, self, "densify")
-        return Densified(edit, states={STATE: state})
+        return DensifyResult(edit, states={STATE: state})

@@ -62,7 +62,7 @@ class Exposure(Component):
         """
         return Fitted(self)
 
-    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+    def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
         """What the user should know about this exposure and the scene; asked of new runs only.
 
         `known` are the values [P, ...] at the start by name, if the user has a file; else empty.
@@ -74,7 +74,7 @@ class Exposure(Component):
         return {}
 
     @abstractmethod
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         """The image as taken, differentiable in the render and in the values.
 
         Args:
@@ -82,7 +82,7 @@ class Exposure(Component):
             values: Name -> the photo's own value [...], on the image's device.
         """
 
-    def projected(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """All values [P, ...] after a step, brought back to where they must be.
 
         By default as they are. Gains that are brought back to a mean of zero, say, leave the
@@ -90,14 +90,14 @@ class Exposure(Component):
         """
         return values
 
-    def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
         """The values [P, ...] of a parameter, all moved by what makes `end` of `start`.
 
         By default by a sum. What photos differ by stays, at whatever level a file has them.
         """
         return values + (end - start)
 
-    def unseen(
+    def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
         """The values of a view that is not trained on, without a look at its pixels.

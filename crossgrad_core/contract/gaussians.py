@@ -51,7 +51,8 @@ class Gaussians:
         decoded: [P] bool, the primitives that were decoded for this view, whether or not they gave
             a Gaussian; None where all were.
         on_demand: Tensors whose rows must be asked for before they are read; the gradients of these
-            are by rows, sparse. None where all is there. Only rasterizers with `by_rows` get it.
+            are by rows, sparse. None where all is there. Only rasterizers with `sparse_rows`
+            get it.
     """
 
     means: Tensor

@@ -76,7 +76,7 @@ class SeparateGradients(Gradients):
         """[B, K, K] float64 Gramians; views with a non-finite gradient have zero rows."""
 
     @abstractmethod
-    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+    def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         """[B, K, K] what rounding took from the Gramians: the sum of both has twice the digits.
 
         Takes ten times as long as the Gramians.

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block, BlockKind
 from crossgrad_core.contract.component import answered, with_state
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated, OperatorContext
+from crossgrad_core.contract.contexts import AggregateContext, AggregateResult, OperatorContext
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.state import PluginState
@@ -28,7 +28,7 @@ class MatrixOperator(Operator):
     It can be a link of a chain and serve single blocks.
     """
 
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
     @abstractmethod
     def transform(
@@ -54,7 +54,7 @@ class MatrixOperator(Operator):
     @override
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         return aggregate_by_gramians(self, "block", context, state)
 
 
@@ -66,7 +66,7 @@ class GramianOperator(MatrixOperator):
             blocks, everything, or each Gaussian's row of a block.
     """
 
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
     granularity: Granularity = Field("block", description="what one Gramian covers")
 
@@ -77,7 +77,7 @@ class GramianOperator(MatrixOperator):
     @override
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         return aggregate_by_gramians(self, self.granularity, context, state)
 
 
@@ -125,7 +125,7 @@ def aggregate_by_gramians(
     granularity: Granularity,
     context: AggregateContext,
     state: PluginState,
-) -> tuple[Aggregated, PluginState]:
+) -> tuple[AggregateResult, PluginState]:
     """One pass for the Gramians of all blocks, one small solve, one pass for the weighted sums.
 
     Counts blocks (Gramians, under other granularities) in which some view's gradient is exactly
@@ -146,7 +146,7 @@ def aggregate_by_gramians(
         raise _not_finite(operator, given, weights)
     # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
     counts = _counts(gradients, granularity, gramians, present)
-    return Aggregated(gradients.combine(weights, granularity), counts), state
+    return AggregateResult(gradients.combine(weights, granularity), counts), state
 
 
 def transformed(
@@ -199,7 +199,7 @@ def operator_context(
         reference_distance=context.reference_distance,
         present=present,
         unit=context.separate.unit,
-        remainders=partial(context.separate.remainders, granularity),
+        rounding_residuals=partial(context.separate.rounding_residuals, granularity),
         scales=context.scales,
     )
 

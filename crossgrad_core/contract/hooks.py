@@ -8,7 +8,7 @@ with a value; None is an error.
 
 from typing import TYPE_CHECKING
 
-from crossgrad_core.contract.marks import hookspec
+from crossgrad_core.contract.markers import hookspec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     from crossgrad_core.contract.contexts import (
         AfterStepContext,
         AggregateContext,
-        Aggregated,
-        Densified,
+        AggregateResult,
         DensifyContext,
+        DensifyResult,
         EvaluationReport,
         Model,
         PixelContext,
         RegularizeContext,
-        Regularized,
+        RegularizeResult,
         RunInfo,
         SampleContext,
-        Sampled,
+        SampleResult,
         ScaleContext,
-        Scaled,
+        ScaleResult,
         StepRecord,
     )
     from crossgrad_core.contract.selection import Selection
@@ -38,7 +38,7 @@ class HookSpecs:
     """All hooks in the order in which a run calls them."""
 
     @hookspec
-    def crossgrad_objections(self, selection: "Selection") -> "list[str] | None":
+    def crossgrad_validate_selection(self, selection: "Selection") -> "list[str] | None":
         """Before training: reasons why this selection of components cannot work.
 
         Every plugin is asked; one reason is enough to refuse the run.
@@ -49,11 +49,11 @@ class HookSpecs:
         """Event: the scene is read, the components are chosen, no step is taken yet."""
 
     @hookspec(firstresult=True)
-    def crossgrad_sample_views(self, context: "SampleContext") -> "Sampled | None":
+    def crossgrad_sample_views(self, context: "SampleContext") -> "SampleResult | None":
         """Seam 1: the K views of this step. Answered by the selected sampler."""
 
     @hookspec(firstresult=True)
-    def crossgrad_choose_scales(self, context: "ScaleContext") -> "Scaled | None":
+    def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
         """The scale at which each drawn view is rendered and compared. The selected resolution."""
 
     @hookspec
@@ -64,7 +64,7 @@ class HookSpecs:
         """
 
     @hookspec
-    def crossgrad_regularize(self, context: "RegularizeContext") -> "Regularized | None":
+    def crossgrad_regularize(self, context: "RegularizeContext") -> "RegularizeResult | None":
         """Loss terms besides the photometric one, per view or per step.
 
         Every plugin is asked, once per view (`context.gaussians` given) and once per step (None);
@@ -72,15 +72,17 @@ class HookSpecs:
         """
 
     @hookspec(firstresult=True)
-    def crossgrad_aggregate_gradients(self, context: "AggregateContext") -> "Aggregated | None":
+    def crossgrad_aggregate_gradients(
+        self, context: "AggregateContext"
+    ) -> "AggregateResult | None":
         """Seam 2: one gradient per tensor from the gradients of K views. The selected operator."""
 
     @hookspec(firstresult=True)
-    def crossgrad_densify(self, context: "DensifyContext") -> "Densified | None":
+    def crossgrad_densify(self, context: "DensifyContext") -> "DensifyResult | None":
         """Seam 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
 
     @hookspec
-    def crossgrad_after_step(self, context: "AfterStepContext") -> "Densified | None":
+    def crossgrad_after_step(self, context: "AfterStepContext") -> "DensifyResult | None":
         """After optimizer and density control: an edit for noise, clamps, filters; or None."""
 
     @hookspec
@@ -88,7 +90,7 @@ class HookSpecs:
         """Event: the step is complete."""
 
     @hookspec
-    def crossgrad_model(self, model: "Model") -> None:
+    def crossgrad_model_ready(self, model: "Model") -> None:
         """Event: the step is complete, and this is the model now. Read only; off the clock."""
 
     @hookspec
@@ -96,11 +98,11 @@ class HookSpecs:
         """Event: the test views were evaluated."""
 
     @hookspec
-    def crossgrad_length(self, step: int, total: int) -> None:
+    def crossgrad_length_changed(self, step: int, total: int) -> None:
         """Event: after `step`, a run with a time budget is to have `total` steps in all."""
 
     @hookspec
-    def crossgrad_message(self, text: str) -> None:
+    def crossgrad_log(self, text: str) -> None:
         """Event: the run says something to the user (one line of plain text)."""
 
     @hookspec

@@ -16,7 +16,7 @@ def unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
     return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
 
 
-def eight_bit(image: Tensor) -> Tensor:
+def to_uint8(image: Tensor) -> Tensor:
     """The image as uint8 on the CPU, clamped to [0, 1] and rounded; NaN becomes 0."""
     image = image.detach().cpu()
     if image.dtype == torch.uint8:

@@ -6,7 +6,7 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.selection import HasIdleOptions, Selection
+from crossgrad_core.contract.selection import HasUnusedOptions, Selection
 
 
 def objections_to(selection: Selection) -> list[str]:
@@ -84,16 +84,16 @@ def _of_the_resolution(selection: Selection) -> Iterator[str]:
         )
 
 
-def idle_options(component: Component, selection: Selection) -> Mapping[str, str]:
+def unused_options(component: Component, selection: Selection) -> Mapping[str, str]:
     """Options of a component that would change nothing: name -> why, and the way out."""
     idle: dict[str, str] = {}
     if isinstance(component, GramianOperator) and not component.reads_gramians():
         idle["granularity"] = "this operator looks at no Gramians; leave it out"
-    if isinstance(component, Rasterizer) and selection.backbone.own_dilation:
+    if isinstance(component, Rasterizer) and selection.backbone.sets_dilation:
         name = selection.names["backbone"]
         idle["dilation"] = f"backbone {name} has a dilation of its own; leave it out"
-    if isinstance(component, HasIdleOptions):
-        idle |= component.idle_options(selection)
+    if isinstance(component, HasUnusedOptions):
+        idle |= component.unused_options(selection)
     return idle
 
 
@@ -102,7 +102,7 @@ def set_for_nothing(component: Component, selection: Selection) -> dict[str, str
     fields = type(component).model_fields
     return {
         name: why
-        for name, why in idle_options(component, selection).items()
+        for name, why in unused_options(component, selection).items()
         if name in component.model_fields_set
         and name in fields
         and getattr(component, name) != fields[name].default

@@ -7,8 +7,8 @@ from typing import ClassVar
 from typing_extensions import override
 
 from crossgrad_core.contract.component import Component, ViewCounts, with_state
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import AggregateContext, AggregateResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.state import PluginState
 
 STATE = "operator"
@@ -27,9 +27,9 @@ class Operator(Component):
             says that the operator does nothing.
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no labels.
-        by_rows: Whether `aggregate` hands on what `total` and `combine` answer as it is, sparse or
-            dense. It holds for the class that says so and those that keep its `aggregate`; others
-            get dense gradients only.
+        sparse_rows: Whether `aggregate` hands on what `total` and `combine` answer as it is, sparse
+            or dense. It holds for the class that says so and for subclasses that keep its
+            `aggregate`; other classes get dense gradients only.
     """
 
     slot: ClassVar[str] = "operators"
@@ -37,14 +37,14 @@ class Operator(Component):
     views: ClassVar[ViewCounts] = ViewCounts()
     idle_at_one: ClassVar[bool] = False
     default_grouping: ClassVar[str | None] = None
-    by_rows: ClassVar[bool] = False
+    sparse_rows: ClassVar[bool] = False
 
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
         answers = {"aggregate", "crossgrad_aggregate_gradients"} & vars(cls).keys()
-        if answers and "by_rows" not in vars(cls):
-            cls.by_rows = False
+        if answers and "sparse_rows" not in vars(cls):
+            cls.sparse_rows = False
 
     @property
     def usual_grouping(self) -> str | None:
@@ -66,7 +66,7 @@ class Operator(Component):
     @abstractmethod
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         """One gradient per tensor, and the new state.
 
         The place of a view in the step means nothing. Views are told apart by labels, losses,
@@ -78,9 +78,9 @@ class Operator(Component):
         """
 
     @hookimpl
-    def crossgrad_aggregate_gradients(self, context: AggregateContext) -> Aggregated:
+    def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
         """Answers the seam with this operator's directions."""
         answer = self.aggregate(context, context.state(STATE))
-        aggregated, state = with_state(answer, Aggregated, self, "aggregate")
+        aggregated, state = with_state(answer, AggregateResult, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}
-        return Aggregated(aggregated.gradients, aggregated.counts, states=states)
+        return AggregateResult(aggregated.gradients, aggregated.counts, states=states)

@@ -58,7 +58,7 @@ ONE_BY_ONE: Final = Pace()
 
 
 @dataclass(frozen=True)
-class ViewPlan:
+class ViewsPerStepSpec:
     """K over a run of any length: one number, or several with the share at which each begins.
 
     Attributes:
@@ -70,7 +70,7 @@ class ViewPlan:
     shares: tuple[float, ...] = ()
 
     @classmethod
-    def parsed(cls, text: str) -> "ViewPlan":
+    def parsed(cls, text: str) -> "ViewsPerStepSpec":
         """The plan that `2` or `1..2@0.5` stands for.
 
         Raises:
@@ -120,4 +120,4 @@ class ViewPlan:
 
 
 #: One view per step, as published.
-ONE_VIEW: Final = ViewPlan()
+ONE_VIEW: Final = ViewsPerStepSpec()

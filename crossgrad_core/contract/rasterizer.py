@@ -24,20 +24,20 @@ class Rasterizer(Component):
             `count`.
         responses: Pixel responses that it draws.
         devices: Torch device types it runs on.
-        together: Whether `render_views` is faster than one view after the other. The views of a
+        batched: Whether `render_views` is faster than one view after the other. The views of a
             step are then drawn in one call, with the graphs of all of them alive.
-        repeatable: Whether the same input gives the same bits.
-        by_rows: Whether it heeds `Gaussians.on_demand`. It holds for the very class that says so,
-            not for those that inherit from it.
+        deterministic: Whether the same input gives the same bits.
+        sparse_rows: Whether it heeds `Gaussians.on_demand`. It holds for the very class that says
+            so, not for those that inherit from it.
     """
 
     slot: ClassVar[str] = "rasterizers"
     provides: ClassVar[frozenset[str]] = frozenset()
     responses: ClassVar[frozenset[Response]] = frozenset({"plain"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
-    together: ClassVar[bool] = False
-    repeatable: ClassVar[bool] = True
-    by_rows: ClassVar[bool] = False
+    batched: ClassVar[bool] = False
+    deterministic: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = False
 
     max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
     near: float = Field(1e-3, gt=0.0, description="near plane, local units")
@@ -47,8 +47,8 @@ class Rasterizer(Component):
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
         # A class that inherits it may look at Gaussians before its parent asks for their rows.
-        if "by_rows" not in vars(cls):
-            cls.by_rows = False
+        if "sparse_rows" not in vars(cls):
+            cls.sparse_rows = False
 
     @classmethod
     def speed(cls, device: str) -> float:  # noqa: ARG003 - for those that run somewhere
@@ -74,7 +74,7 @@ class Rasterizer(Component):
         """
         return ""
 
-    def burn_in(self, device: str) -> None:
+    def self_test(self, device: str) -> None:
         """Finds out before a run trains whether this machine draws rightly; by default does not.
 
         Args:

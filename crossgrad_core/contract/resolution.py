@@ -6,8 +6,8 @@ from math import log2
 from typing import ClassVar
 
 from crossgrad_core.contract.component import Component, with_state
-from crossgrad_core.contract.contexts import ScaleContext, Scaled
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import ScaleContext, ScaleResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
@@ -46,7 +46,7 @@ class Resolution(Component):
         """
         return self
 
-    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+    def messages(self, schedule: Schedule) -> tuple[str, ...]:
         """What to note about the scales of a run with this schedule; asked anew as it changes."""
         return ()
 
@@ -67,8 +67,8 @@ class Resolution(Component):
         """
 
     @hookimpl
-    def crossgrad_choose_scales(self, context: ScaleContext) -> Scaled:
+    def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
         """Answers with this resolution's scales."""
         answer = self.scales(context, context.state(STATE))
         scales, state = with_state(answer, Sequence, self, "scales")
-        return Scaled(tuple(scales), states={STATE: state})
+        return ScaleResult(tuple(scales), states={STATE: state})

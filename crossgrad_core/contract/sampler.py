@@ -4,8 +4,8 @@ from abc import abstractmethod
 from typing import ClassVar
 
 from crossgrad_core.contract.component import Component, ViewCounts, with_state
-from crossgrad_core.contract.contexts import Draw, SampleContext, Sampled
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import SampleContext, SampleResult, ViewSample
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.state import PluginState
 
 STATE = "sampler"
@@ -51,12 +51,12 @@ class Sampler(Component):
         return frozenset({views})
 
     @abstractmethod
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         """The views of this step and the new state. Random numbers come from `context.rng`."""
 
     @hookimpl
-    def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
+    def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
         """Answers the seam with this sampler's draw."""
         answer = self.sample(context, context.state(STATE))
-        draw, state = with_state(answer, Draw, self, "sample")
-        return Sampled(draw, states={STATE: state})
+        draw, state = with_state(answer, ViewSample, self, "sample")
+        return SampleResult(draw, states={STATE: state})

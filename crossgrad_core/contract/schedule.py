@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from math import log
 from typing import Literal
 
-from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewPlan
-from crossgrad_core.numerics.lots import lot
+from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewsPerStepSpec
+from crossgrad_core.numerics.hashing import hash32
 
 ScheduleMode = Literal["scaled", "absolute"]
 Unit = Literal["views", "steps"]
@@ -52,16 +52,16 @@ class Counting:
             run is long enough.
         reference: For which length the schedule counts, where that is not the run's own or the
             published one.
-        fewest_edits: So many edits of density control there are in any run, however short: warm-up
-            and interval, which are the least of a longer run, give way. Counted in views only.
+        min_refinements: Edits of density control that any run makes at least, however short: a
+            short run shortens warm-up and interval for it. Used if the schedule counts views.
         edits_from: They are asked for from this length on.
     """
 
     unit: Unit = "steps"
-    views: ViewPlan = ONE_VIEW
+    views: ViewsPerStepSpec = ONE_VIEW
     photos: int = 1
     reference: int | None = None
-    fewest_edits: int = 0
+    min_refinements: int = 0
     edits_from: int = 0
 
 
@@ -92,7 +92,7 @@ class Schedule:
         counting: What is counted.
         pace: K of every step.
         edits_before: Edits before `densify_from` in a run whose length followed the clock.
-        fewest_edits: Edits that another length of the run leaves, if there is room for them.
+        min_refinements: Edits that another length of the run leaves, if there is room for them.
     """
 
     mode: ScheduleMode
@@ -113,7 +113,7 @@ class Schedule:
     counting: Counting = IN_STEPS
     pace: Pace = ONE_BY_ONE
     edits_before: int = 0
-    fewest_edits: int = 0
+    min_refinements: int = 0
 
     @classmethod
     def for_run(
@@ -145,7 +145,7 @@ class Schedule:
         )
         long = counting.unit == "views" and length >= counting.edits_from
         if long and not schedule.published:
-            schedule = replace(schedule, fewest_edits=counting.fewest_edits)
+            schedule = replace(schedule, min_refinements=counting.min_refinements)
         return schedule.with_edits(until=length // 2)
 
     def with_edits(
@@ -155,7 +155,7 @@ class Schedule:
 
         Where edits are counted in views, interval and start are fitted to it: an interval is a pass
         over the training photos, as far as that leaves room for `USUAL_EDITS`, and there are at
-        least `fewest_edits`.
+        least `min_refinements`.
 
         Args:
             until: Edits end before this.
@@ -167,10 +167,10 @@ class Schedule:
         last, photos = until - 1, self.counting.photos
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
-        if self.fewest_edits:
+        if self.min_refinements:
             # A pass over more photos than there is room for does not shorten the warm-up.
-            whole = max(every, photos) if photos <= last // self.fewest_edits else every
-            start, every = _fitted(start, last, whole, photos, self.fewest_edits)
+            whole = max(every, photos) if photos <= last // self.min_refinements else every
+            start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
 
     @property
@@ -229,7 +229,7 @@ class Schedule:
         behind = max(count, self.densify_from)
         return origin + ((behind - origin) // every + 1) * every
 
-    def lengthened(self, wanted: "Schedule", step: int) -> "Schedule":
+    def with_length(self, wanted: "Schedule", step: int) -> "Schedule":
         """This schedule with the length of another one, from the end of a step on.
 
         The ends of the run, of the learning-rate decay and of density control move as far as they
@@ -256,8 +256,8 @@ class Schedule:
         )
         if over:
             return longer
-        longer = replace(longer, fewest_edits=wanted.fewest_edits)
-        if longer.fewest_edits:
+        longer = replace(longer, min_refinements=wanted.min_refinements)
+        if longer.min_refinements:
             return _with_edits_ahead(longer, wanted, step)
         return replace(longer, densify_until=max(count, wanted.densify_until))
 
@@ -274,7 +274,7 @@ class Schedule:
         photos or regimes by turns, none is left out.
         """
         turn, place = divmod(step - 1, self.sh_every)
-        return place != lot(turn) * self.sh_every >> 32
+        return place != hash32(turn) * self.sh_every >> 32
 
     def densifies(self, step: int) -> bool:
         """Whether density control edits the primitives after this step."""
@@ -304,7 +304,7 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
     """The schedule from the end of a step on, with the edits of a run of the wanted length."""
     now = schedule.counted(step)
     done = schedule.edits_before + schedule.edits() - schedule.edits(step)
-    missing = max(0, schedule.fewest_edits - done)
+    missing = max(0, schedule.min_refinements - done)
     every, until = wanted.densify_every, max(now, wanted.densify_until)
     if done:
         start = schedule.next_edit(now) - schedule.densify_every

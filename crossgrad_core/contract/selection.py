@@ -13,7 +13,7 @@ from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
@@ -61,12 +61,12 @@ class Selection:
     device: str
     grouping: Grouping | None = None
     labels: tuple[str, ...] | None = None
-    view_plan: ViewPlan | None = None
+    view_plan: ViewsPerStepSpec | None = None
 
     @property
-    def views(self) -> ViewPlan:
+    def views(self) -> ViewsPerStepSpec:
         """K over the run."""
-        return self.view_plan or ViewPlan((self.views_per_step,))
+        return self.view_plan or ViewsPerStepSpec((self.views_per_step,))
 
     @property
     def components(self) -> dict[str, Component]:
@@ -88,10 +88,10 @@ class Selection:
 
 
 @runtime_checkable
-class HasIdleOptions(Protocol):
+class HasUnusedOptions(Protocol):
     """A component that knows which of its options would change nothing."""
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Options that would change nothing in this selection: name -> why, and the way out.
 
         A new run is refused where the user has set one of them to something else than its default.

@@ -46,7 +46,7 @@ class Start(Component):
     def more_points(self, scene: Scene) -> MorePoints | None:
         """The points to add; None for none."""
 
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
+    def messages(self, scene: Scene) -> tuple[str, ...]:
         """What the user should know about them; asked of new runs only."""
         return ()
 

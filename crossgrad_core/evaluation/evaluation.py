@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.images import eight_bit
+from crossgrad_core.contract.images import to_uint8
 from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.scene import View
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
@@ -57,7 +57,7 @@ def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = Non
     """The view's photo and its render [H, W, 3], rounded to 8 bits, and the points it observed."""
     photo, mask = view.photo.image(), view.photo.mask()
     seen = np.zeros((0, 3)) if points is None else points[view.seen]
-    return Compared(view, eight_bit(render), photo, mask, render.detach().cpu(), seen)
+    return Compared(view, to_uint8(render), photo, mask, render.detach().cpu(), seen)
 
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:

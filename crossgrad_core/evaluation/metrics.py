@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.images import eight_bit
+from crossgrad_core.contract.images import to_uint8
 
 #: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite;
 #: images that differ reach it only if fewer than one value in 150,000 is off, by one 8-bit step.
@@ -32,7 +32,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     """
     rendered, photo = (
         each.reshape(-1, 3) if mask is None else each[mask]
-        for each in (eight_bit(image), eight_bit(target))
+        for each in (to_uint8(image), to_uint8(target))
     )
     if rendered.numel() == 0:
         return None

@@ -9,7 +9,7 @@ from crossgrad_core.gradients import generic
 from crossgrad_core.gradients.columns import Column
 
 
-def remainders(
+def rounding_residuals(
     columns: Sequence[Column],
     group: NDArray[np.int64],
     gramians: NDArray[np.float64],
@@ -23,7 +23,7 @@ def remainders(
         gramians: [B, K, K] as they were rounded.
         scale: What the gradients were multiplied by for them.
     """
-    from crossgrad_core.gradients.numba_kernels.remainders import add_products, left_over
+    from crossgrad_core.gradients.numba_kernels.rounding_residuals import add_products, left_over
 
     high, low = np.zeros(gramians.shape), np.zeros(gramians.shape)
     for b, column in zip(group.tolist(), columns, strict=True):
@@ -37,7 +37,10 @@ def row_remainders(
     columns: Sequence[Column], rows: int, gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[N, K, K] the same for the Gramians of the rows of a block's tensors."""
-    from crossgrad_core.gradients.numba_kernels.remainders import add_row_products, left_over
+    from crossgrad_core.gradients.numba_kernels.rounding_residuals import (
+        add_row_products,
+        left_over,
+    )
 
     high, low = np.zeros(gramians.shape), np.zeros(gramians.shape)
     for column in columns:

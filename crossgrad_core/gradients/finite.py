@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.gradients.by_rows import values_of
 from crossgrad_core.gradients.columns import is_native
+from crossgrad_core.gradients.sparse_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
 #: Parts for so few of which no other thread is woken.

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.gradients import native
-from crossgrad_core.gradients.by_rows import Packed
 from crossgrad_core.gradients.columns import Column, is_native
+from crossgrad_core.gradients.sparse_rows import PackedRows
 
 
 def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
@@ -22,7 +22,7 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
     Returns:
         T sums, None for columns without a gradient.
     """
-    packed = [Packed(column) for column in columns]
+    packed = [PackedRows(column) for column in columns]
     sums = _plain_sums([each.column for each in packed], divisor, keep=keep)
     return [each.unpacked(result) for each, result in zip(packed, sums, strict=True)]
 

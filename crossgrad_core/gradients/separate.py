@@ -14,9 +14,9 @@ from typing_extensions import override
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Elementwise, Granularity, SeparateGradients
 from crossgrad_core.gradients import exact, generic, native
-from crossgrad_core.gradients.by_rows import Packed, dense
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
 from crossgrad_core.gradients.passes import passes_of
+from crossgrad_core.gradients.sparse_rows import PackedRows, dense
 from crossgrad_core.gradients.squares import column_gramians, column_remainders
 
 KINDS: Final = ("geometry", "appearance", "neutral")
@@ -64,7 +64,7 @@ class DenseGradients(SeparateGradients):
         self._lost: dict[Granularity, NDArray[np.float64]] = {}
         self._tensors = tuple(name for block in self._blocks for name in block.tensors)
         self._packed = tuple(
-            Packed([_prepared(view.get(name)) for view in views]) for name in self._tensors
+            PackedRows([_prepared(view.get(name)) for view in views]) for name in self._tensors
         )
         self._columns: tuple[Column, ...] = tuple(each.column for each in self._packed)
         self._native = tuple(is_native(column) for column in self._columns)
@@ -98,7 +98,7 @@ class DenseGradients(SeparateGradients):
         return unit_roundoff(self._columns)
 
     @override
-    def remainders(self, granularity: Granularity) -> NDArray[np.float64]:
+    def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         if granularity not in self._lost:
             self._require_unspent()
             # What is added to an infinity or a NaN makes no difference.
@@ -184,7 +184,7 @@ class DenseGradients(SeparateGradients):
         """Makes all gradients dense."""
         if any(packed.rows is not None for packed in self._packed):
             self._packed = tuple(
-                Packed([dense(p.unpacked(g)) for g in p.column]) for p in self._packed
+                PackedRows([dense(p.unpacked(g)) for g in p.column]) for p in self._packed
             )
             self._columns = tuple(packed.column for packed in self._packed)
 

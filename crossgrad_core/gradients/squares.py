@@ -46,7 +46,7 @@ def column_remainders(
         group: [T] which of the sums each column is part of; -1 for none.
         gramians: [B, K, K].
     """
-    return exact.remainders(columns, group, gramians, _scale(columns))
+    return exact.rounding_residuals(columns, group, gramians, _scale(columns))
 
 
 def _scale(columns: Sequence[Column]) -> float:

@@ -14,11 +14,11 @@ from inspect import isabstract
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.changes import Change, change_of, change_of_import
-from crossgrad_core.registry.places import defined_at, raised_at
+from crossgrad_core.registry.deprecations import Change, change_of, change_of_import
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS, QUICK
+from crossgrad_core.registry.source_location import defined_at, raised_at
 from crossgrad_core.registry.strays import strays
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (

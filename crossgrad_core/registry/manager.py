@@ -16,13 +16,13 @@ from typing_extensions import override
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import (
     Answer,
-    Densified,
-    Regularized,
-    Sampled,
+    DensifyResult,
+    RegularizeResult,
+    SampleResult,
     StepContext,
 )
 from crossgrad_core.contract.hooks import HookSpecs
-from crossgrad_core.contract.marks import PROJECT
+from crossgrad_core.contract.markers import PROJECT
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import installed_as
@@ -175,11 +175,11 @@ def _described(name: str, plugin: object) -> str:
 def _complete(answer: Answer) -> bool:
     """Whether an answer's own part is of its type: a None inside must not go unnoticed either."""
     match answer:
-        case Sampled():
+        case SampleResult():
             return bool(answer.draw)
-        case Densified():
+        case DensifyResult():
             return isinstance(answer.edit, Edit)
-        case Regularized():
+        case RegularizeResult():
             return isinstance(answer.loss, Tensor) and answer.loss.numel() == 1
         case _:
             return True

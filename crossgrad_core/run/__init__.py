@@ -24,8 +24,8 @@ class _Room(ModuleType):
         verbose: bool = False,
         **options: object,
     ) -> "Run":
-        """Trains a scene, evaluates and exports it; see `crossgrad_core.run.door.run`."""
-        from crossgrad_core.run.door import run
+        """Trains a scene, evaluates and exports it; see `crossgrad_core.run.api.run`."""
+        from crossgrad_core.run.api import run
 
         return run(scene, config=config, quiet=quiet, verbose=verbose, **options)
 

@@ -14,13 +14,13 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import failed_plugin, notes_on
+from crossgrad_core.run.apply_plan import seconds_of
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
-from crossgrad_core.run.ending import Course, Ending, last_words, resume_line
-from crossgrad_core.run.forecast import Forecast
-from crossgrad_core.run.opening import continued, parsed, set_up
-from crossgrad_core.run.planning import seconds_of
-from crossgrad_core.run.reason import reason_of
+from crossgrad_core.run.eta import Forecast
+from crossgrad_core.run.failure_report import reason_of
+from crossgrad_core.run.finish import Ending, RunLoop, exit_messages, resume_line
+from crossgrad_core.run.load_run import continued, parsed, set_up
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
@@ -48,27 +48,27 @@ from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
 from crossgrad_core.run.session import CLOUD, Session, totals
 from crossgrad_core.run.settings import layered
-from crossgrad_core.run.settings_for_nothing import (
+from crossgrad_core.run.unused_settings import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
     without_resets,
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
 from crossgrad_core.scene.photo_check import check_photos, fits
+from crossgrad_core.system.check_writable import check_folder
 from crossgrad_core.system.checksums import changed_files, drop_checksums
-from crossgrad_core.system.interrupts import exit_code, way_on
-from crossgrad_core.system.writability import check_folder
+from crossgrad_core.system.interrupts import exit_code, resume_hint
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-from crossgrad_core.training.photo_parameters import known_starts
+from crossgrad_core.training.per_image_params import known_starts
 from crossgrad_core.training.rates import note_on_axes, note_on_plan
+from crossgrad_core.training.scale_clamp import note_on_sizes
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.training.stopper import Stopper
-from crossgrad_core.training.veils import note_on_sizes
 from crossgrad_core.wording import listed, one_line
 
 _LOG = logging.getLogger(__name__)
@@ -189,16 +189,16 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
         write_plan(folder, setup.plan)
         write_plugins(folder, packages_of(setup))
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
-        with way_on(resume_line(folder)):
+        with resume_hint(resume_line(folder)):
             return _train(setup, state, Session.fresh(folder, setup), length, way.tell)
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
     """The setup with what exposure and start say about the scene, and the seconds it took."""
     begun, scene = perf_counter(), setup.scene
-    remarks = setup.exposure.remarks(scene, known_starts(setup))
-    remarks += setup.selection.start.remarks(scene)
-    return replace(setup, notes=(*setup.notes, *remarks)), perf_counter() - begun
+    messages = setup.exposure.messages(scene, known_starts(setup))
+    messages += setup.selection.start.messages(scene)
+    return replace(setup, notes=(*setup.notes, *messages)), perf_counter() - begun
 
 
 def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
@@ -321,10 +321,10 @@ def _train(
     setup.manager.register(session.machine, name="machine")
     stopper = Stopper()
     with stopper.installed():
-        course = Course(setup, state, session, log, stopper)
+        course = RunLoop(setup, state, session, log, stopper)
         ending = course.to_the_end(length)
         table = final_table(session.result(state.step), totals(course.setup, state))
-        words = last_words(course)
+        words = exit_messages(course)
         for text in (table, *words):
             log.write(text)
         tell(table, session.folder, words)
@@ -362,7 +362,7 @@ def resumed(
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
     read_config(folder)  # Before a lock is laid into a folder that is no run's.
-    with way_on(resume_line(folder)), _held(folder):
+    with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step

@@ -11,7 +11,7 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
@@ -27,23 +27,23 @@ from crossgrad_core.registry.entries import (
 )
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
+from crossgrad_core.run.apply_plan import notes_of, planned
 from crossgrad_core.run.devices import choose_device
-from crossgrad_core.run.idle import idle_note
-from crossgrad_core.run.planning import notes_of, planned
+from crossgrad_core.run.noop_operator import idle_note
 from crossgrad_core.run.select import select
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.self_check.check import checked
+from crossgrad_core.training.averaging import notes_on as at_the_end
 from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rates import note_on_axes
 from crossgrad_core.training.rates import notes_on as of_rates
-from crossgrad_core.training.regrouping import labels_of
+from crossgrad_core.training.relabel import labels_of
 from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.scale_clamp import note_on_sizes
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.steady import notes_on as at_the_end
-from crossgrad_core.training.veils import note_on_sizes
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
 _LOG = logging.getLogger(__name__)
@@ -156,7 +156,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     }
     plugins = _plugins(selection, observers)
     manager = make_manager(plugins)
-    answers = manager.hook.crossgrad_objections(selection=selection)
+    answers = manager.hook.crossgrad_validate_selection(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
     config = with_dropout(_with_steps(config, selection.views), scene, notes)
@@ -219,7 +219,7 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
     return config.model_copy(update={"sh_from": degree})
 
 
-def _with_steps(config: RunConfig, views: ViewPlan) -> RunConfig:
+def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     """The configuration with a length in steps, where it has none in seconds.
 
     Views within seconds stay: whether there are seconds for them is known after the first steps.

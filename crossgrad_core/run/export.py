@@ -18,11 +18,11 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare
 from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.system.files import write_atomically
-from crossgrad_core.training.photo_parameters import exposed
+from crossgrad_core.training.averaging import eval_parameters
+from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import shown
-from crossgrad_core.training.targets import eval_background
+from crossgrad_core.training.view_target import eval_background
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def export_scene(
     views = setup.train_views if view is None else (view,)
     with torch.no_grad():
         cameras = [each.camera for each in views]
-        baked = setup.backbone.bake(shown(state), phase, cameras)
+        baked = setup.backbone.bake(eval_parameters(state), phase, cameras)
     exporter = exporter or setup.selection.exporter
     placed = setup.scene.georeference.placed(baked, setup.scene.similarity, coordinates)
     comments = [f"crossgrad step {state.step}"]
@@ -169,7 +169,7 @@ def view_named(setup: Setup, name: str, where: str = "--camera") -> View:
 def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
     """Renders a view with the parameters to be shown as an evaluation does, exposure included."""
     through = camera_renderer(setup, state)
-    return lambda view: exposed(setup, state, view, through(view.camera))
+    return lambda view: apply(setup, state, view, through(view.camera))
 
 
 def plain_renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
@@ -180,7 +180,7 @@ def plain_renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
 
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
     """Renders what any camera sees with the parameters to be shown, before any exposure."""
-    background, parameters = eval_background(setup), shown(state)
+    background, parameters = eval_background(setup), eval_parameters(state)
     phase = setup.phase(state.step, training=False)
 
     def render_one(camera: Camera) -> Tensor:
@@ -196,7 +196,7 @@ def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[V
     On black: what a file holds is what viewers draw, and they draw it so.
     """
     plain = plain_drawer(setup, gaussians)
-    return lambda view: exposed(setup, state, view, plain(view))
+    return lambda view: apply(setup, state, view, plain(view))
 
 
 def plain_drawer(setup: Setup, gaussians: Gaussians) -> Callable[[View], Tensor]:

@@ -6,11 +6,11 @@ from typing import Any
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
+from crossgrad_core.training.averaging import average_of, lr_tail_of
 from crossgrad_core.training.floaters import removes_floaters
-from crossgrad_core.training.room import bound_of
+from crossgrad_core.training.growth_budget import bound_of
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.steady import average_of, final_decay_of
 
 #: Slots that every run fills with one component.
 ALWAYS = (
@@ -52,7 +52,7 @@ def resolved(setup: Setup) -> RunConfig:
             "steps": None if config.seconds else config.steps or setup.schedule.total,
             "events": setup.schedule.counting.unit,
             "sh_every": setup.schedule.sh_every,
-            "final_decay": _final_decay(config, setup),
+            "lr_tail": _lr_tail(config, setup),
             "average": average_of(config),
             "floaters": "remove" if removes_floaters(config, setup.densifier) else "keep",
             "growth": growth_of(setup),
@@ -66,10 +66,10 @@ def _located(path: Path | None) -> Path | None:
     return path.resolve() if path is not None and path.exists() else path
 
 
-def _final_decay(config: RunConfig, setup: Setup) -> float:
+def _lr_tail(config: RunConfig, setup: Setup) -> float:
     """The share over which rates fade; 0, and no more may be asked for, where all decay."""
     fading = any(not block.lr.decays for block in setup.trained_blocks)
-    return final_decay_of(config) if fading else 0.0
+    return lr_tail_of(config) if fading else 0.0
 
 
 def _choice(name: str, component: Component) -> ComponentChoice:

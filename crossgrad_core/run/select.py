@@ -13,7 +13,7 @@ from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
@@ -61,7 +61,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     fitting = backbone.fitted_to(scene)
     backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
-    views = config.view_plan or ViewPlan((usual_views(config, sampler, operator, notes),))
+    views = config.view_plan or ViewsPerStepSpec((usual_views(config, sampler, operator, notes),))
     usual = usual_densifier(config, views, backbone, len(scene.train_views))
     densifier, densifier_name = _named_or(usual, Densifier, config.densifier)
     of_backbone = backbone.default_densifier

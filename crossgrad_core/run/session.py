@@ -13,8 +13,9 @@ from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint.checkpoint import drop_later, latest, renew_scalars, save
 from crossgrad_core.run.checkpoint.folders import Keep
+from crossgrad_core.run.checkpoint_io import to_checkpoint
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
-from crossgrad_core.run.persist import to_checkpoint
+from crossgrad_core.run.results.cost_totals import Totals
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.environment import environment
 from crossgrad_core.run.results.kept import KEY as KEPT
@@ -30,10 +31,9 @@ from crossgrad_core.run.results.panels import PanelWriter
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.plan_file import read_plan
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
-from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.training.memory import peak_mebibytes
+from crossgrad_core.training.per_image_params import write_photos
 from crossgrad_core.training.photo_file import FILE as PHOTO_VALUES
-from crossgrad_core.training.photo_parameters import write_photos
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -182,7 +182,7 @@ class Session:
             self._exported = export_scene(setup, state, path)
             write_photos(setup, state, self.folder / PHOTO_VALUES)
         for line in described(self._exported, path):
-            setup.hook.crossgrad_message(text=line)
+            setup.hook.crossgrad_log(text=line)
 
     def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None

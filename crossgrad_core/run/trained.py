@@ -117,7 +117,7 @@ class Run:
         Raises:
             UserError: The run has no checkpoint, or its scene is another one.
         """
-        from crossgrad_core.run.afterwards.figures import evaluated
+        from crossgrad_core.run.postprocess.evaluate import evaluated
         from crossgrad_core.run.process import as_in_a_command
 
         with as_in_a_command():
@@ -141,7 +141,7 @@ class Run:
             UserError: The file exists or cannot be written, there is no such view, the scene is not
                 georeferenced, or the run has no checkpoint.
         """
-        from crossgrad_core.run.afterwards.files import exported
+        from crossgrad_core.run.postprocess.export import exported
         from crossgrad_core.run.process import as_in_a_command
 
         with as_in_a_command():
@@ -157,7 +157,7 @@ class Run:
             return out
 
     def _open(self) -> "tuple[Setup, TrainState]":
-        from crossgrad_core.run.opening import require_checkpoint
+        from crossgrad_core.run.load_run import require_checkpoint
         from crossgrad_core.run.process import as_in_a_command
 
         require_checkpoint(self.folder)
@@ -202,7 +202,7 @@ class _Opened:
 
     def open(self, folder: Path) -> "tuple[Setup, TrainState]":
         """The run's setup and its newest state."""
-        from crossgrad_core.run.afterwards.how import How
+        from crossgrad_core.run.postprocess.open_options import How
 
         newest = max(named_checkpoints(folder / CHECKPOINTS), default=0)
         if self._kept is None or self._kept[0] != newest:

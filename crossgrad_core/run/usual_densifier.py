@@ -5,7 +5,7 @@ from typing import Final
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import REFERENCE
 from crossgrad_core.defaults import DENSIFIER, SHORT_DENSIFIER
@@ -20,7 +20,9 @@ from crossgrad_core.training.schedules import growth_by
 MANY_PHOTOS: Final = 100
 
 
-def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, photos: int) -> str:
+def usual_densifier(
+    config: RunConfig, views: ViewsPerStepSpec, backbone: Backbone, photos: int
+) -> str:
     """The backbone's; in short runs of many photos one that asks where pixels pull, whichever way.
 
     Where a budget leads growth, what counts is which Gaussians ask the most, not how many ask
@@ -39,7 +41,7 @@ def usual_densifier(config: RunConfig, views: ViewPlan, backbone: Backbone, phot
     return SHORT_DENSIFIER if here and _is_heard(config, backbone) else usual
 
 
-def _is_led(config: RunConfig, views: ViewPlan) -> bool:
+def _is_led(config: RunConfig, views: ViewsPerStepSpec) -> bool:
     """Whether a budget leads growth, which the published length has none of; `is_led` by views."""
     if growth_by(config, budgeted=True) != "curve" or not counts_as_short(config, views):
         return False

@@ -79,7 +79,7 @@ def _failure(config: RunConfig, name: str) -> str:
     """Try the rasterizer, and return what is wrong; empty if it works."""
     _LOG.info("trying rasterizer %s on the GPU: the first time it may compile for minutes", name)
     try:
-        build(Rasterizer, name, config.rasterizer.options).burn_in("cuda")
+        build(Rasterizer, name, config.rasterizer.options).self_test("cuda")
     except UserError as error:
         return sentences(error.what, *([] if error.found is None else [error.found]))
     except Exception as error:

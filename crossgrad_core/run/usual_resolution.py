@@ -3,14 +3,18 @@
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import REFERENCE, is_published
 from crossgrad_core.defaults import RESOLUTION, SHORT_RESOLUTION
 from crossgrad_core.training.schedules import growth_by
 
 
 def usual_resolution(
-    config: RunConfig, views: ViewPlan, backbone: Backbone, densifier: Densifier, device: str
+    config: RunConfig,
+    views: ViewsPerStepSpec,
+    backbone: Backbone,
+    densifier: Densifier,
+    device: str,
 ) -> str:
     """Some of the pixels first in short runs on a CPU, where pixels are most of a step; else all.
 
@@ -35,7 +39,7 @@ def is_plain(backbone: Backbone) -> bool:
     return bool(backbone.axes) and backbone.response == "plain"
 
 
-def counts_as_short(config: RunConfig, views: ViewPlan) -> bool:
+def counts_as_short(config: RunConfig, views: ViewsPerStepSpec) -> bool:
     """Whether a run is shorter than published ones, and has not their schedule or rules.
 
     A run within seconds counts as short: its length is not known.

@@ -4,7 +4,7 @@ from typing import Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.registry.entries import build
@@ -48,9 +48,9 @@ def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: 
     return found or usual
 
 
-def view_plan_of(config: RunConfig) -> ViewPlan:
+def views_per_step_spec_of(config: RunConfig) -> ViewsPerStepSpec:
     """K over a run of that configuration, as it will be assembled."""
     if config.view_plan is not None:
         return config.view_plan
     sampler = build(Sampler, config.sampler.name, config.sampler.options)
-    return ViewPlan((usual_views(config, sampler, operator_of(config)[0], []),))
+    return ViewsPerStepSpec((usual_views(config, sampler, operator_of(config)[0], []),))

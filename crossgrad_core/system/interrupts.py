@@ -28,7 +28,7 @@ def exit_code(number: int) -> int:
     return 128 + number
 
 
-def listened_to() -> list[int]:
+def signal_names() -> list[int]:
     """The signals that are not ignored; `nohup` and background jobs of scripts ignore some."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
@@ -69,7 +69,7 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
 
 
 @contextmanager
-def way_on(text: str) -> Iterator[None]:
+def resume_hint(text: str) -> Iterator[None]:
     """Inside the block an end at once is followed by this line."""
     _WAYS_ON.append(text)
     try:
@@ -81,7 +81,7 @@ def way_on(text: str) -> Iterator[None]:
 @contextmanager
 def ended_quietly() -> Iterator[None]:
     """Ends the process at once when it is asked to inside the block, and quietly after it."""
-    numbers = listened_to()
+    numbers = signal_names()
     for number in numbers:
         signal.signal(number, end_at_once)
     try:

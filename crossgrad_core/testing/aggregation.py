@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.contexts import AggregateContext, Aggregated
+from crossgrad_core.contract.contexts import AggregateContext, AggregateResult
 from crossgrad_core.contract.operator import STATE, Operator
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.gradients.separate import DenseGradients
@@ -87,14 +87,14 @@ def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients
 
 def aggregated(
     operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
-) -> Aggregated:
+) -> AggregateResult:
     """What the operator answers at the seam; see `aggregate_context`."""
     return _answer(operator, aggregate_context(gradients, summed=summed))
 
 
-def _answer(operator: Operator, context: AggregateContext) -> Aggregated:
+def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
     answer: object = operator.crossgrad_aggregate_gradients(context)
-    if not isinstance(answer, Aggregated):
+    if not isinstance(answer, AggregateResult):
         require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
         raise TypeError
     return answer

@@ -293,20 +293,20 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
 
 
 def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
-    """What `passed_on` names reaches the Gaussians as the very tensor, or not; nothing reads it."""
+    """A tensor of `passthrough` reaches the Gaussians as it is; `decode` does not read it."""
     backbone = make()
     parameters = created(backbone)
-    for name in parameters.keys() & set(backbone.passed_on.values()):
+    for name in parameters.keys() & set(backbone.passthrough.values()):
         parameters[name] = torch.full_like(parameters[name], torch.nan)
     for step in _STEPS:
         gaussians = backbone.decode(parameters, sample_camera(), sample_phase(step))
         for field, value in vars(gaussians).items():
-            if value is not None and field in backbone.passed_on:
-                kept = value is parameters.get(backbone.passed_on[field])
-                require(kept, f"{field} is not the tensor that passed_on names")
+            if value is not None and field in backbone.passthrough:
+                kept = value is parameters.get(backbone.passthrough[field])
+                require(kept, f"{field} is not the tensor that passthrough names")
             elif isinstance(value, Tensor):
                 known = bool(value.isfinite().all())
-                require(known, f"{field} is made of a tensor that passed_on names")
+                require(known, f"{field} is made of a tensor that passthrough names")
 
 
 BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (

@@ -39,7 +39,7 @@ def an_image_stays_an_image(make: Make[Exposure]) -> None:
     exposure, values = make(), _first(_starts(make()))
     for image in (_image(), _image()[:5, :9], 3.0 * _image() - 1.0, torch.zeros(4, 4, 3)):
         kept = image.clone()
-        taken = exposure.exposed(image, values)
+        taken = exposure.apply(image, values)
         require(taken.shape == image.shape, f"{list(image.shape)} became {list(taken.shape)}")
         require(taken.dtype == image.dtype, f"{image.dtype} became {taken.dtype}")
         require(taken.isfinite().all(), "the image as taken is not finite")
@@ -51,7 +51,7 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
     exposure = make()
     values = {name: row.clone().requires_grad_() for name, row in _first(_starts(exposure)).items()}
     image = _image().requires_grad_()
-    taken = exposure.exposed(image, values)
+    taken = exposure.apply(image, values)
     weights = torch.rand(taken.shape, generator=torch.Generator().manual_seed(4))
     inputs = {"the render": image, **values}
     found = torch.autograd.grad((taken * weights).sum(), list(inputs.values()), allow_unused=True)
@@ -68,12 +68,12 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
     if not values:
         raise cannot_tell("it has no parameters")
     kept = {name: each.clone() for name, each in values.items()}
-    once = exposure.projected(values)
+    once = exposure.project(values)
     require(once.keys() == values.keys(), f"{sorted(values)} became {sorted(once)}")
     for name, each in once.items():
         _require_rows(f"the projected {name}", each)
         require(torch.equal(values[name], kept[name]), f"the projection changes {name} in place")
-        again = exposure.projected(once)[name]
+        again = exposure.project(once)[name]
         close = torch.allclose(again, each, rtol=_ROUNDING, atol=_ROUNDING)
         require(close, f"a second projection moves {name} on")
 
@@ -83,7 +83,7 @@ def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
     exposure, scene = make(), sample_scene()
     starts = _starts(exposure)
     for view in scene.test_views:
-        values = exposure.unseen(view, scene, starts)
+        values = exposure.predict_unseen(view, scene, starts)
         require(values.keys() == starts.keys(), f"a held-out view gets {sorted(values)}")
         for name, value in values.items():
             right = value.shape == starts[name].shape[1:] and value.isfinite().all()
@@ -93,7 +93,7 @@ def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
 def same_input_same_bits(make: Make[Exposure]) -> None:
     """The image as taken depends on the render and the values alone."""
     values = _first(_starts(make()))
-    one, two = (make().exposed(_image(), values) for _ in range(2))
+    one, two = (make().apply(_image(), values) for _ in range(2))
     require(torch.equal(one, two), "two calls give different images")
 
 

@@ -25,5 +25,5 @@ def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
 
     Nothing is late here, so bringing rows does nothing.
     """
-    fields = frozenset(f for f in backbone.passed_on if getattr(gaussians, f) is not None)
+    fields = frozenset(f for f in backbone.passthrough if getattr(gaussians, f) is not None)
     return replace(gaussians, on_demand=OnDemand(fields, lambda _: None)).whole()

@@ -19,27 +19,27 @@ from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
-    Aggregated,
+    AggregateResult,
     Answer,
-    Densified,
     DensifyContext,
-    Draw,
+    DensifyResult,
     EvaluationReport,
     Model,
     PixelContext,
     RegularizeContext,
-    Regularized,
+    RegularizeResult,
     RunInfo,
     SampleContext,
-    Sampled,
+    SampleResult,
     ScaleContext,
-    Scaled,
+    ScaleResult,
     StepContext,
     StepRecord,
+    ViewSample,
 )
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
@@ -96,20 +96,20 @@ class _Components:
     """Stands in for the selected components: a fixed draw, full size, the plain sum, no edit."""
 
     @hookimpl
-    def crossgrad_sample_views(self, context: SampleContext) -> Sampled:
-        return Sampled(Draw(_VIEWS))
+    def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
+        return SampleResult(ViewSample(_VIEWS))
 
     @hookimpl
-    def crossgrad_choose_scales(self, context: ScaleContext) -> Scaled:
-        return Scaled((1.0,) * len(_VIEWS))
+    def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
+        return ScaleResult((1.0,) * len(_VIEWS))
 
     @hookimpl
-    def crossgrad_aggregate_gradients(self, context: AggregateContext) -> Aggregated:
-        return Aggregated(context.gradients.total())
+    def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
+        return AggregateResult(context.gradients.total())
 
     @hookimpl
-    def crossgrad_densify(self, context: DensifyContext) -> Densified:
-        return Densified(NO_EDIT)
+    def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
+        return DensifyResult(NO_EDIT)
 
 
 @contextmanager
@@ -164,8 +164,8 @@ def survives_every_event(make: Make[Observer]) -> None:
                 hooks.crossgrad_evaluation(
                     report=EvaluationReport(2, {"step": 2, "psnr": 20.0, "ssim": None})
                 )
-                hooks.crossgrad_length(step=2, total=3)
-                hooks.crossgrad_message(text="a line of text")
+                hooks.crossgrad_length_changed(step=2, total=3)
+                hooks.crossgrad_log(text="a line of text")
                 hooks.crossgrad_run_end(status="finished")
 
 
@@ -173,7 +173,7 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
     """Requires that the hooks of a step raise nothing; what they answer is looked at elsewhere."""
     try:
         _step_end(hooks, step, _seams(hooks, observer, step))
-        hooks.crossgrad_model(model=_model(step))
+        hooks.crossgrad_model_ready(model=_model(step))
     except ContractError:
         raise
     except (Exception, SystemExit) as error:
@@ -190,7 +190,7 @@ def the_model_stays_untouched(make: Make[Observer]) -> None:
         for step in _STEPS:
             model = _model(step)
             _step_end(hooks, step, [])
-            hooks.crossgrad_model(model=model)
+            hooks.crossgrad_model_ready(model=model)
             _require_new(model, step)
 
 
@@ -199,10 +199,10 @@ def _require_new(model: Model, step: int) -> None:
     same = _model(step).parameters
     for name, tensor in model.parameters.items():
         equal = torch.equal(tensor.detach(), same[name].detach())
-        require(equal, f"step {step}: crossgrad_model changes the parameters {name}")
+        require(equal, f"step {step}: crossgrad_model_ready changes the parameters {name}")
     for name, moment in model.adam.exp_avg.items():
         changed = bool(moment.any())
-        require(not changed, f"step {step}: crossgrad_model changes the moments of {name}")
+        require(not changed, f"step {step}: crossgrad_model_ready changes the moments of {name}")
 
 
 def survives_an_early_end(make: Make[Observer]) -> None:
@@ -220,14 +220,14 @@ def seams_stay_answered(make: Make[Observer]) -> None:
         _start(hooks, None)
         for step in _STEPS:
             sampled, scaled, aggregated, densified = _seams(hooks, observer, step)
-            _require_views(step, cast("Sampled", sampled), cast("Scaled", scaled))
-            _require_gradients(step, cast("Aggregated", aggregated))
-            edit = cast("Densified", densified).edit
+            _require_views(step, cast("SampleResult", sampled), cast("ScaleResult", scaled))
+            _require_gradients(step, cast("AggregateResult", aggregated))
+            edit = cast("DensifyResult", densified).edit
             require(isinstance(edit, Edit), f"step {step}: the edit is {edit!r}, not an Edit")
             require_good(edit, run.backbone.blocks(), run.parameters)
 
 
-def _require_views(step: int, sampled: Sampled, scaled: Scaled) -> None:
+def _require_views(step: int, sampled: SampleResult, scaled: ScaleResult) -> None:
     drawn, scales = len(sampled.draw.views), scaled.scales
     require(drawn == len(_VIEWS), f"step {step}: {len(_VIEWS)} views became {drawn}")
     good = len(scales) == len(_VIEWS) and all(0.0 < scale <= 1.0 for scale in scales)
@@ -235,7 +235,7 @@ def _require_views(step: int, sampled: Sampled, scaled: Scaled) -> None:
     require(good, f"step {step}: {len(_VIEWS)} views get the scales {scales}; {wanted}")
 
 
-def _require_gradients(step: int, aggregated: Aggregated) -> None:
+def _require_gradients(step: int, aggregated: AggregateResult) -> None:
     gradients, answered = sample_gradients(len(_VIEWS))[0], aggregated.gradients
     what = f"step {step}: a wrapper of crossgrad_aggregate_gradients answers"
     require(
@@ -257,9 +257,11 @@ def questions_are_answered_in_kind(make: Make[Observer]) -> None:
     run = DensifierRun.of(build(Densifier, NO_DENSIFIER, {}))
     kept = {name: tensor.detach().clone() for name, tensor in run.parameters.items()}
     with _hooks(make()) as hooks, global_randomness_untouched():
-        for reasons in hooks.crossgrad_objections(selection=selection):
+        for reasons in hooks.crossgrad_validate_selection(selection=selection):
             good = isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
-            require(good, f"crossgrad_objections answers {reasons!r}, not a list of sentences")
+            require(
+                good, f"crossgrad_validate_selection answers {reasons!r}, not a list of sentences"
+            )
         _start(hooks, None)
         for step in _STEPS:
             _require_usable(hooks, run, step, 0.5 if step == 2 else 1.0)  # noqa: PLR2004
@@ -283,13 +285,13 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
     for gaussians, view in ((drawn, shown.view), (None, None)):
         context = RegularizeContext(**fields, gaussians=gaussians, view=view)
         for answer in hooks.crossgrad_regularize(context=context):
-            _require_answer(answer, Regularized)
+            _require_answer(answer, RegularizeResult)
             loss = answer.loss
             good = isinstance(loss, Tensor) and loss.ndim == 0 and loss.isfinite()
             require(good, f"the loss of crossgrad_regularize is {loss!r:.60}, no finite scalar")
     after = AfterStepContext(**fields, means_lr=1e-4, edited=False)
     for answer in hooks.crossgrad_after_step(context=after):
-        _require_answer(answer, Densified)
+        _require_answer(answer, DensifyResult)
         require(isinstance(answer.edit, Edit), f"the edit is {answer.edit!r}, not an Edit")
         require_good(answer.edit, run.backbone.blocks(), run.parameters)
 
@@ -340,16 +342,16 @@ def _seams(
         **step_fields(step), views_per_step=len(_VIEWS), groups=None, centers=centers, last=last
     )
     quiet = build(Densifier, NO_DENSIFIER, {})
-    scale = ScaleContext(**step_fields(step), draw=Draw(_VIEWS), last=last)
+    scale = ScaleContext(**step_fields(step), draw=ViewSample(_VIEWS), last=last)
     summed = not observer.needs_separate_gradients
     gradients = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
     if last is None:
         gradients = replace(gradients, labels=None)
     asked: list[tuple[Any, StepContext, type[Answer]]] = [
-        (hooks.crossgrad_sample_views, sample, Sampled),
-        (hooks.crossgrad_choose_scales, scale, Scaled),
-        (hooks.crossgrad_aggregate_gradients, replace(gradients, step=step), Aggregated),
-        (hooks.crossgrad_densify, DensifierRun.of(quiet).context(step), Densified),
+        (hooks.crossgrad_sample_views, sample, SampleResult),
+        (hooks.crossgrad_choose_scales, scale, ScaleResult),
+        (hooks.crossgrad_aggregate_gradients, replace(gradients, step=step), AggregateResult),
+        (hooks.crossgrad_densify, DensifierRun.of(quiet).context(step), DensifyResult),
     ]
     answers = []
     for hook, context, kind in asked:
@@ -390,7 +392,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
         for step in range(1, 4 * _BLOCK + 1):
             hooks.crossgrad_aggregate_gradients(context=replace(gradients, step=step))
             _step_end(hooks, step, [])
-            hooks.crossgrad_model(model=model)
+            hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
     # What it keeps once, such as a buffer, comes in the first steps.
@@ -398,8 +400,8 @@ def nothing_piles_up(make: Make[Observer]) -> None:
     require(
         grown <= _KEPT,
         f"the observer keeps {grown / 1e6:.1f} MB more after each step (crossgrad_step_end, "
-        f"crossgrad_model, wrappers); expected at most {_KEPT / 1e6:g} MB, so that 30,000 steps "
-        "fit into memory: keep sums, or write to the run's folder",
+        f"crossgrad_model_ready, wrappers); expected at most {_KEPT / 1e6:g} MB, so that 30,000 "
+        "steps fit into memory: keep sums, or write to the run's folder",
     )
 
 

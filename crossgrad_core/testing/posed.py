@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import Draw, SampleContext, StepRecord
+from crossgrad_core.contract.contexts import SampleContext, StepRecord, ViewSample
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Schedule
@@ -83,7 +83,7 @@ class SamplerRun:
     step: int = 0
     last: StepRecord | None = None
 
-    def draw(self) -> Draw:
+    def draw(self) -> ViewSample:
         """The views of the next step."""
         self.step += 1
         draw, self.state = self.sampler.sample(self.context(), self.state)
@@ -100,7 +100,7 @@ class SamplerRun:
         )
         return draw
 
-    def draws(self, count: int) -> Iterator[Draw]:
+    def draws(self, count: int) -> Iterator[ViewSample]:
         """The views of the next `count` steps."""
         for _ in range(count):
             yield self.draw()

@@ -152,7 +152,7 @@ def _directions_are_of_pixels(screen: Screen) -> None:
 
 def same_input_same_bits(make: Make[Rasterizer]) -> None:
     """Two renders and their gradients are equal to the last bit, and inputs stay as they were."""
-    if not make().repeatable:
+    if not make().deterministic:
         raise cannot_tell("it says that its bits differ from run to run")
     results = []
     original = sample_gaussians(harmonics=True)
@@ -188,9 +188,9 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
-    """With `by_rows`, rows that are drawn are asked for and have the gradients, to the bit."""
+    """With `sparse_rows`, rows that are drawn are asked for and have the gradients, to the bit."""
     rasterizer = make()
-    if not rasterizer.by_rows:
+    if not rasterizer.sparse_rows:
         return
     some = moved(sample_gaussians(harmonics=True), device_of(rasterizer))
     with torch.no_grad():

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from crossgrad_core.contract.contexts import Draw, ScaleContext, StepRecord
+from crossgrad_core.contract.contexts import ScaleContext, StepRecord, ViewSample
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.contract.state import PluginState
@@ -45,9 +45,9 @@ class _Run:
         return scales
 
 
-def _draw(step: int) -> Draw:
+def _draw(step: int) -> ViewSample:
     count = len(sample_scene().train)
-    return Draw(tuple((step + 3 * slot) % count for slot in range(1 + step % 4)))
+    return ViewSample(tuple((step + 3 * slot) % count for slot in range(1 + step % 4)))
 
 
 def every_view_has_a_scale(make: Make[Resolution]) -> None:

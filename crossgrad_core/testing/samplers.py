@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from crossgrad_core.contract.contexts import Draw
+from crossgrad_core.contract.contexts import ViewSample
 from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.registry.entries import build
@@ -67,8 +67,8 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
             run.draw()
 
 
-def _require_good(draw: Draw, counts: frozenset[int], available: int) -> None:
-    require(isinstance(draw, Draw), f"the sampler answers {draw!r}, not a Draw and a state")
+def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> None:
+    require(isinstance(draw, ViewSample), f"the sampler answers {draw!r}, not a Draw and a state")
     require(
         isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
         f"the drawn views {draw.views!r} are not a tuple of plain integers",
@@ -95,7 +95,7 @@ def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
     for draw in run.draws(_AFTER):
         require(
             draw.labels is not None,
-            "context.groups is given, and sample answers a Draw without labels, so that no "
+            "context.groups is given, and sample answers a ViewSample without labels, so that no "
             "operator can tell the groups apart; expected a label for each view, such as "
             "context.groups[view]",
         )

@@ -49,14 +49,14 @@ class ShortRun:
 def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     """The reasons for which a run is refused before training; empty where it is not.
 
-    They are what components object (`crossgrad_objections`) and what does not fit of what they
-    declare: numbers of views, tensors, statistics, devices. Any other error is none of them.
+    A combination is refused if a component objects (`crossgrad_validate_selection`), or if what
+    its components declare does not fit: numbers of views, tensors, statistics, devices.
     """
     selection, _ = select(config, sample_scene(), "none")
     # What the manager would gather; registering with it would take most of the time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.components.values(), *observers)
-    asked = (getattr(each, "crossgrad_objections", None) for each in plugins)
+    asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
     answers = [ask(selection) for ask in asked if ask is not None]
     return reasons_against(config, selection, [each for each in answers if each])
 
@@ -122,5 +122,5 @@ def try_out(config: RunConfig, steps: int) -> None:
     with on_one_thread():
         run = train(setup, steps)
         require_sound(run)
-        if setup.rasterizer.repeatable:
+        if setup.rasterizer.deterministic:
             require_repeated(run, train(setup, steps))

@@ -57,7 +57,7 @@ def answers_alike(make: Make[Start]) -> None:
     with global_randomness_untouched():
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
-        told = one.remarks(scene) == other.remarks(scene)
+        told = one.messages(scene) == other.messages(scene)
     require(told, "remarks() differ from one call to the next")
     require((first is None) == (second is None), "points are added the one time only")
     if first is not None and second is not None:

@@ -10,7 +10,7 @@ from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.numerics.kernel_cache import told_of_missing
 from crossgrad_core.training.clock import ClockKind
 from crossgrad_core.training.expected_cost import (
-    Crowd,
+    PrimitiveCounts,
     cost_ahead,
     cost_of_run,
     growth_ahead,
@@ -56,7 +56,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     state.step = _FULL_SIZE
     steps, each = _probed(probed, state, seconds)
     note = f"{steps} probed steps took {each * pace.at(_FULL_SIZE) * 1000:.1f} ms each"
-    crowd = Crowd.of(setup, state)
+    crowd = PrimitiveCounts.of(setup, state)
 
     def fitting(share: float) -> int:
         measured = replace(setup, pixel_share=share)
@@ -145,7 +145,7 @@ class Planned:
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """The setup with the length that is written down."""
-        return _told(setup, lengthened(setup, state.step, self._revisions[state.step]))
+        return _told(setup, with_length(setup, state.step, self._revisions[state.step]))
 
 
 class Timed:
@@ -186,14 +186,14 @@ class Timed:
         self._each = each = before + SMOOTHING * (newest - before)
         self._look(state)
         affordable = (self._seconds - state.clock.trained(self._kind)) / each
-        crowd, step = Crowd.of(setup, state), state.step
+        crowd, step = PrimitiveCounts.of(setup, state), state.step
         fits = step + _fitting(lambda left: cost_ahead(setup, crowd, step, left), affordable)
         total = min(fits, self._most)
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
         revisions = (*setup.config.revisions, (state.step, total))
         config = setup.config.model_copy(update={"revisions": revisions})
-        return _told(setup, lengthened(replace(setup, config=config), state.step, total))
+        return _told(setup, with_length(replace(setup, config=config), state.step, total))
 
     def _look(self, state: TrainState) -> None:
         self._step, self._clock = state.step, state.clock.trained(self._kind)
@@ -210,22 +210,22 @@ def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
     schedule, step = setup.schedule, state.step
     now = views_of(setup, schedule, max(0, step - 1), max(1, step))
     steps = views_of(setup, schedule, step, schedule.total) / now
-    return steps * each * growth_ahead(setup, Crowd.of(setup, state), schedule, step)
+    return steps * each * growth_ahead(setup, PrimitiveCounts.of(setup, state), schedule, step)
 
 
-def lengthened(setup: Setup, step: int, total: int) -> Setup:
+def with_length(setup: Setup, step: int, total: int) -> Setup:
     """The setup of a run that has reached `step` and is to have `total` steps in all."""
     wanted = schedule_for(setup, total)
-    setup.hook.crossgrad_length(step=step, total=total)
-    schedule = setup.schedule.lengthened(wanted, step)
+    setup.hook.crossgrad_length_changed(step=step, total=total)
+    schedule = setup.schedule.with_length(wanted, step)
     return _with_notes(replace(setup, schedule=schedule), instead_of=setup)
 
 
-def caught_up(setup: Setup, step: int) -> Setup:
+def replay_length(setup: Setup, step: int) -> Setup:
     """The setup as it was when the run had done `step` steps."""
     for done, total in setup.config.revisions:
         if done <= step:
-            setup = lengthened(setup, done, total)
+            setup = with_length(setup, done, total)
     return setup
 
 
@@ -250,9 +250,9 @@ def _told(before: Setup, after: Setup) -> Setup:
         schedule = after.schedule
         start, end = map(schedule.step_of, (schedule.densify_from, schedule.densify_until))
         text = f"density control after all: in {schedule.total} steps it lasts from step "
-        before.hook.crossgrad_message(text=f"{text}{start} to step {min(end, schedule.total)}")
+        before.hook.crossgrad_log(text=f"{text}{start} to step {min(end, schedule.total)}")
     elif now and not was:
-        before.hook.crossgrad_message(text=now[0])
+        before.hook.crossgrad_log(text=now[0])
     return after
 
 

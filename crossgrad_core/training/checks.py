@@ -50,7 +50,7 @@ def _way_out(step: int) -> str:
 
 def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
     """Stops a run that had to drop too many non-finite gradients."""
-    if state.counters.dropped >= setup.config.max_dropped:
+    if state.counters.dropped >= setup.config.max_nonfinite_blocks:
         raise TrainingFailedError(
             f"{state.counters.dropped} blocks of single views were dropped because their gradient "
             f"was not finite, the last in step {state.step} (views {', '.join(record.names)})"

@@ -55,7 +55,7 @@ class Clock:
         """A copy that stays as it is."""
         return replace(self, phases=dict(self.phases))
 
-    def count(self, laps: "Laps") -> None:
+    def count(self, laps: "PhaseTimer") -> None:
         """Adds a complete step."""
         self.train += laps.total
         self.cpu += laps.cpu
@@ -64,7 +64,7 @@ class Clock:
 
 
 @dataclass
-class Laps:
+class PhaseTimer:
     """The phases of the step under way; a step that is cut short counts for none.
 
     Attributes:

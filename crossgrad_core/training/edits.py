@@ -13,11 +13,11 @@ from crossgrad_core.contract.topology import (
     misfit_of,
 )
 from crossgrad_core.errors import UserError
-from crossgrad_core.training.order import in_order
+from crossgrad_core.training.averaging import STATE as AVERAGE
+from crossgrad_core.training.averaging import with_rows
+from crossgrad_core.training.morton_order import in_order
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import STATE as AVERAGE
-from crossgrad_core.training.steady import with_rows
 
 
 def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:

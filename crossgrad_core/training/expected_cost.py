@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.training.room import most_after, started_with
+from crossgrad_core.training.growth_budget import most_after, started_with
 from crossgrad_core.training.schedules import growth_of, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -20,7 +20,7 @@ PIXELS_PER_PRIMITIVE = 8.0
 
 
 @dataclass(frozen=True)
-class Crowd:
+class PrimitiveCounts:
     """The primitives of a run.
 
     Attributes:
@@ -32,20 +32,20 @@ class Crowd:
     present: int
 
     @classmethod
-    def of(cls, setup: Setup, state: TrainState) -> "Crowd":
+    def of(cls, setup: Setup, state: TrainState) -> "PrimitiveCounts":
         """Those of a run that has reached this state."""
         return cls(started_with(setup, state), state.primitives(setup))
 
 
-def cost_of_run(setup: Setup, crowd: Crowd, steps: int) -> float:
+def cost_of_run(setup: Setup, crowd: PrimitiveCounts, steps: int) -> float:
     """Expected cost of a run of so many steps, in units of a view of full size at its start."""
     schedule = schedule_for(setup, steps)
     return views_of(setup, schedule, 0, steps) * growth_ahead(setup, crowd, schedule, 0)
 
 
-def cost_ahead(setup: Setup, crowd: Crowd, step: int, left: int) -> float:
+def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> float:
     """Expected cost of the `left` steps after `step`, in units of a view of full size now."""
-    schedule = setup.schedule.lengthened(schedule_for(setup, step + left), step)
+    schedule = setup.schedule.with_length(schedule_for(setup, step + left), step)
     views = views_of(setup, schedule, step, step + left)
     return views * growth_ahead(setup, crowd, schedule, step)
 
@@ -63,7 +63,7 @@ def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
     return views + setup.pixel_share * (pixels - views)
 
 
-def growth_ahead(setup: Setup, crowd: Crowd, schedule: Schedule, step: int) -> float:
+def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
     """Mean cost of a view in the steps after `step`, over its cost with the primitives of now."""
     if not setup.densifier.edits:
         return 1.0
@@ -75,7 +75,7 @@ def growth_ahead(setup: Setup, crowd: Crowd, schedule: Schedule, step: int) -> f
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
-def _along_curve(setup: Setup, crowd: Crowd, schedule: Schedule, step: int) -> float:
+def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
     """The same where growth follows the curve to its budget."""
     cameras = [view.camera for view in setup.train_views]
     # What a view without any primitive costs, in primitives.

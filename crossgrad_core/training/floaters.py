@@ -16,9 +16,9 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.training.averaging import eval_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import shown
 
 #: Around a camera this share of the distance to the nearest point that it sees is taken to be
 #: empty. The ground below a level camera, which sees it from some way off on, is farther away.
@@ -68,7 +68,7 @@ def floaters(setup: Setup, state: TrainState, empty: float = EMPTY) -> Tensor:
         state: Its state.
         empty: See `in_empty_space`.
     """
-    parameters = shown(state)
+    parameters = eval_parameters(state)
     name = setup.backbone.positions
     if name not in parameters:
         return torch.zeros(0, dtype=torch.int64, device=setup.device)

@@ -7,16 +7,16 @@ from typing import Literal, Protocol
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.system.allocator import use_large_pages
 from crossgrad_core.training.checks import check_dropped, check_start
-from crossgrad_core.training.clock import Laps
+from crossgrad_core.training.clock import PhaseTimer
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-from crossgrad_core.training.foresight import Foresight
-from crossgrad_core.training.keeper import Keeper, is_whole
 from crossgrad_core.training.model import model_of
+from crossgrad_core.training.rollback import RollbackGuard, is_whole
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.training.view_prefetch import Prefetcher
 
 #: Why the loop came back.
 Ending = Literal["finished", "stopped", "paused"]
@@ -28,7 +28,7 @@ CHECK_EVERY = 10
 SNAPSHOT_EVERY = 100
 
 
-class Sink(Protocol):
+class RunWriter(Protocol):
     """Where a run's results go."""
 
     def evaluate(self, setup: Setup, state: TrainState) -> None:
@@ -47,10 +47,10 @@ class Sink(Protocol):
 def train(
     setup: Setup,
     state: TrainState,
-    sink: Sink,
+    sink: RunWriter,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None = None,
-    keeper: Keeper | None = None,
+    keeper: RollbackGuard | None = None,
 ) -> Ending:
     """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
 
@@ -64,7 +64,7 @@ def train(
     """
     check_start(state)
     use_large_pages()
-    keeper = keeper or Keeper(state)
+    keeper = keeper or RollbackGuard(state)
     try:
         status = _steps(setup, state, sink, stopper, pauses, keeper)
     except TrainingFailedError:
@@ -83,14 +83,14 @@ def train(
 def _steps(
     setup: Setup,
     state: TrainState,
-    sink: Sink,
+    sink: RunWriter,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None,
-    keeper: Keeper,
+    keeper: RollbackGuard,
 ) -> Ending:
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
-    foresight = Foresight(setup)
+    foresight = Prefetcher(setup)
     while state.step < last and not stopper.requested:
         foresight.look(state)
         try:
@@ -106,7 +106,7 @@ def _steps(
         check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)
         if setup.shows_model:
-            setup.hook.crossgrad_model(model=model_of(setup, state))
+            setup.hook.crossgrad_model_ready(model=model_of(setup, state))
         _tell_held_back(setup, record)
         _record(setup, state, sink)
         pausing = pauses is not None and state.step < last and pauses(state)
@@ -123,7 +123,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     A GPU, or the other threads, may still be at the optimizer when the step is over; the next one
     waits for them.
     """
-    state.laps = Laps()
+    state.laps = PhaseTimer()
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
     if setup.config.clock == "cpu" or looks_after(setup, state.step):
@@ -135,7 +135,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     return state.last
 
 
-def _is_good(setup: Setup, state: TrainState, sink: Sink, keeper: Keeper) -> bool:
+def _is_good(setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard) -> bool:
     """Checks a state that is about to be kept; where it is bad, training goes back."""
     try:
         keeper.look(state)
@@ -146,13 +146,13 @@ def _is_good(setup: Setup, state: TrainState, sink: Sink, keeper: Keeper) -> boo
 
 
 def _rewind(
-    setup: Setup, state: TrainState, sink: Sink, keeper: Keeper, error: NonFiniteError
+    setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard, error: NonFiniteError
 ) -> None:
     rewound_before = state.rewinds > 0
     keeper.rewind(state, setup.config.seed)
     if rewound_before:
         raise TrainingFailedError(f"{error}, for the second time") from error
-    setup.hook.crossgrad_message(
+    setup.hook.crossgrad_log(
         text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
     )
     sink.rewind(setup, state.step)
@@ -161,7 +161,7 @@ def _rewind(
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
     if held_back > 0 and growth_of(setup) == "free":
-        setup.hook.crossgrad_message(
+        setup.hook.crossgrad_log(
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"
         )
@@ -193,7 +193,7 @@ def evaluates_after(setup: Setup, step: int) -> bool:
     return step % every == shift and first <= step < setup.schedule.total
 
 
-def _record(setup: Setup, state: TrainState, sink: Sink) -> None:
+def _record(setup: Setup, state: TrainState, sink: RunWriter) -> None:
     if evaluates_after(setup, state.step):
         sink.evaluate(setup, state)
     if saves_after(setup, state.step):

@@ -3,12 +3,12 @@
 from functools import partial
 
 from crossgrad_core.contract.contexts import Model
-from crossgrad_core.training.on_request import OnRequest
-from crossgrad_core.training.photo_parameters import exposed
+from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.rates import rule_at
+from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.targets import eval_background
+from crossgrad_core.training.view_target import eval_background
 
 
 def model_of(setup: Setup, state: TrainState) -> Model:
@@ -22,8 +22,8 @@ def model_of(setup: Setup, state: TrainState) -> Model:
         adam=state.adam,
         background=eval_background(setup),
         loss=setup.loss,
-        exposed=partial(exposed, setup, state),
+        exposed=partial(apply, setup, state),
         rule=rule_at(setup, state.step + 1),
-        render=OnRequest(setup, state, counted=False),
+        render=RenderCallback(setup, state, counted=False),
         groups=setup.groups,
     )

@@ -9,8 +9,8 @@ from crossgrad_core.contract.adam_state import BETAS, AdamRule
 from crossgrad_core.contract.blocks import LearningRate, Parameters
 from crossgrad_core.contract.schedule import REFERENCE, SHORT, Schedule, shortness
 from crossgrad_core.errors import UserError
+from crossgrad_core.training.averaging import tail_lr_factor
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.steady import faded
 from crossgrad_core.wording import listed
 
 #: The published rates are for `REFERENCE` steps. A run of fewer has them times the ratio of the two
@@ -179,11 +179,11 @@ def note_on_plan(setup: Setup) -> tuple[str, ...]:
 
 def note_on_axes(setup: Setup) -> tuple[str, ...]:
     """How positions step, where that is not as published and the run did not ask for it."""
-    if setup.config.position_steps is not None or axes_of(setup) is None:
+    if setup.config.position_lr is not None or axes_of(setup) is None:
         return ()
     return (
         "positions step along the axes of their Gaussians, by shares of their lengths "
-        "(--position-steps extent: by the scene's extent, as published)",
+        "(--position-lr extent: by the scene's extent, as published)",
     )
 
 
@@ -204,8 +204,8 @@ def axes_of(setup: Setup) -> tuple[str, str, str] | None:
     """
     config = setup.config
     by_size = is_short(config, setup.schedule)
-    if config.position_steps is not None:
-        by_size = config.position_steps == "size"
+    if config.position_lr is not None:
+        by_size = config.position_lr == "per-axis"
     return gaussians_of(setup) if by_size else None
 
 
@@ -226,7 +226,7 @@ def gaussians_of(setup: Setup) -> tuple[str, str, str] | None:
     And where rows of these are not all up to date, as they may be stepped by rows.
     """
     names = setup.backbone.positions, *setup.backbone.axes
-    late = not set(setup.backbone.passed_on.values()).isdisjoint(names)
+    late = not set(setup.backbone.passthrough.values()).isdisjoint(names)
     return names if all(names) and len(names) == len(_AXES) and not late else None
 
 
@@ -246,8 +246,8 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),
-            todo="repair the plugin (docs/write-a-backbone.md), or --position-steps extent --set "
-            "size_bound=0",
+            todo="repair the plugin (docs/write-a-backbone.md), or --position-lr extent --set "
+            "max_scale_ratio=0",
         )
 
 
@@ -273,7 +273,7 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     factor = factor_of(config, schedule, photos)
     if config.rate_factor is None and in_a_hurry(config, schedule, photos):
         factor *= rate.hurried
-    factor *= faded(config, rate, step=step, total=schedule.total)
+    factor *= tail_lr_factor(config, rate, step=step, total=schedule.total)
     if config.batch_rule == "sqrt":
         factor *= sqrt(schedule.pace.at(step))
     return rate.at(schedule.progress(step)) * factor

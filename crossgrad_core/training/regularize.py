@@ -5,15 +5,15 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.contexts import RegularizeContext, Regularized
+from crossgrad_core.contract.contexts import RegularizeContext, RegularizeResult
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import View
-from crossgrad_core.gradients.by_rows import dense
+from crossgrad_core.gradients.sparse_rows import dense
 from crossgrad_core.registry.manager import call_question
 from crossgrad_core.training.operator_scale import Scale
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.targets import context_fields
+from crossgrad_core.training.view_target import context_fields
 
 #: Tensor name -> gradient or None.
 TensorGradients = dict[str, Tensor | None]
@@ -34,7 +34,7 @@ def add_regularization(
         gaussians=gaussians,
         view=view,
     )
-    for answer in call_question(setup.hook.crossgrad_regularize, context, Regularized):
+    for answer in call_question(setup.hook.crossgrad_regularize, context, RegularizeResult):
         state.accept(answer.states, setup.hook.crossgrad_regularize)
         _add(into, _gradients_of(answer.loss, state.tensors, keep=gaussians is not None))
 

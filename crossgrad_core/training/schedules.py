@@ -6,7 +6,7 @@ from typing import Any, Final, Literal
 
 from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import (
     REFERENCE,
     SHORTEST_RUN_WITH_EDITS,
@@ -30,7 +30,9 @@ MOST_DEGREES: Final = 3
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
-def counting_of(config: RunConfig, views: ViewPlan, photos: int, *, budgeted: bool) -> Counting:
+def counting_of(
+    config: RunConfig, views: ViewsPerStepSpec, photos: int, *, budgeted: bool
+) -> Counting:
     """What the schedule of a run counts.
 
     Args:
@@ -39,11 +41,11 @@ def counting_of(config: RunConfig, views: ViewPlan, photos: int, *, budgeted: bo
         photos: Its training photos.
         budgeted: Whether its density control is led along a curve by itself.
     """
-    plain = Counting(unit_of(config), views, photos, config.reference, config.fewest_edits or 0)
+    plain = Counting(unit_of(config), views, photos, config.reference, config.min_refinements or 0)
     # Without a budget early growth copies nearly everything, and a short run ends lower.
-    if config.fewest_edits is not None or growth_by(config, budgeted=budgeted) == "free":
+    if config.min_refinements is not None or growth_by(config, budgeted=budgeted) == "free":
         return plain
-    return replace(plain, fewest_edits=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
+    return replace(plain, min_refinements=USUAL_EDITS, edits_from=SHORTEST_RUN_WITH_EDITS)
 
 
 def growth_of(setup: Setup) -> Literal["free", "curve"]:
@@ -87,15 +89,15 @@ def schedule_of(
     schedule = replace(schedule, sh_wait=_before_harmonics(config, schedule))
     schedule = replace(schedule, **edits, **_given(config, ("reset_every", "sh_from", "sh_every")))
     # What the user sets stays, whatever the length.
-    return replace(schedule, fewest_edits=0) if edits else schedule
+    return replace(schedule, min_refinements=0) if edits else schedule
 
 
 def _before_harmonics(config: RunConfig, schedule: Schedule) -> int:
     """The count before which harmonics above those of the first step are not drawn."""
     # Another schedule than the run's own may be longer than the run.
     length = min(schedule.length, schedule.counted(schedule.total))
-    if config.sh_after is not None:
-        return round(config.sh_after * length)
+    if config.sh_start is not None:
+        return round(config.sh_start * length)
     ours = schedule.counting.unit == "views" and not schedule.published
     waits = ours and in_a_hurry(config, schedule, schedule.counting.photos)
     return int(SH_AFTER * shortness(schedule.length) * length) if waits else 0
@@ -108,19 +110,19 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
 def notes_on_length(setup: Setup) -> tuple[str, ...]:
     """What is noted about a run of this length."""
     resolution = setup.selection.resolution
-    remarks = resolution.remarks(setup.schedule)
-    return (*growth_note(setup), *_curve_note(setup), *_harmonics_note(setup), *remarks)
+    messages = resolution.messages(setup.schedule)
+    return (*growth_note(setup), *_curve_note(setup), *_harmonics_note(setup), *messages)
 
 
 def _harmonics_note(setup: Setup) -> tuple[str, ...]:
     """Says that harmonics come late, where nobody asked for it."""
     schedule, banded = setup.schedule, any(block.rests for block in setup.trained_blocks)
-    usual = setup.config.sh_after is None and banded and schedule.sh_from < MOST_DEGREES
+    usual = setup.config.sh_start is None and banded and schedule.sh_from < MOST_DEGREES
     if not usual or schedule.sh_wait <= schedule.sh_interval:
         return ()
     return (
         f"harmonics above degree {schedule.sh_from} are drawn after {schedule.sh_wait:,} views "
-        "(--set sh_after=0: degree by degree from the start, as published)",
+        "(--set sh_start=0: degree by degree from the start, as published)",
     )
 
 

@@ -157,17 +157,17 @@ class Setup:
         return self.config.backward == "joint"
 
     @cached_property
-    def by_rows(self) -> Mapping[str, str]:
+    def sparse_rows(self) -> Mapping[str, str]:
         """Field of the Gaussians -> tensor whose steps wait until a row is drawn."""
         trained = {name for block in self.trained_blocks for name in block.tensors}
         # Who looks at the model after each step reads every row, and a wrapper of the aggregation
         # computes with dense gradients.
         whole = self.joint or self.shows_model or self.device.type != "cpu"
         wrapped = len(self.hook.crossgrad_aggregate_gradients.get_hookimpls()) > 1
-        if whole or wrapped or not (self.rasterizer.by_rows and self.operator.by_rows):
+        if whole or wrapped or not (self.rasterizer.sparse_rows and self.operator.sparse_rows):
             return {}
-        passed_on = self.backbone.passed_on
-        return {field: name for field, name in passed_on.items() if name in trained}
+        passthrough = self.backbone.passthrough
+        return {field: name for field, name in passthrough.items() if name in trained}
 
     def resting(self, step: int) -> frozenset[str]:
         """The tensors that do not learn in a step."""
@@ -188,7 +188,7 @@ class Setup:
     @cached_property
     def shows_model(self) -> bool:
         """Whether any plugin looks at the model after a step."""
-        return bool(self.hook.crossgrad_model.get_hookimpls())
+        return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
     def acts_after_step(self) -> bool:

@@ -20,17 +20,17 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.system.checksums import warn_if_changed
-from crossgrad_core.training import photo_parameters
-from crossgrad_core.training.compile_ahead import compiling_beside
+from crossgrad_core.training import per_image_params
+from crossgrad_core.training.growth_budget import bound_of
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.order import ordered
+from crossgrad_core.training.morton_order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rates import axes_of, check_axes
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.room import bound_of
+from crossgrad_core.training.scale_clamp import max_scale_ratio_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.veils import size_bound_of
+from crossgrad_core.training.warmup import compiling_beside
 from crossgrad_core.wording import in_one_line, listed
 
 _LOG = logging.getLogger(__name__)
@@ -57,12 +57,12 @@ def first_state(setup: Setup) -> TrainState:
     }
     prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
     parameters = _made(setup, prepared, "prepare")
-    if axes_of(setup) or size_bound_of(setup):
+    if axes_of(setup) or max_scale_ratio_of(setup):
         check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
-    photos = photo_parameters.started(setup)
+    photos = per_image_params.started(setup)
     if photos is not None:
-        state.commit({photo_parameters.STATE: photos})
+        state.commit({per_image_params.STATE: photos})
     if crowd is not None:
         state.commit({THINNED: PluginState({"of": crowd, "start": state.primitives(setup)})})
     return state
@@ -233,7 +233,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """
     _LOG.info("loading kernels")
     start = perf_counter()
-    setup.rasterizer.burn_in(str(setup.device))
+    setup.rasterizer.self_test(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
     # A run of one step has no second one to be tried out with.
     degrees = {max(schedule.sh_interval * degree, schedule.sh_wait) for degree in (1, 2, 3)}
@@ -250,7 +250,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
                 state = first_state(setup) if reached is None else deepcopy(reached)
                 state.step = step
                 timed_step(setup, state)
-                if setup.by_rows and step == steps[0] and step + 1 < schedule.total:
+                if setup.sparse_rows and step == steps[0] and step + 1 < schedule.total:
                     # Rows are behind from the second step on.
                     timed_step(setup, state)
     seconds = perf_counter() - start

@@ -16,7 +16,7 @@ from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import EMPTY_STATE, SLOTS, TAKEN, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.adam.late import Late
-from crossgrad_core.training.clock import Clock, Laps
+from crossgrad_core.training.clock import Clock, PhaseTimer
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
@@ -67,7 +67,7 @@ class TrainState:
     last: StepRecord | None = None
     counters: Counters = field(default_factory=Counters)
     clock: Clock = field(default_factory=Clock)
-    laps: Laps = field(default_factory=Laps)
+    laps: PhaseTimer = field(default_factory=PhaseTimer)
     rewinds: int = 0
     touched: bool = False
     late: Late = field(default_factory=Late)
@@ -224,7 +224,7 @@ class _Current(Mapping[str, Tensor]):
 
 
 @dataclass(frozen=True, eq=False)
-class Mark:
+class StepSnapshot:
     """All that a step changes besides parameters and moments, as it was at one moment.
 
     Plugin states and records are values and need no copy.
@@ -239,7 +239,7 @@ class Mark:
     rewinds: int
 
     @classmethod
-    def of(cls, state: TrainState) -> "Mark":
+    def of(cls, state: TrainState) -> "StepSnapshot":
         """The mark of this moment."""
         return cls(
             step=state.step,
@@ -268,7 +268,7 @@ class Snapshot:
 
     parameters: Parameters
     adam: AdamState
-    mark: Mark
+    mark: StepSnapshot
 
     @classmethod
     def of(cls, state: TrainState) -> "Snapshot":
@@ -276,7 +276,7 @@ class Snapshot:
         return cls(
             parameters={name: t.detach().clone() for name, t in state.parameters.items()},
             adam=copied_moments(state.adam),
-            mark=Mark.of(state),
+            mark=StepSnapshot.of(state),
         )
 
     def restore(self, state: TrainState, seed: int) -> None:

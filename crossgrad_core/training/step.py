@@ -11,41 +11,41 @@ from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
-    Aggregated,
-    Densified,
+    AggregateResult,
     DensifyContext,
-    Draw,
+    DensifyResult,
     SampleContext,
-    Sampled,
+    SampleResult,
     StepRecord,
+    ViewSample,
 )
 from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.by_rows import dense, tidy
 from crossgrad_core.gradients.finite import is_finite
+from crossgrad_core.gradients.sparse_rows import coalesced, dense
 from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.adam.axes import step_along_axes
-from crossgrad_core.training.density_views import observed_views
+from crossgrad_core.training.averaging import restart, update_average
+from crossgrad_core.training.densify_views import observed_views
 from crossgrad_core.training.edits import apply_edit, put_in_order
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.on_request import OnRequest
+from crossgrad_core.training.growth_budget import max_new_gaussians
 from crossgrad_core.training.operator_scale import Scale
-from crossgrad_core.training.photo_parameters import take_photo_step
+from crossgrad_core.training.per_image_params import take_photo_step
 from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
-from crossgrad_core.training.regrouping import groups_of, regroup_if_due
 from crossgrad_core.training.regularize import TensorGradients, add_regularization, joined
+from crossgrad_core.training.relabel import groups_of, regroup_if_due
+from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.room import room_of
+from crossgrad_core.training.scale_clamp import clamp_scales
 from crossgrad_core.training.schedules import is_led
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.steady import follow, restart
-from crossgrad_core.training.targets import context_fields
-from crossgrad_core.training.veils import bound_sizes
+from crossgrad_core.training.view_target import context_fields
 from crossgrad_core.training.views import Rendered, render_views, scales_of
 from crossgrad_core.wording import listed
 
@@ -77,7 +77,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     # An edit needs the memory that gradients hold.
     del of_views, context, aggregated, of_step
     counts = _finish(setup, state, rendered, gradients, scale)
-    follow(setup, state)
+    update_average(setup, state)
     primitives = state.primitives(setup)
     state.counters.peak_primitives = max(state.counters.peak_primitives, primitives)
     return StepRecord(
@@ -118,9 +118,9 @@ def check_largest_draw(setup: Setup) -> None:
     )
 
 
-def _sample(setup: Setup, state: TrainState) -> Draw:
+def _sample(setup: Setup, state: TrainState) -> ViewSample:
     context = sample_context(setup, state, state.step)
-    answer = call_seam(setup.hook.crossgrad_sample_views, context, Sampled)
+    answer = call_seam(setup.hook.crossgrad_sample_views, context, SampleResult)
     state.accept(answer.states, setup.hook.crossgrad_sample_views)
     counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
     views = answer.draw.views
@@ -138,7 +138,7 @@ def _sample(setup: Setup, state: TrainState) -> Draw:
     )
 
 
-def _labels(setup: Setup, state: TrainState, draw: Draw) -> tuple[str, ...] | None:
+def _labels(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[str, ...] | None:
     """The labels of a draw; a plugin may list them otherwise than in a tuple."""
     labels: object = draw.labels
     if labels is None:
@@ -156,7 +156,7 @@ def _labels(setup: Setup, state: TrainState, draw: Draw) -> tuple[str, ...] | No
 
 
 def _aggregate_context(
-    setup: Setup, state: TrainState, draw: Draw, rendered: Rendered, of_views: Gradients
+    setup: Setup, state: TrainState, draw: ViewSample, rendered: Rendered, of_views: Gradients
 ) -> AggregateContext:
     return AggregateContext(
         **context_fields(setup, state, "operator"),
@@ -170,8 +170,8 @@ def _aggregate_context(
     )
 
 
-def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Aggregated:
-    answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, Aggregated)
+def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> AggregateResult:
+    answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, AggregateResult)
     state.accept(answer.states, setup.hook.crossgrad_aggregate_gradients)
     wanted = {name: state.tensors[name] for b in setup.trained_blocks for name in b.tensors}
     if misfit := _misfit(answer, wanted):
@@ -187,7 +187,7 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
     return answer
 
 
-def _misfit(answer: Aggregated, wanted: Mapping[str, Tensor]) -> str:
+def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
     """What of an answer is no gradient of the tensors that learn; empty where all fits."""
     for part in (answer.gradients, answer.counts):
         if not isinstance(part, Mapping):
@@ -240,14 +240,14 @@ def _optimize(
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
     # Terms of regularisation may pull at what rests, too.
     resting = setup.resting(state.step)
-    found = {name: tidy(g) for name, g in gradients.items() if name not in resting}
-    waiting = set(setup.by_rows.values())
-    by_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
-    whole = {name: dense(g) for name, g in found.items() if name not in by_rows}
+    found = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
+    waiting = set(setup.sparse_rows.values())
+    sparse_rows = {n: g for n, g in found.items() if g is not None and g.is_sparse and n in waiting}
+    whole = {name: dense(g) for name, g in found.items() if name not in sparse_rows}
     state.settle(name for name, g in whole.items() if g is not None)
     _take_adam_step(setup, state, whole, rates, rule, scale)
-    bound_sizes(setup, state)
-    for name, gradient in by_rows.items():
+    clamp_scales(setup, state)
+    for name, gradient in sparse_rows.items():
         param, to_sum = state.tensors[name], scale.to_sum[name]
         step = one_more(name, param, state.moments, rates[name], rule, to_sum)
         state.late.step(name, param, gradient, state.moments, step)
@@ -283,11 +283,11 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         views=rendered.observed,
         share=len(rendered.observed) / len(rendered.records),
         means_lr=means_rate_at(setup, state.step),
-        room=room_of(setup, state, rendered),
+        room=max_new_gaussians(setup, state, rendered),
         led=is_led(setup.config, setup.densifier, setup.schedule),
-        render=OnRequest(setup, state, counted=True),
+        render=RenderCallback(setup, state, counted=True),
     )
-    answer = call_seam(setup.hook.crossgrad_densify, context, Densified)
+    answer = call_seam(setup.hook.crossgrad_densify, context, DensifyResult)
     state.accept(answer.states, setup.hook.crossgrad_densify)
     edited = apply_edit(setup, state, answer.edit)
     if edited or answer.edit.values:
@@ -306,7 +306,7 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
         means_lr=means_rate_at(setup, state.step),
         edited=edited,
     )
-    for answer in call_question(setup.hook.crossgrad_after_step, context, Densified):
+    for answer in call_question(setup.hook.crossgrad_after_step, context, DensifyResult):
         state.accept(answer.states, setup.hook.crossgrad_after_step)
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-from crossgrad_core.system.interrupts import end_at_once, listened_to, tell
+from crossgrad_core.system.interrupts import end_at_once, signal_names, tell
 
 #: What the user is told at the first and at the second signal; the third one ends the process.
 _WORDS = (
@@ -50,7 +50,7 @@ class Stopper:
         """
         before = self._before
         try:
-            for number in listened_to():
+            for number in signal_names():
                 before[number] = signal.signal(number, self._handle)
         except ValueError:  # Signals can be handled in the main thread only.
             yield self

@@ -10,25 +10,25 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.component import answered
-from crossgrad_core.contract.contexts import Draw, ScaleContext, Scaled, ViewRecord
+from crossgrad_core.contract.contexts import ScaleContext, ScaleResult, ViewRecord, ViewSample
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render
 from crossgrad_core.contract.gradients import Gradients
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.by_rows import tidy
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.sparse_rows import coalesced
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.manager import call_seam
 from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.failure import NonFiniteError
-from crossgrad_core.training.interlaced import as_in_full
-from crossgrad_core.training.photo_parameters import Leaves, leaves_of
+from crossgrad_core.training.per_image_params import Leaves, leaves_of
 from crossgrad_core.training.regularize import TensorGradients, add_regularization
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.targets import (
+from crossgrad_core.training.strided_rendering import as_in_full
+from crossgrad_core.training.view_target import (
     Target,
     background_of,
     context_fields,
@@ -74,10 +74,10 @@ class _Drawn:
     leaves: Leaves
 
 
-def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
+def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float, ...]:
     """The scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
-    answer = call_seam(setup.hook.crossgrad_choose_scales, context, Scaled)
+    answer = call_seam(setup.hook.crossgrad_choose_scales, context, ScaleResult)
     state.accept(answer.states, setup.hook.crossgrad_choose_scales)
     scales = answer.scales
     if len(scales) == len(draw.views) and all(
@@ -94,7 +94,7 @@ def scales_of(setup: Setup, state: TrainState, draw: Draw) -> tuple[float, ...]:
 
 
 def render_views(
-    setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float]
+    setup: Setup, state: TrainState, draw: ViewSample, scales: Sequence[float]
 ) -> tuple[Rendered, Gradients]:
     """The views of `draw` at their scales, and their gradients: apart or summed up.
 
@@ -106,7 +106,7 @@ def render_views(
         return _render_jointly(setup, state, draw, scales, regular)
     records, losses, per_view, photos = [], [], [], []
     total = _sums(setup, len(draw.views))
-    way = _together if setup.rasterizer.together and len(draw.views) > 1 else _one_by_one
+    way = _together if setup.rasterizer.batched and len(draw.views) > 1 else _one_by_one
     for drawn, gradients in way(setup, state, draw, scales, regular):
         records.append(drawn.record)
         losses.append(drawn.loss.detach())
@@ -135,7 +135,7 @@ def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
 def _one_by_one(
     setup: Setup,
     state: TrainState,
-    draw: Draw,
+    draw: ViewSample,
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
@@ -152,7 +152,7 @@ def _one_by_one(
 def _together(
     setup: Setup,
     state: TrainState,
-    draw: Draw,
+    draw: ViewSample,
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
@@ -210,7 +210,11 @@ def _with_losses(
 
 
 def _render_jointly(
-    setup: Setup, state: TrainState, draw: Draw, scales: Sequence[float], regular: TensorGradients
+    setup: Setup,
+    state: TrainState,
+    draw: ViewSample,
+    scales: Sequence[float],
+    regular: TensorGradients,
 ) -> tuple[Rendered, Gradients]:
     """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
     _clear(state.tensors)
@@ -228,7 +232,9 @@ def _render_jointly(
     return Rendered(records, regular, photos), total
 
 
-def _prepare(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Prepared:
+def _prepare(
+    setup: Setup, state: TrainState, draw: ViewSample, slot: int, scale: float
+) -> _Prepared:
     """The photo of a view of the draw, and what is decoded for it."""
     target = target_at(setup, state, draw.views[slot], scale, slot)
     background = background_of(setup, state)
@@ -244,7 +250,9 @@ def _outputs(setup: Setup, state: TrainState) -> frozenset[str]:
     return setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
 
 
-def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: float) -> _Drawn:
+def _draw_view(
+    setup: Setup, state: TrainState, draw: ViewSample, slot: int, scale: float
+) -> _Drawn:
     view, wanted = _prepare(setup, state, draw, slot, scale), _outputs(setup, state)
     camera = view.target.camera
     render = setup.rasterizer.render(view.gaussians, camera, view.background, wanted)
@@ -253,12 +261,12 @@ def _draw_view(setup: Setup, state: TrainState, draw: Draw, slot: int, scale: fl
 
 
 def _compare(
-    setup: Setup, state: TrainState, draw: Draw, view: _Prepared, render: Render
+    setup: Setup, state: TrainState, draw: ViewSample, view: _Prepared, render: Render
 ) -> _Drawn:
     """The render of a view beside its photo."""
     index, target = draw.views[view.slot], view.target
     leaves = leaves_of(setup, state, index)
-    image = setup.exposure.exposed(render.image, leaves)
+    image = setup.exposure.apply(render.image, leaves)
     weights = weights_of(setup, state, index, target)
     loss = setup.loss.loss(image, target.photo, target.mask, weights)
     state.counters.views += 1
@@ -285,8 +293,8 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)
     gaussians = answered(answer, Gaussians, setup.backbone, "decode")
-    names = {f: n for f, n in setup.by_rows.items() if getattr(gaussians, f) is tensors[n]}
-    if names.keys() != {f for f in setup.by_rows if getattr(gaussians, f) is not None}:
+    names = {f: n for f, n in setup.sparse_rows.items() if getattr(gaussians, f) is tensors[n]}
+    if names.keys() != {f for f in setup.sparse_rows if getattr(gaussians, f) is not None}:
         # It is not handed over as it is after all, and was read too early.
         state.settle()
         return setup.backbone.decode(tensors, camera, phase)
@@ -308,7 +316,7 @@ def _learning(setup: Setup, state: TrainState) -> Parameters:
     return {name: t.detach() if name in resting else t for name, t in state.tensors.items()}
 
 
-def observe_view(setup: Setup, state: TrainState, draw: Draw, scale: float) -> ViewRecord:
+def observe_view(setup: Setup, state: TrainState, draw: ViewSample, scale: float) -> ViewRecord:
     """Renders the one view of `draw` for its statistics: nobody takes its gradients.
 
     Raises:
@@ -341,6 +349,6 @@ def _clear(parameters: Mapping[str, Tensor]) -> None:
 
 
 def _take(parameters: Mapping[str, Tensor]) -> TensorGradients:
-    taken = {name: tidy(t.grad) for name, t in parameters.items() if t.requires_grad}
+    taken = {name: coalesced(t.grad) for name, t in parameters.items() if t.requires_grad}
     _clear(parameters)
     return taken

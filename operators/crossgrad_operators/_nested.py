@@ -86,7 +86,7 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
     """What an inner operator objects to in a selection."""
     name = component_name(operator)
     seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
-    own = getattr(operator, "crossgrad_objections", None)
+    own = getattr(operator, "crossgrad_validate_selection", None)
     return objections_to_views(operator, seen) + list(own(seen) or () if own else ())
 
 

@@ -47,7 +47,9 @@ def project(
     # Two views take one step each, whose errors are those of the cosine. More of them add up, to
     # nothing that float32 gradients would show.
     many = gramians.shape[1] > 2  # noqa: PLR2004
-    if context.unit < NARROW and many and context.remainders is not None:
+    if context.unit < NARROW and many and context.rounding_residuals is not None:
         rule = (float(threshold), float(strength))
-        return exact_projected(gramians, context.remainders(), context.present, order, gates, rule)
+        return exact_projected(
+            gramians, context.rounding_residuals(), context.present, order, gates, rule
+        )
     return projected(gramians, context.present, order, gates, threshold, strength)

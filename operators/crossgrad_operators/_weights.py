@@ -15,9 +15,9 @@ Flags = NDArray[np.bool_]
 FLOAT32: Final = 2.0**-24
 
 
-def sharpened(
+def refine(
     weights: Floats,
-    doubtful: Flags,
+    ill_conditioned: Flags,
     gramians: Floats,
     context: OperatorContext,
     exact: Callable[[Floats, Floats, Flags], Floats],
@@ -26,7 +26,7 @@ def sharpened(
 
     Args:
         weights: [B, K] or rows [B, K, K], changed in place.
-        doubtful: [B].
+        ill_conditioned: [B].
         gramians: [B, K, K].
         context: Tells which views are present, and what rounding took from the Gramians; where
             that is not known, the weights stay as they are.
@@ -35,9 +35,11 @@ def sharpened(
     Returns:
         `weights`.
     """
-    if context.remainders is not None and doubtful.any():
-        part = np.flatnonzero(doubtful)
-        weights[part] = exact(gramians[part], context.remainders()[part], context.present[part])
+    if context.rounding_residuals is not None and ill_conditioned.any():
+        part = np.flatnonzero(ill_conditioned)
+        weights[part] = exact(
+            gramians[part], context.rounding_residuals()[part], context.present[part]
+        )
     return weights
 
 
@@ -45,21 +47,26 @@ class Kernel(Protocol):
     """A kernel: Gramians, remainders, presence, True for 32 digits -> weights, which to doubt."""
 
     def __call__(
-        self, gramians: Floats, remainders: Floats, present: Flags, exact: Literal[True] | None, /
+        self,
+        gramians: Floats,
+        rounding_residuals: Floats,
+        present: Flags,
+        exact: Literal[True] | None,
+        /,
     ) -> tuple[Floats, Flags]: ...
 
 
-def with_digits(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
+def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
     """Weights with as many digits as the gradients ask for.
 
     That is 32 for gradients finer than float32, if their Gramians are known that well; else 16, and
     32 where the kernel finds these doubtful.
     """
-    if context.unit < FLOAT32 and context.remainders is not None:
-        return kernel(gramians, context.remainders(), context.present, True)[0]
-    weights, doubtful = kernel(gramians, np.zeros_like(gramians), context.present, None)
+    if context.unit < FLOAT32 and context.rounding_residuals is not None:
+        return kernel(gramians, context.rounding_residuals(), context.present, True)[0]
+    weights, ill_conditioned = kernel(gramians, np.zeros_like(gramians), context.present, None)
 
-    def exact(part: Floats, remainders: Floats, present: Flags) -> Floats:
-        return kernel(part, remainders, present, True)[0]
+    def exact(part: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
+        return kernel(part, rounding_residuals, present, True)[0]
 
-    return sharpened(weights, doubtful, gramians, context, exact)
+    return refine(weights, ill_conditioned, gramians, context, exact)

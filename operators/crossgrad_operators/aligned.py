@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import sharpened
+from crossgrad_operators._weights import refine
 
 
 class Aligned(Weighting):
@@ -27,5 +27,5 @@ class Aligned(Weighting):
         from crossgrad_operators.numba_kernels.balance import aligned
         from crossgrad_operators.numba_kernels.exact_balance import exact_aligned
 
-        weights, doubtful = aligned(gramians, context.present, context.unit)
-        return sharpened(weights, doubtful, gramians, context, exact_aligned)
+        weights, ill_conditioned = aligned(gramians, context.present, context.unit)
+        return refine(weights, ill_conditioned, gramians, context, exact_aligned)

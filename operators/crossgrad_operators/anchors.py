@@ -49,6 +49,6 @@ class Anchors(GramianOperator):
         return project(gramians, context, slot_order(gramians.shape[1]), gates=gates), state
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Refuses samplers whose views carry no labels."""
         return label_objections(selection, {"near": self.near, "far": self.far})

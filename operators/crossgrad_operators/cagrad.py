@@ -9,7 +9,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Selection, Weighting
-from crossgrad_operators._weights import Flags, Floats, with_digits
+from crossgrad_operators._weights import Flags, Floats, extended_precision
 
 
 class CAGrad(Weighting):
@@ -31,8 +31,8 @@ class CAGrad(Weighting):
     def reads_gramians(self) -> bool:
         return self.c > 0
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if self.c > 0:
             return {}
         return {"rescale": "it divides by 1 where c = 0; leave it out"}
@@ -44,11 +44,11 @@ class CAGrad(Weighting):
         from crossgrad_operators.numba_kernels.simplex import cagrad
 
         def kernel(
-            part: Floats, remainders: Floats, present: Flags, exact: Literal[True] | None
+            part: Floats, rounding_residuals: Floats, present: Flags, exact: Literal[True] | None
         ) -> tuple[Floats, Flags]:
-            return cagrad(part, remainders, present, exact, self.c)
+            return cagrad(part, rounding_residuals, present, exact, self.c)
 
-        weights = with_digits(kernel, gramians, context)
+        weights = extended_precision(kernel, gramians, context)
         several = context.present.sum(axis=1, keepdims=True) > 1
         scale = {"none": 1.0, "1+c": 1.0 / (1.0 + self.c), "1+c^2": 1.0 / (1.0 + self.c**2)}
         return weights * np.where(several, scale[self.rescale], 1.0)

@@ -63,8 +63,8 @@ class Chain(GramianOperator):
     def reads_labels(self) -> bool:
         return any(link.reads_labels() for link in self.links)
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         return inner_idle(selection, "links", self.links)
 
     @override
@@ -90,12 +90,12 @@ class Chain(GramianOperator):
             empty = _noise(seen, product, gramians)
             product = np.where(empty[:, :, None], 0.0, product)
             seen = np.where(empty[:, :, None] | empty[:, None, :], 0.0, seen)
-            remainders = _remainders(product, gramians, context, seen)
-            seen_context = replace(context, present=~empty, remainders=remainders)
+            rounding_residuals = _remainders(product, gramians, context, seen)
+            seen_context = replace(context, present=~empty, rounding_residuals=rounding_residuals)
         return product, outer_state(states)
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """What any link objects to."""
         return [reason for link in self.links for reason in inner_objections(selection, link)]
 
@@ -117,7 +117,7 @@ def _remainders(
     seen: NDArray[np.float64],
 ) -> Callable[[], NDArray[np.float64]] | None:
     """What rounding took from M Gram M^T, for links that ask for it."""
-    whole = context.remainders
+    whole = context.rounding_residuals
     if whole is None:
         return None
 

@@ -34,8 +34,8 @@ class ConfGate(GramianOperator):
     beta: float = Field(0.99, ge=0, lt=1, description="decay of the averages per step")
     warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         return {} if self.tau is None else {"preset": "tau wins over it; leave one of the two out"}
 
     @override

@@ -97,8 +97,8 @@ class Dispatch(GramianOperator):
     def reads_labels(self) -> bool:
         return any(operator.reads_labels() for operator in self._operators().values())
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         given = self._given(selection)
         ruled = {rule.block for rule in self.rules}
         keys = {self._key(name, kind, ruled) for name, kind in given}
@@ -148,7 +148,7 @@ class Dispatch(GramianOperator):
         return matrices, outer_state(states)
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """What any of the operators objects to, and rules for blocks that do not exist."""
         reasons = [
             reason
@@ -192,13 +192,13 @@ class Dispatch(GramianOperator):
 
 
 def _part(context: OperatorContext, part: NDArray[np.int64]) -> OperatorContext:
-    whole = context.remainders
+    whole = context.rounding_residuals
     return replace(
         context,
         blocks=tuple(context.blocks[b] for b in part),
         kinds=tuple(context.kinds[b] for b in part),
         present=context.present[part],
-        remainders=None if whole is None else lambda: whole()[part],
+        rounding_residuals=None if whole is None else lambda: whole()[part],
     )
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import AggregateContext, Aggregated, Operator, PluginState
+from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, PluginState
 
 
 class GradDrop(Operator):
@@ -23,7 +23,7 @@ class GradDrop(Operator):
     @override
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         gradients = context.separate
         finite, present = gradients.finite(), gradients.present()
         seed = int(context.rng.integers(2**63))
@@ -42,7 +42,7 @@ class GradDrop(Operator):
             "zero": int((finite & ~present).any(axis=1).sum()),
             "dropped": int((~finite).any(axis=1).sum()),
         }
-        return Aggregated(gradients.elementwise(drop), counts), state
+        return AggregateResult(gradients.elementwise(drop), counts), state
 
 
 def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:

@@ -46,8 +46,8 @@ class GradNorm(GramianOperator):
     def reads_labels(self) -> bool:
         return True
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if self.alpha > 0:
             return {}
         return dict.fromkeys(("baseline", "decay"), "alpha = 0 looks at no losses; leave it out")
@@ -73,7 +73,7 @@ class GradNorm(GramianOperator):
         return diagonals(weights), remember(kept, context, "log_weight", logs)
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Refuses samplers whose views carry no labels."""
         return label_objections(selection)
 

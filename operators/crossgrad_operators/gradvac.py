@@ -10,7 +10,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
 from crossgrad_operators._memory import recall, remember
 from crossgrad_operators._pairs import random_order
-from crossgrad_operators._weights import Floats, sharpened
+from crossgrad_operators._weights import Floats, refine
 
 
 class GradVac(GramianOperator):
@@ -38,15 +38,19 @@ class GradVac(GramianOperator):
         views = gramians.shape[1]
         targets = recall(state, context, "target", (views, views))
         before, order = targets.copy(), random_order(views, rng)
-        matrices, doubtful = aligned_to_targets(
+        matrices, ill_conditioned = aligned_to_targets(
             gramians, context.present, order, targets, self.beta, context.unit
         )
 
-        def exact(gramians: Floats, remainders: Floats, present: NDArray[np.bool_]) -> Floats:
-            again = before[doubtful]
-            rows = exact_aligned_to_targets(gramians, remainders, present, order, again, self.beta)
-            targets[doubtful] = again
+        def exact(
+            gramians: Floats, rounding_residuals: Floats, present: NDArray[np.bool_]
+        ) -> Floats:
+            again = before[ill_conditioned]
+            rows = exact_aligned_to_targets(
+                gramians, rounding_residuals, present, order, again, self.beta
+            )
+            targets[ill_conditioned] = again
             return rows
 
-        sharpened(matrices, doubtful, gramians, context, exact)
+        refine(matrices, ill_conditioned, gramians, context, exact)
         return matrices, remember(state, context, "target", targets)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import sharpened
+from crossgrad_operators._weights import refine
 
 
 class IMTLG(Weighting):
@@ -27,5 +27,5 @@ class IMTLG(Weighting):
         from crossgrad_operators.numba_kernels.balance import imtl_g
         from crossgrad_operators.numba_kernels.exact_balance import exact_imtl_g
 
-        weights, doubtful = imtl_g(gramians, context.present, context.unit)
-        return sharpened(weights, doubtful, gramians, context, exact_imtl_g)
+        weights, ill_conditioned = imtl_g(gramians, context.present, context.unit)
+        return refine(weights, ill_conditioned, gramians, context, exact_imtl_g)

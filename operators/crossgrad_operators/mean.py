@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import (
     AggregateContext,
-    Aggregated,
+    AggregateResult,
     MatrixOperator,
     OperatorContext,
     PluginState,
@@ -24,7 +24,7 @@ class Mean(MatrixOperator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
     @override
     def transform(
@@ -40,5 +40,5 @@ class Mean(MatrixOperator):
     @override
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         return divided_sum(context, context.gradients.views), state

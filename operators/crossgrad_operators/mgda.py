@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import with_digits
+from crossgrad_operators._weights import extended_precision
 
 
 class MGDA(Weighting):
@@ -25,4 +25,4 @@ class MGDA(Weighting):
     ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.simplex import mgda
 
-        return with_digits(mgda, gramians, context)
+        return extended_precision(mgda, gramians, context)

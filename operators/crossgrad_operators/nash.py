@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import sharpened
+from crossgrad_operators._weights import refine
 
 
 class Nash(Weighting):
@@ -27,5 +27,5 @@ class Nash(Weighting):
         from crossgrad_operators.numba_kernels.balance import nash
         from crossgrad_operators.numba_kernels.exact_balance import exact_nash
 
-        weights, doubtful = nash(gramians, context.present, context.unit)
-        return sharpened(weights, doubtful, gramians, context, exact_nash)
+        weights, ill_conditioned = nash(gramians, context.present, context.unit)
+        return refine(weights, ill_conditioned, gramians, context, exact_nash)

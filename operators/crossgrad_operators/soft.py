@@ -27,8 +27,8 @@ class Soft(GramianOperator):
     def reads_gramians(self) -> bool:
         return self.strength > 0
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if self.strength > 0:
             return {}
         return {"threshold": "nothing is taken away where strength = 0; leave it out"}

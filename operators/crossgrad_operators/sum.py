@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import (
     AggregateContext,
-    Aggregated,
+    AggregateResult,
     MatrixOperator,
     OperatorContext,
     PluginState,
@@ -23,7 +23,7 @@ class Sum(MatrixOperator):
 
     separate: ClassVar[bool] = False
     idle_at_one: ClassVar[bool] = True
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
     @override
     def transform(
@@ -39,11 +39,11 @@ class Sum(MatrixOperator):
     @override
     def aggregate(
         self, context: AggregateContext, state: PluginState
-    ) -> tuple[Aggregated, PluginState]:
+    ) -> tuple[AggregateResult, PluginState]:
         return divided_sum(context, 1), state
 
 
-def divided_sum(context: AggregateContext, divisor: int) -> Aggregated:
+def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
     """The sum of the views' gradients over `divisor`, without Gramians.
 
     Counts blocks in which some view's gradient is exactly zero or absent (`zero`) or was left out
@@ -55,4 +55,4 @@ def divided_sum(context: AggregateContext, divisor: int) -> Aggregated:
         "zero": int((finite & ~present).any(axis=1).sum()),
         "dropped": int((~finite).any(axis=1).sum()),
     }
-    return Aggregated(gradients.total(divisor), counts)
+    return AggregateResult(gradients.total(divisor), counts)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
-from crossgrad_operators._weights import with_digits
+from crossgrad_operators._weights import extended_precision
 
 
 class UPGrad(GramianOperator):
@@ -30,4 +30,4 @@ class UPGrad(GramianOperator):
     ) -> tuple[NDArray[np.float64], PluginState]:
         from crossgrad_operators.numba_kernels.cone import upgrad
 
-        return with_digits(upgrad, gramians, context), state
+        return extended_precision(upgrad, gramians, context), state

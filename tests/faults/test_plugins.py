@@ -7,9 +7,9 @@ from crossgrad_faults import laws
 from crossgrad_faults.faulty_plugin import HOOKS
 
 #: Asked before anything is written.
-EARLY = {"crossgrad_objections", "crossgrad_run_start"}
+EARLY = {"crossgrad_validate_selection", "crossgrad_run_start"}
 #: Not called in these runs: they follow no clock, hold nothing back and have no terms.
-UNUSED = {"crossgrad_length", "crossgrad_regularize", "crossgrad_message"}
+UNUSED = {"crossgrad_length_changed", "crossgrad_regularize", "crossgrad_log"}
 
 
 def fails(reference, folder, hook, call, error="RuntimeError"):

@@ -21,8 +21,8 @@ from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.dropout import STREAM, dropped
 from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import rows_without_floaters
-from crossgrad_core.training.interlaced import as_in_full, camera_of
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.strided_rendering import as_in_full, camera_of
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer

@@ -43,7 +43,7 @@ HOMES = {
     "a calibration": (r"class (Pinhole|Camera)\b", {SCENE}),
     "the rule set of rasterizers": (
         r"^(ALPHA_THRESHOLD|TRANSMITTANCE_STOP|JACOBIAN_MARGIN)\b.*=",
-        {f"{CORE}/numerics/rules.py"},
+        {f"{CORE}/numerics/raster_constants.py"},
     ),
     "quaternion to matrix": (
         r"2(\.0)? \* \(x \* y - w \* z\)",
@@ -54,7 +54,7 @@ HOMES = {
     "compiled or plain passes": (r"\bnative if .* else generic", {f"{CORE}/gradients/passes.py"}),
     "weights on a diagonal": (r"\[:, :: views \+ 1\]", {f"{CORE}/contract/gramian_operator.py"}),
     "a cast to a slot's type": (rf"cast\(\s*\"(type\[)?({'|'.join(SLOTS)})\b", set()),
-    "an edit that is none": (r"\bNoEdit\b", {f"{CORE}/registry/changes.py"}),
+    "an edit that is none": (r"\bNoEdit\b", {f"{CORE}/registry/deprecations.py"}),
     "summed or separate gradients": (
         r"isinstance\([^)]*(Summed|Separate)Gradients",
         {f"{CORE}/contract/contexts.py"},

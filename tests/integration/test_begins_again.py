@@ -10,8 +10,8 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.afterwards import figures, files
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.postprocess import evaluate, export
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.metrics_csv import read_metrics
 
@@ -85,8 +85,8 @@ def test_its_settings_stay(killed):
 
 def test_until_then_there_is_nothing_to_look_at(killed):
     for look in (
-        figures.evaluate,
-        lambda run: files.export(run, file_format="ply", out=None),
+        evaluate.evaluate,
+        lambda run: export.export(run, file_format="ply", out=None),
     ):
         with pytest.raises(UserError, match=rf"no checkpoint yet(.|\n)*--resume {killed} begins"):
             look(killed)
@@ -94,7 +94,7 @@ def test_until_then_there_is_nothing_to_look_at(killed):
         locked(killed, "training"),
         pytest.raises(UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first one"),
     ):
-        figures.evaluate(killed)
+        evaluate.evaluate(killed)
 
 
 def test_a_new_run_into_its_folder_is_told_to_resume(killed):

@@ -15,8 +15,8 @@ from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.run.opening import parsed
-from crossgrad_core.run.persist import _clock
+from crossgrad_core.run.checkpoint_io import _clock
+from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.results import machine
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.machine import WORTH_A_CALIBRATION, Machine, calibrated
@@ -25,7 +25,7 @@ from crossgrad_core.run.session import totals
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import clock as clocks
 from crossgrad_core.training.budget import Timed
-from crossgrad_core.training.clock import Clock, Laps
+from crossgrad_core.training.clock import Clock, PhaseTimer
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -38,7 +38,7 @@ def scene(tmp_path_factory):
 def test_laps_count_cpu_time_without_what_is_left_out(monkeypatch):
     times = iter([10.0, 10.5, 12.0, 12.25])
     monkeypatch.setattr(clocks, "process_time", lambda: next(times))
-    clock, laps = Clock(), Laps(cpu_border=next(times))
+    clock, laps = Clock(), PhaseTimer(cpu_border=next(times))
     laps.lap("photos")
     laps.leave_out(3.0, 1.25)  # Decoding: 1.25 of the 1.5 seconds until the next border.
     laps.lap("render")

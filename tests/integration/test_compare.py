@@ -7,7 +7,7 @@ from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.run import app
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.load_runs import read_runs
 
 
 def test_runs_as_they_are_written(tmp_path, capsys):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from crossgrad_core.contract.adam_state import BETAS, EPS, AdamRule, AdamState
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.opening import parsed
-from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.run.load_run import parsed
+from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import rates
 from crossgrad_core.training.adam.adam import adam_step
@@ -48,7 +48,7 @@ def trained(number, *plugins, **settings):
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
     plain, doubled = (
         assembled(
-            backbone={"name": backbone}, rate_factor=factor, final_decay=0.0, beta1=0.9, beta2=0.999
+            backbone={"name": backbone}, rate_factor=factor, lr_tail=0.0, beta1=0.9, beta2=0.999
         )
         for factor in (1.0, 2.0)
     )
@@ -112,11 +112,11 @@ PASSES = 360
         ({"steps": 2_000, "events": "steps"}, 0),
         ({"steps": 2_000, "schedule": "absolute"}, 0),
         ({"steps": 900, "schedule": "absolute", "reference": 2_000, "views": 1}, 450),
-        ({"steps": 2_000, "schedule": "absolute", "sh_after": 0.5}, 1_000),
+        ({"steps": 2_000, "schedule": "absolute", "sh_start": 0.5}, 1_000),
         ({"steps": 2_000, "sh_from": 1, "views": 1}, 1_000),
-        ({"steps": 2_000, "sh_after": 0.0}, 0),
-        ({"steps": 2_000, "views": 1, "sh_after": 0.3}, 600),
-        ({"steps": 2_000, "preset": "inria", "sh_after": 0.3}, 600),
+        ({"steps": 2_000, "sh_start": 0.0}, 0),
+        ({"steps": 2_000, "views": 1, "sh_start": 0.3}, 600),
+        ({"steps": 2_000, "preset": "inria", "sh_start": 0.3}, 600),
         ({"steps": 2_000, "beta2": 0.999}, 0),
     ],
 )
@@ -131,7 +131,7 @@ def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wa
         before = schedule.step_of(schedule.sh_wait) - 1
         assert schedule.sh_degree(before) == settings.get("sh_from", 0)
     told = [note for note in setup.notes if "harmonics above" in note]
-    assert len(told) == (wait > 0 and "sh_after" not in settings)
+    assert len(told) == (wait > 0 and "sh_start" not in settings)
     assert all(f" after {schedule.sh_wait:,} views " in note for note in told)
 
 
@@ -148,8 +148,8 @@ def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
 @pytest.mark.parametrize("settings", [{"backbone": {"name": "scaffold"}}, {"sh_from": 3}])
 def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
     monkeypatch.setattr(rates, "HURRY", 10_000)
-    setup = assembled(sh_after=0.5, steps=2_000, **settings)
-    with pytest.raises(UserError, match="sh_after"):
+    setup = assembled(sh_start=0.5, steps=2_000, **settings)
+    with pytest.raises(UserError, match="sh_start"):
         refuse_settings_for_nothing(setup.config, setup)
     assert not any("harmonics above" in n for n in assembled(steps=2_000, **settings).notes)
     assert any("harmonics above" in note for note in assembled(steps=2_000).notes)
@@ -341,9 +341,9 @@ def test_where_k_changes_the_bias_is_that_of_all_steps_so_far(plan):
     ("settings", "name"),
     [
         ({"views": 1, "batch_rule": "sqrt"}, "batch_rule"),
-        ({"views": 1, "density_views": "one"}, "density_views"),
-        ({"views": 2, "density_views": "extra", "densifier": {"name": "mcmc"}}, "density_views"),
-        ({"views": 2, "density_views": "one", "densifier": {"name": "none"}}, "density_views"),
+        ({"views": 1, "densify_views": "one"}, "densify_views"),
+        ({"views": 2, "densify_views": "extra", "densifier": {"name": "mcmc"}}, "densify_views"),
+        ({"views": 2, "densify_views": "one", "densifier": {"name": "none"}}, "densify_views"),
         ({"reference": 600}, "reference"),
     ],
 )
@@ -380,7 +380,7 @@ class Observed:
 
 def test_statistics_of_one_view_are_those_of_each_place_in_turn():
     seen = Observed()
-    _, state = trained(12, seen, views=3, density_views="one")
+    _, state = trained(12, seen, views=3, densify_views="one")
     assert seen.got == [(views[(k + 1) % 3],) for k, views in enumerate(seen.drawn)]
     assert seen.shares == [1 / 3] * 12
     assert (state.counters.views, state.counters.backward_passes) == (36, 36)
@@ -389,8 +389,8 @@ def test_statistics_of_one_view_are_those_of_each_place_in_turn():
 @pytest.mark.parametrize("views", [1, 2])
 def test_an_extra_view_is_rendered_while_density_control_lasts(views):
     seen = Observed()
-    asked = {"views": views, "fewest_edits": 6}
-    setup, state = trained(40, seen, density_views="extra", **asked)
+    asked = {"views": views, "min_refinements": 6}
+    setup, state = trained(40, seen, densify_views="extra", **asked)
     last = 20  # of 40: density control ends in the middle
     assert [setup.schedule.collects(step) for step in (last - 1, last + 1)] == [True, False]
     extra = sum(map(setup.schedule.collects, range(1, 41)))
@@ -403,7 +403,7 @@ def test_an_extra_view_is_rendered_while_density_control_lasts(views):
 
 @pytest.mark.parametrize("views", [1, 2])
 def test_no_further_view_is_rendered_where_no_edit_will_come(views):
-    setup, state = trained(12, views=views, density_views="extra")
+    setup, state = trained(12, views=views, densify_views="extra")
     assert setup.schedule.collects(12) and not setup.schedule.grows
     assert state.counters.views == 12 * views
 
@@ -450,9 +450,9 @@ def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_before_the_first_edit_they_change_no_bit(choice, operator):
-    settings = {"views": 2, "steps": 400, "operator": {"name": operator}, "fewest_edits": 6}
+    settings = {"views": 2, "steps": 400, "operator": {"name": operator}, "min_refinements": 6}
     (setup, state), (_, other) = (
-        trained(8, Weighing(), density_views=each, background="random", **settings)
+        trained(8, Weighing(), densify_views=each, background="random", **settings)
         for each in ("all", choice)
     )
     assert setup.schedule.first_edit > 8 and setup.weighs
@@ -467,8 +467,8 @@ def test_before_the_first_edit_they_change_no_bit(choice, operator):
 
 @pytest.mark.parametrize("choice", ["one", "extra"])
 def test_other_statistics_are_other_edits(choice):
-    asked = {"views": 2, "fewest_edits": 6}
-    edited = [trained(40, density_views=each, **asked)[1] for each in ("all", choice)]
+    asked = {"views": 2, "min_refinements": 6}
+    edited = [trained(40, densify_views=each, **asked)[1] for each in ("all", choice)]
     shapes = [state.parameters["means"].shape[0] for state in edited]
     sums = [float(state.parameters["means"].detach().sum()) for state in edited]
     assert shapes[0] != shapes[1] or sums[0] != sums[1]

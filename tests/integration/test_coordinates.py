@@ -13,10 +13,10 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.afterwards import figures, files
-from crossgrad_core.run.afterwards.how import AS_IT_IS
 from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.run.export import export_scene
+from crossgrad_core.run.postprocess import evaluate, export
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
@@ -167,23 +167,23 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
     assert {"point_cloud_utm.ply", "point_cloud_utm.georef.json"} <= new
     assert {name: (trained / name).read_bytes() for name in before} == before
     with pytest.raises(UserError, match="the file exists"):
-        files.exported(trained, file_format=None, out=None, coordinates="utm")
+        export.exported(trained, file_format=None, out=None, coordinates="utm")
     with pytest.raises(UserError, match=r"no such coordinates(?s:.*)epsg:32633"):
-        files.exported(trained, file_format=None, out=None, coordinates="gauss")
+        export.exported(trained, file_format=None, out=None, coordinates="gauss")
 
 
 def test_what_stands_beside_a_named_file_is_not_replaced(trained, tmp_path):
     (tmp_path / "a.georef.json").write_text("mine")
     with pytest.raises(UserError, match="the file exists"):
-        files.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
+        export.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
     assert (tmp_path / "a.georef.json").read_text() == "mine"
 
 
 def test_a_file_in_other_coordinates_is_not_taken_for_one_in_those_of_the_scene(trained, tmp_path):
     path = tmp_path / "a.ply"
-    files.exported(trained, file_format=None, out=path, coordinates="enu")
+    export.exported(trained, file_format=None, out=path, coordinates="enu")
     with pytest.raises(UserError, match=r"in other coordinates(?s:.*)--coordinates input"):
-        figures.evaluated_file(trained, path)
+        evaluate.evaluated_file(trained, path)
 
 
 def test_options_of_the_reader_are_kept(scene, tmp_path):

@@ -15,8 +15,8 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import tables_of
 
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}

@@ -11,11 +11,11 @@ import pytest
 import torch
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.contract.contexts import Densified
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import DensifyResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import app, assemble, ending, session
+from crossgrad_core.run import app, assemble, finish, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.scene import photos_ahead
@@ -377,7 +377,7 @@ class Leaves:
         rows = torch.arange(3)
         sizes, opaque = torch.full((3, 3), -6.0), torch.full((3,), 5.0)
         values = {"means": centers, "scales": sizes, "opacities": opaque}
-        return Densified(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
+        return DensifyResult(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("by zero")])
@@ -392,7 +392,7 @@ def test_what_ends_the_removal_of_floaters_loses_nothing(
         raise error
 
     with monkeypatch.context() as patched:
-        patched.setattr(ending, "rows_without_floaters", broken)
+        patched.setattr(finish, "rows_without_floaters", broken)
         assert run(scene, out) == (0 if isinstance(error, KeyboardInterrupt) else 1)
     stopped = isinstance(error, KeyboardInterrupt)
     assert summary(out)["status"] == ("stopped" if stopped else "failed")

@@ -13,8 +13,8 @@ SOURCE = """
 import numpy as np
 import torch
 from crossgrad_core.plugin import (
-    Densifier, Draw, Edit, Figure, Grouping, Loss, Metric, Observer, Rasterizer, Reader, Resolution,
-    Rows, Rule, Sampler, UserError, hookimpl,
+    Densifier, ViewSample, Edit, Figure, Grouping, Loss, Metric, Observer, Rasterizer, Reader,
+    Resolution, Rows, Rule, Sampler, UserError, hookimpl,
 )
 
 class TensorMetric(Metric):
@@ -25,15 +25,16 @@ class TensorMetric(Metric):
 
 class NumpySampler(Sampler):
     def sample(self, context, state):
-        return Draw(tuple(context.rng.integers(len(context.scene.train_views), size=1))), state
+        drawn = context.rng.integers(len(context.scene.train_views), size=1)
+        return ViewSample(tuple(drawn)), state
 
 class Behind(Sampler):
     def sample(self, context, state):
-        return Draw((len(context.scene.train_views),)), state
+        return ViewSample((len(context.scene.train_views),)), state
 
 class Before(Sampler):
     def sample(self, context, state):
-        return Draw((-1,)), state
+        return ViewSample((-1,)), state
 
 class Fewer(Grouping):
     def fit(self, scene, rng, probe=None):
@@ -45,12 +46,12 @@ class Failing(Grouping):
 
 class Words(Observer):
     @hookimpl
-    def crossgrad_objections(self, selection):
+    def crossgrad_validate_selection(self, selection):
         return "this is no list"
 
 class Objecting(Observer):
     @hookimpl
-    def crossgrad_objections(self, selection):
+    def crossgrad_validate_selection(self, selection):
         raise RuntimeError("no answer")
 
 class Steps(Observer):
@@ -184,7 +185,7 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
         (("--observe", "objecting"), "RuntimeError: no answer"),
         (
             ("--observe", "objecting"),
-            "in hook crossgrad_objections of observer objecting, from faulty-package 1.0",
+            "in hook crossgrad_validate_selection of observer objecting, from faulty-package 1.0",
         ),
         (("--resolution", "unfit"), "a plugin of faulty-package 1.0 failed"),
         (("--resolution", "unfit"), "made_up_faulty.py:67"),

@@ -4,7 +4,7 @@ import pytest
 from support.same_bits import bits
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.run import app, ending
+from crossgrad_core.run import app, finish
 from crossgrad_core.scene import photos
 
 
@@ -34,7 +34,7 @@ def test_memory_disk_and_files_give_the_same_bits(scene, tmp_path, monkeypatch):
 
     # As if photos were large, and there were memory for one of them.
     monkeypatch.setattr(photos, "_LARGE", 1)
-    for module in (app, ending):
+    for module in (app, finish):
         monkeypatch.setattr(module, "fits", lambda *_: False)
     monkeypatch.setattr(photos, "_LATEST", 2)
     begun = photos.PhotoCache.__init__

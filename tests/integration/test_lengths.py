@@ -8,19 +8,19 @@ import torch
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.run.opening import parsed
+from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.settings import merged
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.budget import seconds_ahead
-from crossgrad_core.training.expected_cost import Crowd, cost_ahead, cost_of_run
+from crossgrad_core.training.expected_cost import PrimitiveCounts, cost_ahead, cost_of_run
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -74,7 +74,7 @@ def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
 
 @pytest.mark.parametrize(("margin", "told"), [(-100.0, True), (100.0, False)])
 def test_a_run_says_where_it_was_better(scene, tmp_path, monkeypatch, capsys, margin, told):
-    monkeypatch.setattr("crossgrad_core.run.ending.WORSE", margin)
+    monkeypatch.setattr("crossgrad_core.run.finish.WORSE", margin)
     settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 4, "eval_every": 2}
     assert app.run(settings, verbosity=0) == 0
     line = "dB below that of step"
@@ -196,7 +196,7 @@ def test_the_dry_run_of_a_budget_is_a_configuration_of_it(scene, tmp_path, capsy
 
 
 def test_one_view_and_two_edit_after_as_many_views():
-    one, two = (trained(views=k, max_views=144, fewest_edits=6)[2] for k in (1, 2))
+    one, two = (trained(views=k, max_views=144, min_refinements=6)[2] for k in (1, 2))
     assert len(one.edits) == len(two.edits) == 6
     assert [count + count % 2 for count in one.edits] == two.edits
     assert max(one.edits) < 72
@@ -256,7 +256,7 @@ def test_what_is_no_k_is_refused_with_its_form(text, form):
 def test_views_that_are_ahead_cost_what_they_cost():
     settings = {"steps": 1000, "densifier": {"name": "none"}}
     plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
-    crowd = Crowd(start=100, present=100)
+    crowd = PrimitiveCounts(start=100, present=100)
     assert cost_of_run(plain, crowd, 500) == cost_of_run(changing, crowd, 500) == 1000
     assert cost_ahead(changing, crowd, 500, 400) == 1200
 

@@ -9,9 +9,9 @@ from support.scenes import write_tiny_scene
 import crossgrad_core as cg
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.afterwards import figures, files, pictures
-from crossgrad_core.run.flight import LADDER
-from crossgrad_core.run.results import film
+from crossgrad_core.run.camera_path import LADDER
+from crossgrad_core.run.postprocess import evaluate, export, render
+from crossgrad_core.run.results import video
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.run.session import Session
 
@@ -47,8 +47,8 @@ def test_results_without_checkpoints_are_not_begun_again(run, status):
     before = contents(run)
     for act in (
         lambda: app.run({}, resume=run, verbosity=-1),
-        lambda: figures.evaluate(run),
-        lambda: files.export(run, file_format="ply", out=None),
+        lambda: evaluate.evaluate(run),
+        lambda: export.export(run, file_format="ply", out=None),
     ):
         with pytest.raises(UserError, match="the checkpoints of the run are gone") as refused:
             act()
@@ -105,13 +105,13 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
 
 def test_of_a_shorter_film_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
-        pictures.fly(run, path=LADDER, frames=frames, out=None)
+        render.render_path(run, path=LADDER, frames=frames, out=None)
         assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
 
 
 def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
     files = [path for path in run.rglob("*") if path.is_file() and path.name != "run.lock"]
-    assert any(path.name == "tensors.safetensors" for path in files)
+    assert any(path.name == "tensors.safetensors" for path in export)
     (run / "fresh").touch()
     assert {path.stat().st_mode for path in files} == {(run / "fresh").stat().st_mode}
 
@@ -154,7 +154,7 @@ def test_a_changed_configuration_is_refused(run, old, new, named):
     assert text.count(old) == 1
     (run / "config.yaml").write_text(text.replace(old, new))
     before = contents(run)
-    for act in (lambda: app.run({}, resume=run, verbosity=-1), lambda: figures.evaluate(run)):
+    for act in (lambda: app.run({}, resume=run, verbosity=-1), lambda: evaluate.evaluate(run)):
         with pytest.raises(UserError, match=r"config.yaml was changed since") as refused:
             act()
         assert refused.value.where == f"settings {named}; step 6"
@@ -165,14 +165,14 @@ def test_what_does_not_train_may_be_changed(run):
     text = (run / "config.yaml").read_text()
     assert "eval_every: 2" in text
     (run / "config.yaml").write_text(text.replace("eval_every: 2", "eval_every: 3"))
-    figures.evaluate(run)
+    evaluate.evaluate(run)
 
 
 def test_a_film_of_other_frames_does_not_stay(run, monkeypatch, capsys):
-    pictures.fly(run, path=LADDER, frames=3, out=None)
-    (made,) = run.glob("renders/*/path_ladder/film.*")
-    monkeypatch.setattr(film, "_LARGEST", 100)
-    monkeypatch.setattr(film.shutil, "which", lambda _: None)
-    pictures.fly(run, path=LADDER, frames=3, out=None)
+    render.render_path(run, path=LADDER, frames=3, out=None)
+    (made,) = run.glob("renders/*/path_ladder/video.*")
+    monkeypatch.setattr(video, "_LARGEST", 100)
+    monkeypatch.setattr(video.shutil, "which", lambda _: None)
+    render.render_path(run, path=LADDER, frames=3, out=None)
     assert not made.exists()
-    assert "no film: too many or too large without ffmpeg" in capsys.readouterr().out
+    assert "no video: too many or too large without ffmpeg" in capsys.readouterr().out

@@ -80,7 +80,7 @@ def test_a_run_of_0_1_keeps_its_units_and_rates(old):
     kept = read_config(old)
     assert (kept["events"], kept["rate_factor"]) == ("steps", 1.0)
     assert (kept["beta1"], kept["beta2"]) == (0.9, 0.999)
-    assert kept["final_decay"] == 0.0
+    assert kept["lr_tail"] == 0.0
 
 
 def test_a_stopped_run_of_0_1_goes_on(old):

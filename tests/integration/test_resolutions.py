@@ -17,9 +17,9 @@ from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.frozen import view_gradients
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.model import model_of
+from crossgrad_core.training.probe_gradients import view_gradients
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.resolutions.octaves import Octaves
 
@@ -79,7 +79,7 @@ CASES = {
         "exposure": {"name": "gain"}, "average": 0.3,
     },
     "a further view, anchors": {
-        "resolution": SPECTRAL, "backbone": {"name": "scaffold"}, "density_views": "extra",
+        "resolution": SPECTRAL, "backbone": {"name": "scaffold"}, "densify_views": "extra",
         "views": 3,
     },
     "weights of pixels in both sizes": {
@@ -117,7 +117,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(
     # Of the notes on scales there is one, and it is that of the length in the end.
     (note,) = notes(tmp_path / "timed")
     if resolution is OCTAVES:
-        (expected,) = Octaves(smallest=4).remarks(Schedule.for_run(last.step))
+        (expected,) = Octaves(smallest=4).messages(Schedule.for_run(last.step))
         assert note == expected
     else:
         assert "far 1/" in note and "near 1/" in note and note.count("full size from step 19") == 2
@@ -163,14 +163,14 @@ def test_a_further_view_has_the_scale_of_its_own_regime_and_changes_none(views):
     asked = {"resolution": {"name": "spectral", "smallest": 1, "courses": PARTS}, "views": views}
     scales = {"far": 0.25, "near": 0.5}
     streams = []
-    for density_views in ("all", "extra"):
-        setup, seen = watched(assembled(**asked, density_views=density_views))
+    for densify_views in ("all", "extra"):
+        setup, seen = watched(assembled(**asked, densify_views=densify_views))
         state = first_state(setup)
         reached = []
         for _ in range(12):
             timed_step(setup, state)
             reached.append(state.states["resolution"].values)
-        assert {len(step) for step in seen} == {views + (density_views == "extra")}
+        assert {len(step) for step in seen} == {views + (densify_views == "extra")}
         for step in seen:
             for regime, scale, shape in step:
                 assert scale == scales[regime]

@@ -9,8 +9,8 @@ import torch
 from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.contract.contexts import Aggregated, Densified, Regularized
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import AggregateResult, DensifyResult, RegularizeResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
@@ -110,7 +110,7 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
 
 
 def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scene, tmp_path):
-    settings = {"steps": 20, "average": 0.5, "final_decay": 0.5, "eval_every": 4}
+    settings = {"steps": 20, "average": 0.5, "lr_tail": 0.5, "eval_every": 4}
     run(scene, tmp_path / "raw", **{**settings, "average": 0.0})
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=15, **settings) == 0
@@ -288,7 +288,7 @@ class Poison:
         self.steps.discard(context.step)
         bad = context.parameters["f_dc"].detach().clone()
         bad[:] = float("nan")
-        return Densified(Edit(values={"f_dc": Rows(bad)}))
+        return DensifyResult(Edit(values={"f_dc": Rows(bad)}))
 
 
 def poisoned(monkeypatch, poison):
@@ -365,19 +365,19 @@ class Louder:
         aggregated = yield
         self.seen.append("aggregate")
         zeroed = dict.fromkeys(aggregated.gradients)
-        return Aggregated(zeroed, aggregated.counts, states=aggregated.states)
+        return AggregateResult(zeroed, aggregated.counts, states=aggregated.states)
 
     @hookimpl(wrapper=True)
     def crossgrad_densify(self, context):
         densified = yield
         self.seen.append("densify")
-        return Densified(NO_EDIT, states=densified.states)
+        return DensifyResult(NO_EDIT, states=densified.states)
 
     @hookimpl
     def crossgrad_regularize(self, context):
         if context.gaussians is not None:
             return None
-        return Regularized(context.parameters["opacities"].sum())
+        return RegularizeResult(context.parameters["opacities"].sum())
 
 
 def test_wrappers_replace_what_the_seams_answer(scene, tmp_path, monkeypatch):

@@ -10,8 +10,8 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.afterwards import figures, files, pictures
-from crossgrad_core.run.afterwards.how import How
+from crossgrad_core.run.postprocess import evaluate, export, render
+from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.scene_file import FILE
 from crossgrad_plugins.diagnostics import app as diagnostics
 from crossgrad_plugins.diagnostics.command import Options
@@ -47,9 +47,9 @@ def looks(root):
     """Every command that looks at a run, as a function of how it opens the run."""
     run = root / "run"
     return {
-        "eval": lambda how: figures.evaluate(run, how),
-        "render": lambda how: pictures.render(run, split="all", out=root / "out", how=how),
-        "export": lambda how: files.export(run, file_format="ply", out=root / "a.ply", how=how),
+        "eval": lambda how: evaluate.evaluate(run, how),
+        "render": lambda how: render.render(run, split="all", out=root / "out", how=how),
+        "export": lambda how: export.export(run, file_format="ply", out=root / "a.ply", how=how),
         "diagnose": lambda how: diagnostics.diagnose(
             None, run, {}, Options(per_group=2), root / "probes", how.accept_scene
         ),
@@ -110,7 +110,7 @@ def test_what_only_looks_takes_it_where_the_user_says_so(root, change, capsys):
     for name, look in looks(root).items():
         if name != "diagnose":  # It needs more views than these.
             look(How(accept_scene=True))
-    pictures.render(run, split="test", out=None, how=How(accept_scene=True))
+    render.render(run, split="test", out=None, how=How(accept_scene=True))
     assert capsys.readouterr().out.count("overall") >= 1
     views = 1 if change == "held out" else 2
     assert len((run / "per_view_accepted.csv").read_text().splitlines()) == 1 + views
@@ -128,7 +128,7 @@ def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):
     assert any("accepted: photos changed: 1" in note for note in notes)
     assert "accepted: photos changed: 1" in (root / "run" / "log.txt").read_text()
     # From then on that is its scene.
-    figures.evaluate(root / "run")
+    evaluate.evaluate(root / "run")
 
 
 def test_a_run_goes_on_only_with_its_own_held_out_views(root):
@@ -139,10 +139,10 @@ def test_a_run_goes_on_only_with_its_own_held_out_views(root):
 
 def test_a_run_of_an_older_version_goes_on_and_knows_its_scene_from_then_on(root, caplog):
     (root / "run" / FILE).unlink()
-    figures.evaluate(root / "run")
+    evaluate.evaluate(root / "run")
     assert caplog.text.count("the run is of an older version") == 1
     assert not (root / "run" / FILE).exists()
     assert resume(root) == 0
     spoilt(root / "scene", "trained")
     with pytest.raises(UserError, match="training photos missing"):
-        figures.evaluate(root / "run")
+        evaluate.evaluate(root / "run")

@@ -16,13 +16,13 @@ from support.selections import selection_of
 
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.errors import UserError
-from crossgrad_core.plugin import Aggregated, Observer, Operator, ViewCounts, hookimpl
+from crossgrad_core.plugin import AggregateResult, Observer, Operator, ViewCounts, hookimpl
 from crossgrad_core.registry.entries import load as load_plugin
 from crossgrad_core.run import app, assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.training.clock import PHASES
-from crossgrad_core.training.on_request import OnRequest
+from crossgrad_core.training.render_callback import RenderCallback
 
 PLUGINS = {
     "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
@@ -151,7 +151,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
 
     class Asks(Observer):
         @hookimpl
-        def crossgrad_model(self, model):
+        def crossgrad_model_ready(self, model):
             drawn = model.render(1, 0.5, frozenset({"depth"}))
             assert drawn.render.depth.shape == drawn.photo.shape[:2] == drawn.image.shape[:2]
             expected = model.loss.loss(drawn.image, drawn.photo, drawn.mask, None)
@@ -171,7 +171,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
 def test_a_render_that_there_cannot_be_is_refused(view, scale):
     setup = SimpleNamespace(train_views=(None,) * 3)
     with pytest.raises(UserError, match="asked for a render"):
-        OnRequest(setup, None, counted=False)(view, scale)
+        RenderCallback(setup, None, counted=False)(view, scale)
 
 
 class PairOnly(Operator):
@@ -180,7 +180,7 @@ class PairOnly(Operator):
     views = ViewCounts(2, 2)
 
     def aggregate(self, context, state):
-        return Aggregated(context.gradients.total()), state
+        return AggregateResult(context.gradients.total()), state
 
 
 def test_an_operator_without_a_meaning_for_some_step_is_refused():

@@ -12,7 +12,7 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics import kernel_cache
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_core.training import budget, compile_ahead
+from crossgrad_core.training import budget, warmup
 
 #: Trains as the command does, and prints which kernels were compiled or loaded after the warm-up.
 SCRIPT = """
@@ -63,7 +63,7 @@ from crossgrad_core.config import ComponentChoice
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.commands import configured
-from crossgrad_core.training.compile_ahead import compile_all
+from crossgrad_core.training.warmup import compile_all
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -115,14 +115,14 @@ class _Process:
 @pytest.fixture
 def started(monkeypatch):
     """What becomes of the other process, on a machine of two cores."""
-    monkeypatch.setattr(compile_ahead.subprocess, "Popen", _Process)
-    monkeypatch.setattr(compile_ahead, "available_cores", lambda: 2)
+    monkeypatch.setattr(warmup.subprocess, "Popen", _Process)
+    monkeypatch.setattr(warmup, "available_cores", lambda: 2)
     monkeypatch.setattr(_Process, "started", [])
     return _Process.started
 
 
 def _setup(**settings):
-    return SimpleNamespace(config=RunConfig(**settings), device=torch.device("cpu"), by_rows={})
+    return SimpleNamespace(config=RunConfig(**settings), device=torch.device("cpu"), sparse_rows={})
 
 
 def _miss(*, kept=True):
@@ -131,7 +131,7 @@ def _miss(*, kept=True):
 
 
 def test_the_other_process_starts_with_the_first_missing_kernel(started):
-    with compile_ahead.compiling_beside(_setup()):
+    with warmup.compiling_beside(_setup()):
         assert started == []
         _miss()
         _miss()
@@ -143,14 +143,14 @@ def test_the_other_process_starts_with_the_first_missing_kernel(started):
 
 def test_a_process_that_hangs_is_ended(started, monkeypatch):
     monkeypatch.setattr(_Process, "hangs", True)
-    with compile_ahead.compiling_beside(_setup()):
+    with warmup.compiling_beside(_setup()):
         _miss()
     assert started[1:] == ["waited for", "terminated", "waited for"]
 
 
 def test_the_other_process_ends_with_a_run_that_is_refused(started):
     def refuse():
-        with compile_ahead.compiling_beside(_setup()):
+        with warmup.compiling_beside(_setup()):
             _miss()
             raise KeyboardInterrupt
 
@@ -161,7 +161,7 @@ def test_the_other_process_ends_with_a_run_that_is_refused(started):
 
 @pytest.mark.parametrize(("settings", "kept"), [({"threads": 1}, True), ({}, False)])
 def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, settings, kept):
-    with compile_ahead.compiling_beside(_setup(**settings)):
+    with warmup.compiling_beside(_setup(**settings)):
         _miss(kept=kept)
     assert started == []
 
@@ -169,11 +169,11 @@ def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, setting
 def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeypatch):
     # Whether a view draws few rows is found out on the clock.
     asked = []
-    monkeypatch.setattr(compile_ahead, "compile_rows", lambda: asked.append("rows"))
-    for by_rows in ({}, {"sh_rest": "f_rest"}):
+    monkeypatch.setattr(warmup, "compile_rows", lambda: asked.append("rows"))
+    for sparse_rows in ({}, {"sh_rest": "f_rest"}):
         setup = _setup(threads=1)
-        setup.by_rows = by_rows
-        with compile_ahead.compiling_beside(setup):
+        setup.sparse_rows = sparse_rows
+        with warmup.compiling_beside(setup):
             assert asked == []
     assert asked == ["rows"]
 

@@ -14,7 +14,7 @@ from crossgrad_core.registry.entries import offers
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.photo_parameters import STATE
+from crossgrad_core.training.per_image_params import STATE
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.authoring.matrix.combinations import NEEDED
 from crossgrad_plugins.authoring.matrix.pairwise import pairwise

@@ -14,7 +14,11 @@ from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Camera
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, JACOBIAN_MARGIN, TRANSMITTANCE_STOP
+from crossgrad_core.numerics.raster_constants import (
+    ALPHA_THRESHOLD,
+    JACOBIAN_MARGIN,
+    TRANSMITTANCE_STOP,
+)
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -24,12 +24,12 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.resolve import resolved
-from crossgrad_core.training.budget import lengthened
+from crossgrad_core.training.budget import with_length
+from crossgrad_core.training.growth_budget import bound_of, most_after
 from crossgrad_core.training.rates import axes_of, rates_at, rule_at
-from crossgrad_core.training.room import bound_of, most_after
+from crossgrad_core.training.scale_clamp import max_scale_ratio_of
 from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.veils import size_bound_of
 
 PATH = Path(__file__).parents[1] / "integration" / "data" / "decided.json"
 COMBINATIONS, SEED = 500, 54
@@ -67,7 +67,7 @@ STARTS = (1_000, 20_000)
 #: The settings of config.yaml that a run decides where the user names nothing.
 DECIDED = (
     *("densifier", "rasterizer", "start", "resolution", "views_per_step", "steps", "events"),
-    *("sh_every", "final_decay", "average", "floaters", "dropout", "growth", "max_gaussians"),
+    *("sh_every", "lr_tail", "average", "floaters", "dropout", "growth", "max_gaussians"),
 )
 
 
@@ -149,14 +149,14 @@ def decided(settings: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"refused": error.what}
     if planned is not None:
         timed = replace(setup, config=setup.config.model_copy(update={"steps": planned}))
-        setup = lengthened(timed, 0, planned)
+        setup = with_length(timed, 0, planned)
     return {
         "settings": json.loads(resolved(setup).model_dump_json(include=set(DECIDED))),
         "schedule": _schedule(setup),
         "rates": {step: rates_at(setup, step) for step in _steps(setup)},
         "adam": {step: repr(rule_at(setup, step)) for step in _steps(setup)},
         "axes": axes_of(setup),
-        "size_bound": size_bound_of(setup),
+        "max_scale_ratio": max_scale_ratio_of(setup),
         "growth": growth_of(setup),
         "bound": bound_of(setup),
         "budget": _budget(setup),
@@ -173,7 +173,7 @@ def _schedule(setup: Setup) -> Mapping[str, Any]:
     schedule = setup.schedule
     names = (
         *("mode", "total", "length", "lr_until", "sh_interval", "sh_from", "sh_wait", "sh_every"),
-        *("densify_from", "densify_until", "densify_every", "reset_every", "fewest_edits"),
+        *("densify_from", "densify_until", "densify_every", "reset_every", "min_refinements"),
         *("anchors_from", "anchors_every", "coarse_until"),
     )
     return {name: getattr(schedule, name) for name in names} | {"edits": schedule.edits()}

@@ -18,8 +18,8 @@ from unittest.mock import patch
 from crossgrad_fuzz.limits import memory_limit
 from PIL import Image
 
+from crossgrad_core.run.camera_path import _read as read_camera_path
 from crossgrad_core.run.checkpoint.tensors import read_tensors
-from crossgrad_core.run.flight import _read as read_camera_path
 from crossgrad_core.scene.decode import decode_photo
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.split import _read_list as read_list

@@ -43,8 +43,8 @@ USUAL: Mapping[str, Any] = {
     "beta1": 0.9,
     "beta2": 0.999,
     "floaters": "keep",
-    "position_steps": "extent",
-    "size_bound": 0.0,
+    "position_lr": "extent",
+    "max_scale_ratio": 0.0,
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.

@@ -3,7 +3,7 @@
 import pytest
 
 from crossgrad_core.run.results.machine import Calibration
-from crossgrad_core.training.clock import Clock, Laps
+from crossgrad_core.training.clock import Clock, PhaseTimer
 
 
 def each_step_takes(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
@@ -14,9 +14,9 @@ def each_step_takes(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     Runs that become long by that do not measure the machine for two real seconds.
     """
 
-    def count(self: Clock, laps: Laps) -> None:
+    def count(self: Clock, laps: PhaseTimer) -> None:
         each = seconds if "render" in laps.spent else 0.0
-        counted(self, Laps(total=each, spent={"other": each}, cpu=each))
+        counted(self, PhaseTimer(total=each, spent={"other": each}, cpu=each))
 
     counted = Clock.count
     monkeypatch.setattr(Clock, "count", count)

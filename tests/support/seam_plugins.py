@@ -6,7 +6,6 @@ from crossgrad_core.plugin import (
     NO_EDIT,
     Compared,
     Densifier,
-    Draw,
     Edit,
     Exposure,
     Field,
@@ -19,6 +18,7 @@ from crossgrad_core.plugin import (
     PluginState,
     Resolution,
     Sampler,
+    ViewSample,
     hookimpl,
 )
 from crossgrad_plugins.losses.photometric.loss import photometric_loss
@@ -92,7 +92,7 @@ class OneThenTwo(Sampler):
         count = context.views_per_step if context.step % 2 == 0 else 1
         drawn = context.rng.choice(len(context.centers), count, replace=False)
         labels = None if context.groups is None else tuple(context.groups[view] for view in drawn)
-        return Draw(tuple(int(view) for view in drawn), labels), state
+        return ViewSample(tuple(int(view) for view in drawn), labels), state
 
 
 class BrightnessError(Metric):

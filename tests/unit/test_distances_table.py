@@ -9,8 +9,6 @@ from support.run_folders import RunFolder
 from support.scenes import write_tiny_scene
 from support.scripts import printed_by
 
-from crossgrad_core.run.afterwards import figures
-
 NAMES = [f"{folder}/{number:04}.png" for folder in ("street", "aerial") for number in range(4)]
 
 
@@ -93,8 +91,10 @@ def evaluated(monkeypatch):
         figure = SimpleNamespace(name="psnr")
         return SimpleNamespace(views=views, figures=[figure]), None
 
-    monkeypatch.setattr(figures, "evaluated_on", evaluate)
-    monkeypatch.setattr(figures, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how))
+    monkeypatch.setattr(evaluate, "evaluated_on", evaluate)
+    monkeypatch.setattr(
+        evaluate, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how)
+    )
     return told
 
 

@@ -11,7 +11,7 @@ from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.directional import ColorFit
 from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
 from crossgrad_core.numerics.elementwise import sigmoid
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_core.plugin import Camera, Gaussians
 
 #: The average is taken over at most so many cameras.

@@ -18,14 +18,14 @@ from crossgrad_backbones.anchors.decode import decoded
 from crossgrad_backbones.anchors.frustum import in_frustum
 from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_backbones.anchors.volume import mean_volume
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_core.plugin import (
     Camera,
     Gaussians,
     Parameters,
     Phase,
     RegularizeContext,
-    Regularized,
+    RegularizeResult,
     Scene,
     UserError,
     hookimpl,
@@ -156,8 +156,8 @@ class AnchorBackbone(AnchorOptions):
         return baked(self.heads, parameters, views, code)
 
     @hookimpl
-    def crossgrad_regularize(self, context: RegularizeContext) -> Regularized | None:
+    def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
         """The mean volume of what a view draws, times `volume_weight`."""
         if context.gaussians is None or not self.volume_weight:
             return None
-        return Regularized(self.volume_weight * mean_volume(context.gaussians))
+        return RegularizeResult(self.volume_weight * mean_volume(context.gaussians))

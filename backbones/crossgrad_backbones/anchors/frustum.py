@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, JACOBIAN_MARGIN
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.plugin import Camera
 
 #: Near plane and dilation (px^2) of the filter: the defaults of the rasterizers.

@@ -43,8 +43,8 @@ class AnchorOptions(Backbone):
     lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
     lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         bank = "there is no feature bank (feature_bank = false); leave it out"
         codes = "photos have no codes (appearance = 0); leave it out"
         return {

@@ -41,7 +41,7 @@ class Lattice:
         scalars = (self.root_cell, self.fork, self.levels, self.distance, self.lead)
         return torch.cat([self.origin, torch.stack([*scalars, self.visible_share])]).double()
 
-    def weeding(self, visible_share: float) -> "Lattice":
+    def with_prune_threshold(self, visible_share: float) -> "Lattice":
         """The same lattices with another threshold of weeding."""
         return replace(self, visible_share=torch.full_like(self.visible_share, visible_share))
 
@@ -116,7 +116,7 @@ class Lattice:
             seen += self.seen(self.distances(anchors, levels, camera), levels, extra)
         return seen / max(1, cameras.shape[0])
 
-    def lasting(self, shares: Tensor) -> Tensor:
+    def keep_levels(self, shares: Tensor) -> Tensor:
         """[A] bool, anchors that are not weeded out, by the share of cameras that see them.
 
         What every camera sees always stays: with an automatic threshold (the mean share) and all

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
-from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
+from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest, NewAnchors
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
 from crossgrad_core.plugin import SHORTEST_ANCHOR_INTERVAL, DensifyContext, Parameters, Schedule
@@ -67,16 +67,18 @@ class OctreeControl(AnchorDensifier):
         )
 
     @override
-    def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:
+    def grown(
+        self, context: DensifyContext, parameters: Parameters, request: GrowthRequest
+    ) -> NewAnchors:
         centers = torch.from_numpy(context.scene.centers)
-        return grown(parameters, urge, self._thresholds(parameters), centers)
+        return grown(parameters, request, self._thresholds(parameters), centers)
 
     @override
-    def changed(self, parameters: Parameters, urge: Urge) -> Mapping[str, Tensor]:
+    def changed(self, parameters: Parameters, request: GrowthRequest) -> Mapping[str, Tensor]:
         thresholds = self._thresholds(parameters, self.extra_ratio)
-        farther = seen_from_farther(parameters, urge, thresholds)
+        farther = seen_from_farther(parameters, request, thresholds)
         extra = parameters["extra_levels"] + self.extra_level * farther
-        return {**super().changed(parameters, urge), "extra_levels": extra}
+        return {**super().changed(parameters, request), "extra_levels": extra}
 
     def _thresholds(self, parameters: Parameters, share: float = 1.0) -> Thresholds:
         """The thresholds of all levels, times `share`."""

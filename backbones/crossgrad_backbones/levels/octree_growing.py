@@ -7,7 +7,12 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.anchors.growth.cells import cells_of, free_cells, in_reach
-from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge, largest, offset_means
+from crossgrad_backbones.anchors.growth.new_anchors import (
+    GrowthRequest,
+    NewAnchors,
+    largest,
+    offset_means,
+)
 from crossgrad_backbones.levels.lattice import Lattice
 
 
@@ -46,7 +51,10 @@ class Requests:
 
 
 def requests(
-    parameters: Mapping[str, Tensor], lattice: Lattice, urge: Urge, thresholds: Thresholds
+    parameters: Mapping[str, Tensor],
+    lattice: Lattice,
+    request: GrowthRequest,
+    thresholds: Thresholds,
 ) -> Requests:
     """What the offsets ask for.
 
@@ -55,9 +63,9 @@ def requests(
     level's threshold as well. There is no level beyond the last.
     """
     levels = parameters["levels"]
-    asks = urge.eligible & (urge.gradient >= thresholds.at(levels)[:, None])
+    asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])
     anchors, slots = asks.nonzero().unbind(1)
-    strength, own = urge.gradient[anchors, slots], levels[anchors]
+    strength, own = request.gradient[anchors, slots], levels[anchors]
     finer = (strength >= thresholds.at(own + 1)) & (own + 1 < lattice.levels)
     asked = own + finer
     places = lattice.coordinates(offset_means(parameters, anchors, slots), asked)
@@ -68,7 +76,10 @@ def requests(
 
 
 def grown(
-    parameters: Mapping[str, Tensor], urge: Urge, thresholds: Thresholds, cameras: Tensor
+    parameters: Mapping[str, Tensor],
+    request: GrowthRequest,
+    thresholds: Thresholds,
+    cameras: Tensor,
 ) -> NewAnchors:
     """New anchors in the free cells that offsets ask for.
 
@@ -77,7 +88,7 @@ def grown(
 
     Args:
         parameters: Those of an octree backbone, detached.
-        urge: What the offsets ask for.
+        request: What the offsets ask for.
         thresholds: From which gradients they grow.
         cameras: [C, 3] camera centres, local units.
 
@@ -87,7 +98,7 @@ def grown(
     Source: Octree-GS; methods of section 6.
     """
     lattice, levels = Lattice.of(parameters["lattice"]), parameters["levels"]
-    asked = requests(parameters, lattice, urge, thresholds)
+    asked = requests(parameters, lattice, request, thresholds)
     held = cells_of(lattice.coordinates(parameters["anchors"], levels), 1.0)
     first, place = free_cells(asked.sites, torch.cat([levels[:, None], held], 1))
     wanted = place >= 0
@@ -103,22 +114,22 @@ def grown(
         strength=strength[:, 0],
         further={"levels": at, "extra_levels": torch.zeros_like(positions[:, 0])},
     )
-    lasting = lattice.lasting(lattice.shares(positions, at, cameras))
-    return new.at(lasting.nonzero().squeeze(1))
+    keep_levels = lattice.keep_levels(lattice.shares(positions, at, cameras))
+    return new.at(keep_levels.nonzero().squeeze(1))
 
 
 def seen_from_farther(
-    parameters: Mapping[str, Tensor], urge: Urge, thresholds: Thresholds
+    parameters: Mapping[str, Tensor], request: GrowthRequest, thresholds: Thresholds
 ) -> Tensor:
     """[P] bool, anchors whose eligible offsets have a mean gradient above their level's threshold.
 
     Args:
         parameters: Those of an octree backbone, detached.
-        urge: What the offsets ask for.
+        request: What the offsets ask for.
         thresholds: Those that the mean must reach.
 
     Source: Octree-GS; methods of section 6.
     """
-    count = urge.eligible.sum(1)
-    mean = (urge.gradient * urge.eligible).sum(1) / count.clamp(min=1)
+    count = request.eligible.sum(1)
+    mean = (request.gradient * request.eligible).sum(1) / count.clamp(min=1)
     return (count > 0) & (mean >= thresholds.at(parameters["levels"]))

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from crossgrad_core.contract.state import Json
+from crossgrad_core.run.changeable_settings import CHANGEABLE
 from crossgrad_core.run.migration import NOTES
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.run.results.plan_file import FILE as PLAN
-from crossgrad_core.run.resumable import CHANGEABLE
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml

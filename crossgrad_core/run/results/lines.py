@@ -45,7 +45,7 @@ class Pace:
             seconds=_smoothed(self.seconds, record.train_seconds - self.record.train_seconds),
         )
 
-    def lengthened(self, total: int) -> "Pace":
+    def with_length(self, total: int) -> "Pace":
         """The figures of a run that is now to have `total` steps."""
         planned = self.total if self.planned is None else self.planned
         return replace(self, total=total, planned=planned)

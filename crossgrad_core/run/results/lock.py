@@ -15,8 +15,8 @@ from typing import BinaryIO, Literal
 from typing_extensions import override
 
 from crossgrad_core.errors import UserError
+from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
-from crossgrad_core.system.writability import check_own
 
 #: The file that is locked. It stays when its process is gone; then no process holds the lock on it.
 FILE = "run.lock"

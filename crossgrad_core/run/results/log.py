@@ -5,9 +5,9 @@ from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
-from crossgrad_core.system.writability import check_own
+from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
 
 FILE = "log.txt"
@@ -72,9 +72,9 @@ class RunLog:
             self.write(progress_line(self._pace))
 
     @hookimpl
-    def crossgrad_length(self, total: int) -> None:
+    def crossgrad_length_changed(self, total: int) -> None:
         """Notes the length that progress is now measured against."""
-        self._pace = self._pace.lengthened(total)
+        self._pace = self._pace.with_length(total)
 
     @hookimpl
     def crossgrad_evaluation(self, report: EvaluationReport) -> None:
@@ -83,7 +83,7 @@ class RunLog:
         self.write(evaluation_line(report))
 
     @hookimpl
-    def crossgrad_message(self, text: str) -> None:
+    def crossgrad_log(self, text: str) -> None:
         """Writes what the run says."""
         self.write(text)
 

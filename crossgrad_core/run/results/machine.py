@@ -7,7 +7,7 @@ from time import perf_counter, thread_time
 import numpy as np
 
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.state import Json
 
 #: Seconds between two looks at the load.

@@ -9,7 +9,7 @@ from typing import TypeAlias
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.results.totals import Totals
+from crossgrad_core.run.results.cost_totals import Totals
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.tables import as_cell, csv_bytes
 from crossgrad_core.system.text_files import parse_number, read_rows

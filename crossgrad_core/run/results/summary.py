@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
+from crossgrad_core.run.results.cost_totals import Totals
 from crossgrad_core.run.results.metrics_csv import Row
-from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 from crossgrad_core.training.clock import Clock

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.evaluation.result import EvaluationResult, Means
-from crossgrad_core.run.results.totals import Totals
+from crossgrad_core.run.results.cost_totals import Totals
 
 _NULL = "-"
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from crossgrad_core.plugin import (
     AggregateContext,
-    Aggregated,
+    AggregateResult,
     Observer,
     PluginState,
     hookimpl,
@@ -27,7 +27,7 @@ class Clip(Observer):
     @hookimpl(wrapper=True)
     def crossgrad_aggregate_gradients(
         self, context: AggregateContext
-    ) -> Generator[None, Aggregated, Aggregated]:
+    ) -> Generator[None, AggregateResult, AggregateResult]:
         """Lets the operator answer, then replaces its answer."""
         aggregated = yield
         gradients, clipped = dict(aggregated.gradients), 0

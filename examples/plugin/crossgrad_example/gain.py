@@ -20,9 +20,9 @@ class Gain(Exposure):
         return {"stops": PerPhoto(start, LearningRate(self.lr))}
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return image * torch.exp2(values["stops"])
 
     @override
-    def projected(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         return {"stops": values["stops"] - values["stops"].mean()}

@@ -5,7 +5,7 @@ from typing import ClassVar, cast
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler
+from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewSample
 
 
 class LeastSeen(Sampler):
@@ -14,7 +14,7 @@ class LeastSeen(Sampler):
     default_views: ClassVar[int] = 2
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         number = len(context.scene.train)
         seen = np.array(cast("list[int]", state.values.get("seen", [0] * number)))
         order = np.lexsort((context.rng.random(number), seen))
@@ -22,4 +22,4 @@ class LeastSeen(Sampler):
         seen[list(views)] += 1
         groups = context.groups
         labels = None if groups is None else tuple(groups[view] for view in views)
-        return Draw(views, labels), PluginState({"seen": seen.tolist()})
+        return ViewSample(views, labels), PluginState({"seen": seen.tolist()})

@@ -128,7 +128,7 @@ def imtl_g(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags
         [B, K] weights and [B] whether they are doubtful.
     """
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     norms, cosines = np.empty(views), np.empty((views, views))
     places = np.empty(views, np.int64)
     for b in range(blocks):
@@ -146,11 +146,11 @@ def imtl_g(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags
         v = np.empty(n)
         smallest = _equal_projections(scaled, own, v)
         total, sizes = v.sum(), np.abs(v).sum()
-        doubtful[b] = CAUTION * n * EPSILON * sizes > unit * smallest * abs(total)
+        ill_conditioned[b] = CAUTION * n * EPSILON * sizes > unit * smallest * abs(total)
         if not _cancels(v, scaled, own):
             for i in range(n):
                 result[b, places[i]] = v[i] / total
-    return result, doubtful
+    return result, ill_conditioned
 
 
 @strict_device
@@ -230,7 +230,7 @@ def nash(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags]:
         [B, K] weights and [B] whether they are doubtful.
     """
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     norms, cosines = np.empty(views), np.empty((views, views))
     places = np.empty(views, np.int64)
     for b in range(blocks):
@@ -244,14 +244,14 @@ def nash(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags]:
             continue
         largest = beta.max()
         # |u|^2 is n, and errors of the cosines grow with the summands over |u|.
-        doubtful[b] = n > 1 and CAUTION * n * EPSILON * max(largest / np.sqrt(n), 1.0) > unit
+        ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON * max(largest / np.sqrt(n), 1.0) > unit
         if n > 1 and n <= CANCELLED * largest * largest:
             continue
         longest = norms[:n].max()
         mean = geometric_mean(norms[:n] / longest)
         for i in range(n):
             result[b, places[i]] = beta[i] * mean * (longest / norms[i])
-    return result, doubtful
+    return result, ill_conditioned
 
 
 @strict_kernel
@@ -267,7 +267,7 @@ def aligned(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flag
         [B, K] weights and [B] whether they are doubtful.
     """
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     norms, cosines = np.empty(views), np.empty((views, views))
     places = np.empty(views, np.int64)
     for b in range(blocks):
@@ -275,7 +275,7 @@ def aligned(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flag
         if n == 0:
             continue
         # Eigenvalues of D C D have the relative errors of those of C.
-        doubtful[b] = n > 1 and CAUTION * n * EPSILON > unit * smallest_pivot(cosines, n)
+        ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * smallest_pivot(cosines, n)
         longest = norms[:n].max()
         gramian, vectors = np.empty((n, n)), np.empty((n, n))
         for i in range(n):
@@ -296,4 +296,4 @@ def aligned(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flag
                 factor = np.sqrt(smallest / values[i]) * inner / views
                 for k in range(n):
                     result[b, places[k]] += factor * vectors[k, i]
-    return result, doubtful
+    return result, ill_conditioned

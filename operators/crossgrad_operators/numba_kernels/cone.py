@@ -63,15 +63,15 @@ def _weight(z: Pair, norm: Pair, other: Pair, exact: Exact) -> float:
 
 
 @strict_kernel
-def upgrad(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -> Solved:
+def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
     """[B, K, K] rows: each gradient, over K, projected on the cone that conflicts with none."""
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
     norms, z = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        directions(gramians[b], remainders[b], present[b], norms, problem)
-        problem.doubtful[0] = False
+        directions(gramians[b], rounding_residuals[b], present[b], norms, problem)
+        problem.ill_conditioned[0] = False
         for k in range(views):
             if present[b, k]:
                 clear(problem.base)
@@ -81,27 +81,27 @@ def upgrad(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -
                     if present[b, j]:
                         weight = _weight(at(z, j), at(norms, k), at(norms, j), exact)
                         result[b, k, j] = weight / views
-        doubtful[b] = problem.doubtful[0]
-    return result, doubtful
+        ill_conditioned[b] = problem.ill_conditioned[0]
+    return result, ill_conditioned
 
 
 @strict_kernel
-def dualproj(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -> Solved:
+def dualproj(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
     """[B, K] weights of the mean gradient projected on the cone that conflicts with none."""
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
     norms, z = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], remainders[b], present[b], norms, problem) == 0:
+        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) == 0:
             continue
         longest, _ = longest_of(norms)
         for k in range(views):
             put(problem.base, k, quotient(at(norms, k), longest, exact))
-        problem.doubtful[0] = False
+        problem.ill_conditioned[0] = False
         _projected(problem, z)
         for k in range(views):
             if present[b, k]:
                 result[b, k] = _weight(at(z, k), longest, at(norms, k), exact) / views
-        doubtful[b] = problem.doubtful[0]
-    return result, doubtful
+        ill_conditioned[b] = problem.ill_conditioned[0]
+    return result, ill_conditioned

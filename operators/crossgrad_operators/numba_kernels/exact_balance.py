@@ -52,7 +52,7 @@ def _pair(cosine: float, cosine_low: float) -> float:
 
 
 @strict_kernel
-def exact_nash(gramians: Floats, remainders: Floats, present: Flags) -> Floats:
+def exact_nash(gramians: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
     """[B, K] weights of `balance.nash`."""
     blocks, views, _ = gramians.shape
     result = np.zeros((blocks, views))
@@ -61,7 +61,7 @@ def exact_nash(gramians: Floats, remainders: Floats, present: Flags) -> Floats:
         n = places.size
         if n == 0:
             continue
-        norms, cosines = exact_cosines(gramians[b], remainders[b], places)
+        norms, cosines = exact_cosines(gramians[b], rounding_residuals[b], places)
         beta = np.ones(n)
         if n == 2:
             beta[:] = _pair(cosines[0, 0, 1], cosines[1, 0, 1])
@@ -154,14 +154,14 @@ def _normalised_sum(cosines: Floats, norms: Floats, v: Floats, weights: Floats) 
 
 
 @strict_kernel
-def exact_imtl_g(gramians: Floats, remainders: Floats, present: Flags) -> Floats:
+def exact_imtl_g(gramians: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
     """[B, K] weights of `balance.imtl_g`, for blocks with more than two gradients."""
     blocks, views, _ = gramians.shape
     result = np.zeros((blocks, views))
     for b in range(blocks):
         places = np.flatnonzero(present[b])
         n = places.size
-        norms, cosines = exact_cosines(gramians[b], remainders[b], places)
+        norms, cosines = exact_cosines(gramians[b], rounding_residuals[b], places)
         scaled, v, weights = np.empty((2, n)), np.empty((2, n)), np.empty(n)
         longest = np.argmax(norms[0])
         for i in range(n):
@@ -175,7 +175,7 @@ def exact_imtl_g(gramians: Floats, remainders: Floats, present: Flags) -> Floats
 
 
 @strict_kernel
-def exact_aligned(gramians: Floats, remainders: Floats, present: Flags) -> Floats:
+def exact_aligned(gramians: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
     """[B, K] weights of `balance.aligned`."""
     blocks, views, _ = gramians.shape
     result = np.zeros((blocks, views))
@@ -184,7 +184,7 @@ def exact_aligned(gramians: Floats, remainders: Floats, present: Flags) -> Float
         n = places.size
         if n == 0:
             continue
-        norms, cosines = exact_cosines(gramians[b], remainders[b], places)
+        norms, cosines = exact_cosines(gramians[b], rounding_residuals[b], places)
         matrix, vectors = np.empty((2, n, n)), np.empty((2, n, n))
         graded(cosines, norms, matrix)
         exact_eigen(matrix, vectors)

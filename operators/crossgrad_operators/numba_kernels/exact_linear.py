@@ -174,13 +174,15 @@ def graded(cosines: Floats, norms: Floats, out: Floats) -> None:
 
 
 @strict_kernel
-def lost_between(matrices: Floats, gramians: Floats, remainders: Floats, rounded: Floats) -> Floats:
+def lost_between(
+    matrices: Floats, gramians: Floats, rounding_residuals: Floats, rounded: Floats
+) -> Floats:
     """[B, R, R] what rounding took from M Gram M^T: its exact value minus `rounded`.
 
     Args:
         matrices: [B, R, K] M.
         gramians: [B, K, K].
-        remainders: [B, K, K] what rounding took from them.
+        rounding_residuals: [B, K, K] what rounding took from them.
         rounded: [B, R, R].
     """
     blocks, rows, views = matrices.shape
@@ -189,7 +191,7 @@ def lost_between(matrices: Floats, gramians: Floats, remainders: Floats, rounded
     for b in range(blocks):
         for i in range(rows):
             for k in range(views):
-                x, x_low = inner(gramians[b, k], remainders[b, k], matrices[b, i], zeros)
+                x, x_low = inner(gramians[b, k], rounding_residuals[b, k], matrices[b, i], zeros)
                 half[0, k], half[1, k] = x, x_low
             for j in range(rows):
                 x, x_low = inner(half[0], half[1], matrices[b, j], zeros)

@@ -87,7 +87,7 @@ def _project(
 @strict_kernel
 def exact_projected(
     gramians: Floats,
-    remainders: Floats,
+    rounding_residuals: Floats,
     present: Flags,
     order: Indices,
     gates: Flags,
@@ -99,7 +99,7 @@ def exact_projected(
     for b in range(blocks):
         places = np.flatnonzero(present[b])
         n = places.size
-        norms, cosines = exact_cosines(gramians[b], remainders[b], places)
+        norms, cosines = exact_cosines(gramians[b], rounding_residuals[b], places)
         partners = _partners(order, places)
         v, open_gates = np.empty((2, n)), np.empty(max(n - 1, 0), np.bool_)
         for i in range(n):
@@ -159,7 +159,7 @@ def _vaccinate(
 @strict_kernel
 def exact_aligned_to_targets(
     gramians: Floats,
-    remainders: Floats,
+    rounding_residuals: Floats,
     present: Flags,
     order: Indices,
     targets: Floats,
@@ -171,7 +171,7 @@ def exact_aligned_to_targets(
     for b in range(blocks):
         places = np.flatnonzero(present[b])
         n = places.size
-        norms, cosines = exact_cosines(gramians[b], remainders[b], places)
+        norms, cosines = exact_cosines(gramians[b], rounding_residuals[b], places)
         partners = _partners(order, places)
         v, own = np.empty((2, n)), np.empty(max(n - 1, 0))
         for i in range(n):

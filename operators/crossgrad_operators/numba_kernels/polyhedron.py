@@ -41,7 +41,7 @@ Indices = NDArray[np.int64]
 #: Steps from the last result.
 ROUNDS = 3
 #: Smallest pivot, the square of a sine, up to which 16 digits may err.
-DOUBTFUL = 1e-6
+ILL_CONDITIONED = 1e-6
 #: Changes of the set of active constraints per view and round; a sixth of it has been seen.
 CHANGES = 12
 
@@ -83,7 +83,7 @@ class Polyhedron(NamedTuple):
         factor: [K, K] L of the active cosines with their ridge, L L^T; L^T above the diagonal.
         step: [K] change of the multipliers.
         room: [K] of whatever is being solved for.
-        doubtful: [1] whether directions so nearly depended on each other that 16 digits may err.
+        ill_conditioned: [1] whether directions nearly depend on each other: 16 digits may err.
         rounding: The digits of it all.
     """
 
@@ -100,7 +100,7 @@ class Polyhedron(NamedTuple):
     factor: Pairs
     step: Pairs
     room: Pairs
-    doubtful: Flags
+    ill_conditioned: Flags
     rounding: Rounding
 
 
@@ -281,7 +281,7 @@ def is_settled(problem: Polyhedron) -> bool:
         count += int(problem.active[k])
     for i in range(count):
         least = min(least, problem.factor[i, i, 0])
-    problem.doubtful[0] |= least * least <= DOUBTFUL
+    problem.ill_conditioned[0] |= least * least <= ILL_CONDITIONED
     return problem.rounding.ridge <= problem.rounding.shown * least * least
 
 

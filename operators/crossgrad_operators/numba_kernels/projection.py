@@ -127,7 +127,7 @@ def aligned_to_targets(
         [B, K, K] rows, and [B] whether they, or the targets, are doubtful.
     """
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     norms = np.empty(views)
     cosines = np.empty((views, views))
     for b in range(blocks):
@@ -145,7 +145,7 @@ def aligned_to_targets(
                 along = times(cosines, j, v)
                 phi = min(max(along / size, -1.0), 1.0)
                 t = targets[b, i, j]
-                doubtful[b] |= _blur(v, size, phi, t) > least
+                ill_conditioned[b] |= _blur(v, size, phi, t) > least
                 targets[b, i, j] = min(max((1.0 - beta) * t + beta * phi, -0.999), 0.999)
                 if phi < t:
                     if 1.0 + phi <= OPPOSITE:
@@ -156,4 +156,4 @@ def aligned_to_targets(
                         v[j] += across * t / np.sqrt((1.0 - t) * (1.0 + t)) - along
                         size = _remaining(v, cosines)
             _as_row(v, norms, i, result[b, i])
-    return result, doubtful
+    return result, ill_conditioned

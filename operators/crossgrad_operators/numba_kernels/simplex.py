@@ -114,22 +114,22 @@ def _shortest(problem: Polyhedron, x: Pairs) -> float:
 
 
 @strict_kernel
-def mgda(gramians: Floats, remainders: Floats, present: Flags, exact: Exact) -> Solved:
+def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
     """[B, K] weights of the shortest convex combination; zero where that is zero to rounding."""
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
     norms, x = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], remainders[b], present[b], norms, problem) == 0:
+        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) == 0:
             continue
         _reciprocals(norms, present[b], problem.heights, exact)
-        problem.doubtful[0] = False
+        problem.ill_conditioned[0] = False
         share = _shortest(problem, x)
         for k in range(views):
             result[b, k] = product(at(x, k), at(problem.heights, k), exact)[0] * share
-        doubtful[b] = problem.doubtful[0]
-    return result, doubtful
+        ill_conditioned[b] = problem.ill_conditioned[0]
+    return result, ill_conditioned
 
 
 class Search(NamedTuple):
@@ -387,16 +387,18 @@ def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Float
 
 
 @strict_kernel
-def cagrad(gramians: Floats, remainders: Floats, present: Flags, exact: Exact, c: float) -> Solved:
+def cagrad(
+    gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact, c: float
+) -> Solved:
     """[B, K] weights 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
     blocks, views, _ = gramians.shape
-    result, doubtful = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
+    result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
     norms, q = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], remainders[b], present[b], norms, problem) > 0:
-            problem.doubtful[0] = False
+        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) > 0:
+            problem.ill_conditioned[0] = False
             _reciprocals(norms, present[b], problem.heights, exact)
             _cagrad(problem, norms, q, c, result[b])
-            doubtful[b] = problem.doubtful[0]
-    return result, doubtful
+            ill_conditioned[b] = problem.ill_conditioned[0]
+    return result, ill_conditioned

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import torch
 
     from crossgrad_operators.stress.runner import Cell
-    from crossgrad_operators.stress.search.tally import Tally
+    from crossgrad_operators.stress.search.worst_cases import WorstCases
 
 #: Elements of the largest gradients.
 LARGE = 10_000_000
@@ -213,7 +213,7 @@ class _Clock:
     def __init__(self) -> None:
         self._progress = Progress(PAUSE)
 
-    def tick(self, turn: int, tallies: "Sequence[Tally]") -> None:
+    def tick(self, turn: int, tallies: "Sequence[WorstCases]") -> None:
         if self._progress.due:
             matrices, broken = (sum(getattr(t, n) for t in tallies) for n in ("matrices", "broken"))
             self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a promise")

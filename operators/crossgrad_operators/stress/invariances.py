@@ -90,7 +90,7 @@ def size(operator: Operator) -> float | None:
     return worst
 
 
-def company(operator: Operator) -> float | None:
+def block_independence(operator: Operator) -> float | None:
     """Other blocks in the same step change no bit of a block's result."""
     if not isinstance(operator, MatrixOperator):
         return None
@@ -123,7 +123,7 @@ def threads(operator: Operator) -> float | None:
     return 0.0 if all(torch.equal(results[0], r) for r in results) else float("inf")
 
 
-LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, company, threads)
+LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, block_independence, threads)
 
 
 def run_law(name: str, operator: Operator, law: Law) -> Cell:

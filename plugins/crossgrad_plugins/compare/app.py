@@ -20,11 +20,11 @@ from crossgrad_plugins.compare.figures.primitives import draw_primitives
 from crossgrad_plugins.compare.figures.profile import draw_profile
 from crossgrad_plugins.compare.figures.regimes import draw_regimes
 from crossgrad_plugins.compare.figures.style import Drawn
+from crossgrad_plugins.compare.load_runs import check_places, read_runs
 from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
 from crossgrad_plugins.compare.page import page_of
 from crossgrad_plugins.compare.parallel import in_parallel
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.source import check_places, read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 from crossgrad_plugins.compare.terminal import lines_of
 

@@ -13,11 +13,11 @@ from crossgrad_plugins.compare.checks.metrics import quantities_of
 from crossgrad_plugins.compare.checks.scenes import check_scenes, differing_regimes
 from crossgrad_plugins.compare.contrasts import Contrast, Runs
 from crossgrad_plugins.compare.cost import ClockChoice, Cost
+from crossgrad_plugins.compare.interpolate import is_inside, shared_amount, value_at
+from crossgrad_plugins.compare.load_runs import RunRecord
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.ranking import Standing
-from crossgrad_plugins.compare.readings import is_inside, shared_amount, value_at
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.source import Found
 
 #: Where a contrast of the main table is taken.
 END = "at the end"
@@ -109,7 +109,7 @@ class Comparison:
         return tuple(run for by in self.main.values() for run in by.values())
 
 
-def compared(found: Found, options: Options) -> Comparison:
+def compared(found: RunRecord, options: Options) -> Comparison:
     """Compares runs.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from crossgrad_core.commands import count, one_line, showable
-from crossgrad_plugins.compare import words
+from crossgrad_plugins.compare import narrative
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
 from crossgrad_plugins.compare.cost import Cost
@@ -75,9 +75,9 @@ def page_of(
         mark=Markup(MARK),
         version=version,
         c=comparison,
-        sentences=words.headline(comparison),
+        sentences=narrative.headline(comparison),
         reference=reference(comparison),
-        noise=words.noise_sentence(comparison),
+        noise=narrative.noise_sentence(comparison),
         rows=arm_rows(comparison),
         figures=[(figure, Markup(figure.svg)) for figure in figures],
         ends=contrast_rows(comparison.ends),
@@ -147,7 +147,7 @@ def _against(comparison: Comparison, name: str) -> tuple[str, str]:
             sign = 1.0 if each.first == name else -1.0
             low, high = sorted(sign * limit for limit in each.estimate.wide)
             text = comparison.quantity.difference(sign * each.estimate.center)
-            interval = words.interval_text(each, (low, high)).removesuffix(each.quantity.unit)
+            interval = narrative.interval_text(each, (low, high)).removesuffix(each.quantity.unit)
             return f"{text} [{interval.strip()}]", str(each.verdict)
     return ("reference" if name == other else "no pair"), ""
 
@@ -183,17 +183,17 @@ def contrast_rows(contrasts: Sequence[Contrast]) -> list[dict[str, Any]]:
                 "first": each.first,
                 "second": each.second,
                 "difference": each.quantity.difference(found.center),
-                "wide": words.interval_text(each, found.wide),
-                "narrow": words.interval_text(each, found.narrow),
+                "wide": narrative.interval_text(each, found.wide),
+                "narrow": narrative.interval_text(each, found.narrow),
                 "verdict": str(each.verdict),
                 "small": each.is_small,
                 "pairs": found.pairs,
                 "ahead": each.ahead,
                 "scenes": found.scenes,
                 "needed": (
-                    words.needed_text(each)
+                    narrative.needed_text(each)
                     if each.verdict == "inconclusive"
-                    else words.opposed_text(each)
+                    else narrative.opposed_text(each)
                 ),
                 "opposed": bool(each.opposed),
                 "inside": each.inside,

@@ -13,7 +13,7 @@ _NO_ARM: Final = frozenset(
     {
         *("crossgrad", "scene", "seed", "out"),
         *("steps", "max_views", "seconds", "revisions", "planned_seconds", "stop_after", "clock"),
-        *("eval_every", "eval_from", "save_every", "threads", "max_dropped"),
+        *("eval_every", "eval_from", "save_every", "threads", "max_nonfinite_blocks"),
         *("observers", "metrics", "exporter"),
         *("reading.cache_mib", "reading.disk_mib", "reading.masks"),
     }

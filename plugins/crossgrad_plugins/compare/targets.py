@@ -11,8 +11,8 @@ from crossgrad_plugins.compare.arms import Arm
 from crossgrad_plugins.compare.cells import Problem
 from crossgrad_plugins.compare.contrasts import Runs
 from crossgrad_plugins.compare.cost import Cost
+from crossgrad_plugins.compare.interpolate import cost_to
 from crossgrad_plugins.compare.quantity import Quantity
-from crossgrad_plugins.compare.readings import cost_to
 
 #: The profile is drawn up to this ratio.
 LARGEST_RATIO = 4.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from crossgrad_plugins.compare import words
+from crossgrad_plugins.compare import narrative
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.page import arm_rows, contrast_rows, reference
 
@@ -11,7 +11,7 @@ _MOST_ROWS = 20
 
 def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
     """The lines."""
-    for sentence in words.headline(comparison):
+    for sentence in narrative.headline(comparison):
         yield f"{sentence.claim}" + (f" ({sentence.support})" if sentence.support else "")
     yield ""
     yield from _table(*_arms(comparison))
@@ -21,7 +21,7 @@ def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
         yield from _table(*_contrasts(contrasts[:_MOST_ROWS]))
         if len(contrasts) > _MOST_ROWS:
             yield f"... and {len(contrasts) - _MOST_ROWS} more in comparisons.csv"
-    if noise := words.noise_sentence(comparison):
+    if noise := narrative.noise_sentence(comparison):
         yield ""
         yield f"noise floor, standard deviation over seeds: {noise}"
     for note in notes:

@@ -9,8 +9,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, Selection, screen_statistics
-from crossgrad_plugins.densifiers.axis_split import AxisSplit
 from crossgrad_plugins.densifiers.clone_split import Growth
+from crossgrad_plugins.densifiers.long_axis_split import AxisSplit
 
 #: Criterion -> the thresholds that it compares with.
 _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
@@ -40,11 +40,11 @@ class AbsGradDensityControl(AxisSplit):
     gsplat_threshold: float = Field(8e-4, gt=0, description="of ga: gsplat (clones and splits)")
 
     @override
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
         used = _THRESHOLDS[self.criterion]
         why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave it out"
         unused = dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)
-        return {**super().idle_options(selection), **unused}
+        return {**super().unused_options(selection), **unused}
 
     @property
     @override

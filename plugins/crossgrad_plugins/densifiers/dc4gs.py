@@ -6,13 +6,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
-from crossgrad_plugins.densifiers.axis_split import child_on_axis
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
 from crossgrad_plugins.densifiers.direction_scores import (
     PLANES,
     inconsistency,
     plane_scores,
 )
+from crossgrad_plugins.densifiers.long_axis_split import child_on_axis
 from crossgrad_plugins.densifiers.split_position import split_positions
 
 

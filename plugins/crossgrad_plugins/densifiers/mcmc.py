@@ -14,14 +14,14 @@ from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.plugin import (
     NO_EDIT,
     AfterStepContext,
-    Densified,
     Densifier,
     DensifyContext,
+    DensifyResult,
     Edit,
     Parameters,
     PluginState,
     RegularizeContext,
-    Regularized,
+    RegularizeResult,
     Rows,
     Schedule,
     hookimpl,
@@ -87,23 +87,23 @@ class MarkovChainMonteCarlo(Densifier):
         return _edit_of(pool, context.parameters["scales"].detach(), counts), state
 
     @hookimpl
-    def crossgrad_after_step(self, context: AfterStepContext) -> Densified | None:
+    def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
         """Moves the positions by noise; the moments stay."""
         strength = self.noise * context.means_lr
         rows, shifts = position_noise(context.parameters, strength, context.rng)
         if rows.shape[0] == 0:
             return None
         moved = context.parameters["means"].detach()[rows] + shifts
-        return Densified(Edit(values={"means": Rows(moved, rows, keep_moments=True)}))
+        return DensifyResult(Edit(values={"means": Rows(moved, rows, keep_moments=True)}))
 
     @hookimpl
-    def crossgrad_regularize(self, context: RegularizeContext) -> Regularized | None:
+    def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
         """Mean opacity and mean scale, once per step however many views it has."""
         opacities, scales = context.parameters["opacities"], context.parameters["scales"]
         if context.gaussians is not None or opacities.shape[0] == 0:
             return None
         opacity = self.opacity_weight * sigmoid(opacities).mean()
-        return Regularized(opacity + self.scale_weight * torch.exp(scales).mean())
+        return RegularizeResult(opacity + self.scale_weight * torch.exp(scales).mean())
 
     def _relocated(self, pool: Pool, rng: np.random.Generator) -> tuple[Pool, int]:
         """The pool with dead primitives moved onto live ones, and how many were moved."""

@@ -23,9 +23,9 @@ from crossgrad_core.plugin import (
     screen_statistics,
 )
 from crossgrad_plugins.densifiers.absgrad import gradient_sums
-from crossgrad_plugins.densifiers.axis_split import AxisSplit
 from crossgrad_plugins.densifiers.clone_split import Growth, Plan, edited_parameters
-from crossgrad_plugins.densifiers.marked_counts import CountsMarkedPixels
+from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
+from crossgrad_plugins.densifiers.long_axis_split import AxisSplit
 
 #: Shortest interval of edits, in views (the published one of the larger variant).
 SHORTEST_INTERVAL = 100
@@ -60,11 +60,11 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     late_score: float = Field(0.9, gt=0, le=1, description="... and above this share in the error")
 
     @override
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
         late = len(self.late_prunings) > 0
         why = "there are no late_prunings; leave it out"
         unused = {} if late else {"late_opacity": why, "late_score": why}
-        return {**super().idle_options(selection), **self.idle_counting(renders=late), **unused}
+        return {**super().unused_options(selection), **self.idle_counting(renders=late), **unused}
 
     @property
     @override

@@ -22,12 +22,12 @@ from crossgrad_core.plugin import (
     plain_component,
     set_for_nothing,
 )
-from crossgrad_plugins.densifiers.marked_counts import CountsMarkedPixels
+from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
 #: Names of what the gate remembers begin with this, those of the other densifier do not.
 OWN = "gate/"
 #: Hooks of a densifier that the gate answers for it.
-_ANSWERED = frozenset({"crossgrad_densify", "crossgrad_objections"})
+_ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})
 
 
 def densifier_of(value: object) -> Densifier:
@@ -83,8 +83,8 @@ class MultiViewGate(CountsMarkedPixels):
         """Whether any of both gathers statistics of views."""
         return self.count == "running" or self.of.observes
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         idle = self.idle_counting(renders=False)
         inner = set_for_nothing(self.of, replace(selection, densifier=self.of))
         if inner:

@@ -111,7 +111,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
     plan = _plan(setup.scene, options, setup.groups)
     watch = Watch(plan, 1, state.step, options.seed)
     model = model_of(setup, state)
-    watch.crossgrad_model(model)
+    watch.crossgrad_model_ready(model)
     names = setup.selection.names
     which = (
         f"run {folder} ({names['backbone']}, {names['sampler']}, {names['operator']}) "

@@ -42,13 +42,13 @@ class Diagnostics(Observer):
         self._run, self._watch = run, None
 
     @hookimpl
-    def crossgrad_model(self, model: Model) -> None:
+    def crossgrad_model_ready(self, model: Model) -> None:
         """Probes where it is time, and writes the table."""
         if self._watch is None:
             self._watch = self._start(model)
         watch = self._watch
         found = len(watch.rows)
-        watch.crossgrad_model(model)
+        watch.crossgrad_model_ready(model)
         folder = self._folder()
         if folder is not None and len(watch.rows) > found:
             from crossgrad_core.commands import write_table

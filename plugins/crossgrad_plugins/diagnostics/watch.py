@@ -40,7 +40,7 @@ class Watch:
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl
-    def crossgrad_model(self, model: Model) -> None:
+    def crossgrad_model_ready(self, model: Model) -> None:
         """Probes where it is time."""
         if not self.due(model.phase.step):
             return

@@ -29,7 +29,7 @@ class Affine(ExposurePerPhoto):
     parameter: ClassVar[str] = "matrix"
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return mapped(image, values[self.parameter])
 
     @override
@@ -46,12 +46,12 @@ class Affine(ExposurePerPhoto):
         return EXPONENT * (white / STRETCH).clamp(min=_DARKEST).log2()
 
     @override
-    def moved(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
         # A sum would change what photos differ by, and make negatives of dark ones. So each map
         # comes after `end` and the inverse of `start`.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
-            return super().moved(name, values, start, end)
+            return super().shift(name, values, start, end)
         linear = values[..., :3] @ inverse
         constant = values[..., 3:] + linear @ (end[:, 3:] - start[:, 3:])
         return torch.cat([linear @ end[:, :3], constant], dim=-1)

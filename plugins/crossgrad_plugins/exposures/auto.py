@@ -40,5 +40,5 @@ class Auto(Exposure):
         return Fitted(NoExposure(), "none", (f"exposure auto: none; {why}",))
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return image

@@ -21,7 +21,7 @@ class Gain(ExposurePerPhoto):
     parameter: ClassVar[str] = "stops"
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return with_gain(image, values[self.parameter])
 
     @override

@@ -12,11 +12,11 @@ class NoExposure(Exposure):
     """Compares renders with photos as they are: all are taken to have the same exposure."""
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return image
 
     @override
-    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+    def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
         """Names the option that helps where SfM tracks say that photos differ in exposure."""
         if not any(len(view.seen) for view in scene.train_views):
             return ()

@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, LearningRate, PerPhoto, Scene, Selection, View
 from crossgrad_plugins.exposures.exif import exposure_values
+from crossgrad_plugins.exposures.initial_values import Start, outliers, starts_of
 from crossgrad_plugins.exposures.neighbours import neighbours_of
-from crossgrad_plugins.exposures.starts import Start, far_ones, starts_of
 
 
 class ExposurePerPhoto(Exposure):
@@ -62,24 +62,24 @@ class ExposurePerPhoto(Exposure):
         return {self.parameter: PerPhoto(start, LearningRate(self.rate, self.rate * self.decay))}
 
     @override
-    def remarks(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+    def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
         if not known:
-            return starts_of(scene, self.start).remarks
+            return starts_of(scene, self.start).messages
         names = [view.name for view in scene.train_views]
         stops = self.in_stops(known[self.parameter]).abs().reshape(len(names), -1)
-        return tuple(far_ones(names, stops.amax(dim=1).tolist()))
+        return tuple(outliers(names, stops.amax(dim=1).tolist()))
 
     @override
-    def projected(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         return {name: self._centred(each.double()) for name, each in values.items()}
 
     def _centred(self, values: Tensor) -> Tensor:
         """The values [P, V] in float64 with their mean where it belongs, in float32."""
         neutral = self.neutral().to(values, non_blocking=True)
-        return self.moved(self.parameter, values, values.mean(dim=0), neutral).float()
+        return self.shift(self.parameter, values, values.mean(dim=0), neutral).float()
 
     @override
-    def unseen(
+    def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
         """By EXIF, where the view and training photos have it; else by neighbours or by regime.
@@ -94,16 +94,16 @@ class ExposurePerPhoto(Exposure):
             # Sensors differ, and a regime often has one of its own.
             rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
             stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
-            moved = self.beside(own[rows], torch.tensor(stops).to(own))
-            return {self.parameter: moved.mean(dim=0)}
+            shift = self.beside(own[rows], torch.tensor(stops).to(own))
+            return {self.parameter: shift.mean(dim=0)}
         neighbours = neighbours_of(scene)
         if not neighbours.tell(own.detach().cpu().double().reshape(len(own), -1).numpy()):
-            return super().unseen(view, scene, values)
+            return super().predict_unseen(view, scene, values)
         near, weights = neighbours.rows_and_weights(view.camera)
         shares = torch.from_numpy(weights).to(own)
         return {self.parameter: torch.tensordot(shares, own[torch.from_numpy(near)], dims=1)}
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """`decay` without a rate."""
         if self.rate:
             return {}

@@ -76,7 +76,7 @@ class OnEarth:
         facts |= projection.facts
         facts["transform_error_m"] = _apart(metres * points, metres * frame.points(centers))
         placed = self._turned(gaussians, similarity, frame, points, facts)
-        return replace(placed, notes=projection.remarks)
+        return replace(placed, notes=projection.messages)
 
     def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 3] metres east, north and up from the origin of points [N, 3] of the input."""

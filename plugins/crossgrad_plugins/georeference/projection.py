@@ -77,7 +77,7 @@ class Projection:
         return {"crs": self.code.upper(), "crs_accuracy_m": self.accuracy}
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """What the user should know about coordinates in it."""
         if self.accuracy is None:
             return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.plugin import eight_bit, masked
+from crossgrad_core.plugin import masked, to_uint8
 from crossgrad_plugins.losses.photometric.reference import RADIUS, SIGMA, WINDOW
 
 SSIM_SKIMAGE_TOO_SMALL = (
@@ -33,8 +33,8 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
     if _keeps_nothing(image, mask):
         return None
-    rendered = (eight_bit(image).to(torch.float32) / 255).contiguous().numpy()
-    photo = eight_bit(target).contiguous().numpy()
+    rendered = (to_uint8(image).to(torch.float32) / 255).contiguous().numpy()
+    photo = to_uint8(target).contiguous().numpy()
     kept = None if mask is None else mask.cpu().contiguous().numpy()
     return 1 - loss_terms(rendered, photo, kept)[1]
 
@@ -64,7 +64,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
     from skimage.metrics import structural_similarity
 
     mask = None if mask is None else mask.cpu()
-    rendered, photo = (masked(eight_bit(each), mask).numpy() for each in (image, target))
+    rendered, photo = (masked(to_uint8(each), mask).numpy() for each in (image, target))
     height = len(rendered)
     found = np.empty(rendered.shape)
 

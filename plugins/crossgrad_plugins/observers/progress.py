@@ -82,9 +82,9 @@ class Progress(Observer):
             self._tell_changes(record)
 
     @hookimpl
-    def crossgrad_length(self, total: int) -> None:
+    def crossgrad_length_changed(self, total: int) -> None:
         """Moves the end of the bar."""
-        self._pace = self._pace.lengthened(total)
+        self._pace = self._pace.with_length(total)
         if self._bar is not None:
             self._bar.total = total
 
@@ -96,7 +96,7 @@ class Progress(Observer):
             self._say(evaluation_line(report))
 
     @hookimpl
-    def crossgrad_message(self, text: str) -> None:
+    def crossgrad_log(self, text: str) -> None:
         """Shows what the run says."""
         if self.level != "quiet":
             self._say(text)

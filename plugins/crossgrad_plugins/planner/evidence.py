@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from crossgrad_core.commands import ComponentChoice, RunConfig, view_plan_of
-from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewPlan, build_component
+from crossgrad_core.commands import ComponentChoice, RunConfig, views_per_step_spec_of
+from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewsPerStepSpec, build_component
 from crossgrad_plugins.planner.modes import Modes, modes_of
 
 if TYPE_CHECKING:
@@ -68,9 +68,9 @@ class Evidence:
         return probed(self.config, self.seconds, self.grouping)
 
     @cached_property
-    def view_plan(self) -> ViewPlan:
+    def view_plan(self) -> ViewsPerStepSpec:
         """How many views the steps have, without decisions on it."""
-        return view_plan_of(self.config)
+        return views_per_step_spec_of(self.config)
 
     @cached_property
     def backbone(self) -> Backbone:

@@ -5,7 +5,7 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING, Final
 
 from crossgrad_core.commands import ComponentChoice
-from crossgrad_core.plugin import ViewPlan
+from crossgrad_core.plugin import ViewsPerStepSpec
 from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ONE_OF, Modes
@@ -107,10 +107,10 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     )
 
 
-def views_of_steps(evidence: Evidence) -> ViewPlan:
+def views_of_steps(evidence: Evidence) -> ViewsPerStepSpec:
     """How many views the steps have, the decision on pairs included."""
     planned = "sampler" in pairs(evidence).settings and not evidence.is_given("views_per_step")
-    return ViewPlan((2,)) if planned else evidence.view_plan
+    return ViewsPerStepSpec((2,)) if planned else evidence.view_plan
 
 
 def _draws_pairs(evidence: Evidence) -> bool:
@@ -120,7 +120,7 @@ def _draws_pairs(evidence: Evidence) -> bool:
     return evidence.sampler.groups == _BOTH and _even(evidence.view_plan)
 
 
-def _even(views: ViewPlan) -> bool:
+def _even(views: ViewsPerStepSpec) -> bool:
     return all(count % 2 == 0 for count in views.counts)
 
 
@@ -147,7 +147,7 @@ def views_per_step(evidence: Evidence) -> Decision:
     plain = Decision(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
     if "sampler" in pairs(evidence).settings:
         return replace(plain, choice="2").found("a step has a near and a far view", decided=True)
-    if evidence.is_given("sampler", "operator", "batch_rule", "density_views", "backward"):
+    if evidence.is_given("sampler", "operator", "batch_rule", "densify_views", "backward"):
         return plain.found("as suits what you set of sampler, operator and steps")
     probe, figures = evidence.probe, {}
     shown = _TWO_AGAINST_ONE

@@ -200,6 +200,6 @@ def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:
 
 #: Settings that only make sense with density control.
 _EDITS: Final = (
-    *("densify_from", "densify_until", "densify_every", "fewest_edits", "reset_every"),
-    *("density_views", "max_gaussians", "growth"),
+    *("densify_from", "densify_until", "densify_every", "min_refinements", "reset_every"),
+    *("densify_views", "max_gaussians", "growth"),
 )

@@ -15,8 +15,8 @@ from crossgrad_core.commands import (
     entries,
     locked,
     one_line,
+    resume_hint,
     text_bytes,
-    way_on,
     write_atomically,
 )
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
@@ -75,7 +75,7 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     matching.check_gps(plan)
     with disk_errors(layout.work):
         layout.work.mkdir(parents=True, exist_ok=True)
-    with locked(scene, "preparing"), way_on("the same command goes on where this one ended"):
+    with locked(scene, "preparing"), resume_hint("the same command goes on where this one ended"):
         clear_leftovers(layout)
         clear_damaged(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))

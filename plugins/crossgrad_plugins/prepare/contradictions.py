@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.prepare.epipolar import Rays, off_lines
-from crossgrad_plugins.prepare.waiting import quiet
+from crossgrad_plugins.prepare.subprocess_wait import quiet
 
 if TYPE_CHECKING:
     import pycolmap

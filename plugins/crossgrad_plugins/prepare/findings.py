@@ -40,7 +40,7 @@ class Lost:
 
 
 @dataclass(frozen=True)
-class Join:
+class ModelJoin:
     """The matches between two folders, or within one.
 
     Attributes:
@@ -57,7 +57,7 @@ class Join:
 
 
 @dataclass(frozen=True)
-class Bridge:
+class BridgeReport:
     """Photos that are missing between two parts of the scene.
 
     Attributes:
@@ -150,7 +150,7 @@ def _why(photo: Photo, features: int, partners: int, usual: tuple[float, float])
     return "; ".join(reasons)
 
 
-def joins_of(plan: Plan, links: Sequence[Link]) -> tuple[Join, ...]:
+def joins_of(plan: Plan, links: Sequence[Link]) -> tuple[ModelJoin, ...]:
     """By how many matches folders are joined, pairs of folders without any included."""
     folder = {photo.name: photo.folder for photo in plan.used}
     pairs: Counter[tuple[str, str]] = Counter()
@@ -160,7 +160,7 @@ def joins_of(plan: Plan, links: Sequence[Link]) -> tuple[Join, ...]:
         pairs[first, second] += 1
         matches[first, second] += link.matches
     whole = [(name, name) for name in plan.folders] + list(combinations(plan.folders, 2))
-    return tuple(Join(*both, pairs[both], matches[both]) for both in whole)
+    return tuple(ModelJoin(*both, pairs[both], matches[both]) for both in whole)
 
 
 def bridges_of(
@@ -168,7 +168,7 @@ def bridges_of(
     links: Sequence[Link],
     parts: Sequence[frozenset[str]],
     heights: Mapping[str, float],
-) -> tuple[Bridge, ...]:
+) -> tuple[BridgeReport, ...]:
     """Where photos are missing that would join a part of the scene to its largest part.
 
     Args:
@@ -208,7 +208,7 @@ def _bridge(
     links: Sequence[Link],
     parts: tuple[frozenset[str], frozenset[str]],
     heights: Mapping[str, float],
-) -> Bridge:
+) -> BridgeReport:
     main, part = parts
     crossing = [
         link for link in links
@@ -219,7 +219,7 @@ def _bridge(
     ends = None if one is None or other is None else (min(one, other), max(one, other))
     first, second = _folders(plan, main), _folders(plan, part)
     advice = _advice(first, second, ends)
-    return Bridge(first, second, len(part), len(crossing), ends, advice)
+    return BridgeReport(first, second, len(part), len(crossing), ends, advice)
 
 
 def _middle(names: Iterable[str], heights: Mapping[str, float]) -> float | None:
@@ -252,11 +252,11 @@ def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str
         )
     return (
         f"fly a ramp from {low:.0f} to {high:.0f} m here, looking at what both show: photos at "
-        f"{', '.join(f'{rung:.0f}' for rung in rungs(low, high))} m"
+        f"{', '.join(f'{rung:.0f}' for rung in fallbacks(low, high))} m"
     )
 
 
-def rungs(low: float, high: float) -> list[float]:
+def fallbacks(low: float, high: float) -> list[float]:
     """Heights from the lower to the higher end, each a fixed factor above the one before."""
     steps = min(_MOST_RUNGS, max(1, math.ceil(math.log(high / low) / math.log(_RUNG))))
     return [low * (high / low) ** (step / steps) for step in range(steps + 1)]

@@ -8,7 +8,7 @@ from crossgrad_core.commands import UserError, check_folder, write_atomically
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Plan
 from crossgrad_plugins.prepare.retrieval import index_of
-from crossgrad_plugins.prepare.waiting import JOURNAL, quiet, rows_of, waited
+from crossgrad_plugins.prepare.subprocess_wait import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap

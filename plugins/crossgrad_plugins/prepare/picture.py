@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.prepare.placing import centers_of
+from crossgrad_plugins.prepare.georegister import centers_of
 from crossgrad_plugins.prepare.report import Report
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from crossgrad_core.commands import VERSION
 from crossgrad_plugins.prepare.findings import (
-    Bridge,
-    Join,
+    BridgeReport,
     Lost,
+    ModelJoin,
     bridges_of,
     joins_of,
     lost_photos,
@@ -57,12 +57,12 @@ class Report:
         return lost_photos(self.plan, self.features, self.links, models, self.misplaced)
 
     @property
-    def joins(self) -> tuple[Join, ...]:
+    def joins(self) -> tuple[ModelJoin, ...]:
         """What joins the folders."""
         return joins_of(self.plan, self.links)
 
     @property
-    def bridges(self) -> tuple[Bridge, ...]:
+    def bridges(self) -> tuple[BridgeReport, ...]:
         """Where photos are missing."""
         parts = parts_of(self.plan, [frozenset(part.photos) for part in self.result.parts])
         return bridges_of(self.plan, self.links, parts, self.heights)

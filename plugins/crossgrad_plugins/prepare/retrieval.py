@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.prepare.layout import Layout
-from crossgrad_plugins.prepare.waiting import quiet, waited
+from crossgrad_plugins.prepare.subprocess_wait import quiet, waited
 
 if TYPE_CHECKING:
     import pycolmap

@@ -13,8 +13,8 @@ from crossgrad_core.scene.decode import decode_photo
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.masks import HALF, counting_pixels
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.waiting import quiet, waited
-from crossgrad_plugins.prepare.whole import check_written
+from crossgrad_plugins.prepare.scene_integrity import check_written
+from crossgrad_plugins.prepare.subprocess_wait import quiet, waited
 
 if TYPE_CHECKING:
     import pycolmap

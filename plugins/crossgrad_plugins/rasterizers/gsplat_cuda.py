@@ -22,10 +22,10 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.gpu.blended import counter
-from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
+from crossgrad_plugins.rasterizers.gpu.empty_render import empty_render
 from crossgrad_plugins.rasterizers.gpu.missing import bring_ninja
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
-from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
+from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
 _GEOMETRY = ("means", "quats", "scales", "opacities")
@@ -40,8 +40,8 @@ class GsplatRasterizer(Rasterizer):
     provides: ClassVar[frozenset[str]] = frozenset({"depth", "pixels", "abs_gradient", "count"})
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased"})
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
-    together: ClassVar[bool] = True
-    repeatable: ClassVar[bool] = False
+    batched: ClassVar[bool] = True
+    deterministic: ClassVar[bool] = False
 
     max_alpha: float = Field(
         0.999, ge=0.999, le=0.999, description="cap of a Gaussian's alpha; gsplat 1.5 has no other"
@@ -58,14 +58,14 @@ class GsplatRasterizer(Rasterizer):
         return _speeds.gsplat_missing() if device in cls.devices else ""
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Objects where the package, or what it compiles its kernels with, is not there."""
         missing = self.missing(selection.device)
         return [f"{missing}, or leave --rasterizer out"] if missing else []
 
     @override
-    def burn_in(self, device: str) -> None:
-        burn_in(self, device)
+    def self_test(self, device: str) -> None:
+        self_test(self, device)
 
     @override
     def render(
@@ -104,7 +104,7 @@ class GsplatRasterizer(Rasterizer):
         gaussians, camera = views[0]
         if not len(gaussians):
             return [
-                nothing_drawn(each, own, behind, outputs)
+                empty_render(each, own, behind, outputs)
                 for (each, own), behind in zip(views, backgrounds, strict=True)
             ]
         bring_ninja()

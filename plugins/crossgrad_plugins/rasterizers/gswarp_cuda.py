@@ -20,9 +20,9 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 from crossgrad_plugins.rasterizers import _speeds
-from crossgrad_plugins.rasterizers.gpu.burn_in import burn_in
+from crossgrad_plugins.rasterizers.gpu.empty_render import empty_render
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
-from crossgrad_plugins.rasterizers.gpu.nothing import nothing_drawn
+from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
 #: Depth up to which gswarp draws nothing, in the units that it is given.
@@ -37,7 +37,7 @@ class GswarpRasterizer(Rasterizer):
 
     provides: ClassVar[frozenset[str]] = frozenset({"depth"})
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
-    repeatable: ClassVar[bool] = False
+    deterministic: ClassVar[bool] = False
 
     max_alpha: float = Field(
         0.99, ge=0.99, le=0.99, description="cap of a Gaussian's alpha; gswarp has no other"
@@ -60,14 +60,14 @@ class GswarpRasterizer(Rasterizer):
         return _speeds.gswarp_missing() if device in cls.devices else ""
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Objects where the package is not there, and to dilations that are not its own."""
         if selection.device not in self.devices:
             return []
         reasons = []
         if missing := self.missing(selection.device):
             reasons.append(f"{missing}, or leave --rasterizer out")
-        if selection.backbone.own_dilation and selection.backbone.response in self.responses:
+        if selection.backbone.sets_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]
             reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")
         if selection.resolution.interlaced:
@@ -76,8 +76,8 @@ class GswarpRasterizer(Rasterizer):
         return reasons
 
     @override
-    def burn_in(self, device: str) -> None:
-        burn_in(self, device)
+    def self_test(self, device: str) -> None:
+        self_test(self, device)
 
     @override
     def render(
@@ -88,7 +88,7 @@ class GswarpRasterizer(Rasterizer):
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
         if not len(gaussians):
-            return nothing_drawn(gaussians, camera, background, outputs)
+            return empty_render(gaussians, camera, background, outputs)
         device = gaussians.means.device
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=device))
         enlarged = _NEAR / self.near

@@ -40,7 +40,7 @@ class NumbaRasterizer(Rasterizer):
         {"depth", "pixels", "abs_gradient", "directions", "count"}
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
     footprint: Footprint = Field("alpha", description=DESCRIPTION)
 
@@ -131,7 +131,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
         dc=_optional(gaussians.sh_dc),
         rest=rest,
         degree=gaussians.sh_degree,
-        by_rows=frozenset() if demand is None else demand.fields,
+        sparse_rows=frozenset() if demand is None else demand.fields,
         bring=None if demand is None else lambda rows: demand.bring(torch.from_numpy(rows)),
     )
 
@@ -213,7 +213,7 @@ def _gradient(
     if array is None:
         return None
     values = torch.from_numpy(array)
-    if rows is None or name not in gaussians.by_rows:
+    if rows is None or name not in gaussians.sparse_rows:
         return values
     shape = (len(gaussians.means), *values.shape[1:])
     return torch.sparse_coo_tensor(rows[None], values, shape, check_invariants=False)

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Response, Screen
 from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint

@@ -73,7 +73,7 @@ class CoarseToFine(Resolution):
         return cast("CoarseToFine", self.fitted_to(scene))
 
     @override
-    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+    def messages(self, schedule: Schedule) -> tuple[str, ...]:
         window = self.window(schedule)
         texts = {name: part.course.text(schedule, window) for name, part in self.parts().items()}
         told = [text if len(texts) == 1 else f"{name} {text}" for name, text in texts.items()]

@@ -65,7 +65,7 @@ class Interlaced(CoarseToFine):
         return {"all": Part(Course.of_stages(there))}
 
     @override
-    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+    def messages(self, schedule: Schedule) -> tuple[str, ...]:
         (part,), window = self.parts().values(), self.window(schedule)
         stages = zip(part.course.ends, part.course.scales, strict=True)
         ends = [(schedule.step_of(ceil(end * window)), round(1.0 / scale)) for end, scale in stages]

@@ -41,7 +41,8 @@ class Octaves(CoarseToFine):
         return {"all": Part(Course.of_stages(there))}
 
     @override
-    def remarks(self, schedule: Schedule) -> tuple[str, ...]:
+    def messages(self, schedule: Schedule) -> tuple[str, ...]:
         return tuple(
-            f"{text}; no side is below {self.smallest} pixels" for text in super().remarks(schedule)
+            f"{text}; no side is below {self.smallest} pixels"
+            for text in super().messages(schedule)
         )

@@ -9,13 +9,13 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
-    Draw,
     Json,
     PluginState,
     SampleContext,
     Sampler,
     StepRecord,
     ViewCounts,
+    ViewSample,
     octave,
 )
 from crossgrad_plugins.samplers.draws import training_views
@@ -48,7 +48,7 @@ class Active(Sampler):
     decay: float = Field(0.9, ge=0.0, lt=1.0, description="decay of a view's running loss")
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         losses, octaves = self._running_losses(context.last, state)
         groups = groups_of(context, "active", 2)
         views = training_views(context)

@@ -6,13 +6,13 @@ from typing import ClassVar
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
-    Draw,
     PluginState,
     SampleContext,
     Sampler,
     Selection,
     UserError,
     ViewCounts,
+    ViewSample,
     hookimpl,
 )
 from crossgrad_plugins.samplers.draws import training_views
@@ -35,7 +35,7 @@ class Anchors30(Sampler):
     default_grouping: ClassVar[str | None] = "anchors"
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Refuses groups without near and far ones."""
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
             return [
@@ -45,7 +45,7 @@ class Anchors30(Sampler):
         return []
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         groups = _anchor_groups(context)
         labels = context.groups or ()
         first = int(context.rng.integers(len(training_views(context))))

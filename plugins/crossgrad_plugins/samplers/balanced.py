@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext
-from crossgrad_plugins.samplers.draws import Deck, Order, draw
+from crossgrad_core.plugin import PluginState, SampleContext, ViewSample
+from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw
 
 
 def balanced_draw(
     groups: Mapping[str, Sequence[int]], context: SampleContext, state: PluginState, order: Order
-) -> tuple[Draw, PluginState]:
+) -> tuple[ViewSample, PluginState]:
     """K / len(groups) views of every group, the groups taking turns within the step.
 
     Args:
@@ -21,12 +21,14 @@ def balanced_draw(
     values = dict(state.values)
     columns = []
     for label, pool in groups.items():
-        column, deck = draw(pool, share, order, Deck.from_json(values.get(label)), context.rng)
+        column, epoch_order = draw(
+            pool, share, order, EpochOrder.from_json(values.get(label)), context.rng
+        )
         columns.append(column)
         if order == "epoch":
-            values[label] = deck.to_json()
+            values[label] = epoch_order.to_json()
     views = tuple(view for row in zip(*columns, strict=True) for view in row)
-    return Draw(views, tuple(groups) * share), PluginState(values)
+    return ViewSample(views, tuple(groups) * share), PluginState(values)
 
 
 def idle_order(order: Order, views: int, groups: int) -> Mapping[str, str]:

@@ -4,8 +4,8 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, ViewCounts
-from crossgrad_plugins.samplers.draws import Deck, draw, training_views
+from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewCounts, ViewSample
+from crossgrad_plugins.samplers.draws import EpochOrder, draw, training_views
 from crossgrad_plugins.samplers.groups import drawn
 
 
@@ -23,8 +23,8 @@ class Epoch(Sampler):
     reads_groups: ClassVar[bool] = False
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
-        deck = Deck.from_json(state.values.get("deck"))
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        epoch_order = EpochOrder.from_json(state.values.get("deck"))
         pool = training_views(context)
-        views, deck = draw(pool, context.views_per_step, "epoch", deck, context.rng)
-        return drawn(views, context), PluginState({"deck": deck.to_json()})
+        views, epoch_order = draw(pool, context.views_per_step, "epoch", epoch_order, context.rng)
+        return drawn(views, context), PluginState({"deck": epoch_order.to_json()})

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, ViewCounts
-from crossgrad_plugins.samplers.draws import Deck, require_enough, training_views
+from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewCounts, ViewSample
+from crossgrad_plugins.samplers.draws import EpochOrder, require_enough, training_views
 from crossgrad_plugins.samplers.groups import drawn
 
 
@@ -32,17 +32,17 @@ class FarthestPoint(Sampler):
     )
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         views = training_views(context)
         require_enough(len(views), context.views_per_step)
-        deck = Deck.from_json(state.values.get("deck"))
+        epoch_order = EpochOrder.from_json(state.values.get("deck"))
 
         def renew() -> list[int]:
             start = int(context.rng.integers(len(views)))
             return farthest_point_order(self._poses(context), start)
 
-        chosen, deck = deck.deal(context.views_per_step, renew)
-        return drawn(chosen, context), PluginState({"deck": deck.to_json()})
+        chosen, epoch_order = epoch_order.next(context.views_per_step, renew)
+        return drawn(chosen, context), PluginState({"deck": epoch_order.to_json()})
 
     def _poses(self, context: SampleContext) -> NDArray[np.float64]:
         """[N, 6] the training cameras in pose space."""

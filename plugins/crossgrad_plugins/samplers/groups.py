@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
-from crossgrad_core.plugin import Draw, SampleContext, UserError
+from crossgrad_core.plugin import SampleContext, UserError, ViewSample
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
@@ -34,11 +34,11 @@ def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[st
     return groups
 
 
-def drawn(views: Sequence[int], context: SampleContext) -> Draw:
+def drawn(views: Sequence[int], context: SampleContext) -> ViewSample:
     """The draw of these views with their labels, where there is a grouping."""
     groups = context.groups
     labels = None if groups is None else tuple(groups[view] for view in views)
-    return Draw(tuple(views), labels)
+    return ViewSample(tuple(views), labels)
 
 
 @lru_cache(maxsize=8)

@@ -7,15 +7,15 @@ from pydantic import Field, PositiveInt
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
-    Draw,
     Json,
     PluginState,
     SampleContext,
     Sampler,
     Selection,
     ViewCounts,
+    ViewSample,
 )
-from crossgrad_plugins.samplers.draws import Deck, draw
+from crossgrad_plugins.samplers.draws import EpochOrder, draw
 from crossgrad_plugins.samplers.groups import drawn, groups_of
 
 #: Decimals of a number of steps that are no rounding.
@@ -46,30 +46,32 @@ class Horizon(Sampler):
         0.6, ge=0.0, le=1.0, description="share of the run that the first stage takes"
     )
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if 0.0 < self.coarse_share < 1.0:
             return {}
         name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")
         return {name: f"coarse_share = {self.coarse_share:g} leaves no {stage} stage; leave it out"}
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         near, far = groups_of(context, "horizon", 2).items()
         # 0.29 of 100 steps are 29, though not in binary numbers.
         coarse = context.step <= round(self.coarse_share * context.schedule.total, _DIGITS)
         far_turns, near_turns = self.coarse if coarse else self.fine
         turns = [far] * far_turns + [near] * near_turns
         start = _turn(state, coarse)
-        decks = dict(cast("dict[str, Json]", state.values.get("decks", {})))
+        epoch_orders = dict(cast("dict[str, Json]", state.values.get("decks", {})))
         views = []
         for k in range(context.views_per_step):
             label, pool = turns[(start + k) % len(turns)]
-            (view,), deck = draw(pool, 1, "epoch", Deck.from_json(decks.get(label)), context.rng)
+            (view,), epoch_order = draw(
+                pool, 1, "epoch", EpochOrder.from_json(epoch_orders.get(label)), context.rng
+            )
             views.append(view)
-            decks[label] = deck.to_json()
+            epoch_orders[label] = epoch_order.to_json()
         turn = (start + context.views_per_step) % len(turns)
-        values: dict[str, Json] = {"coarse": coarse, "turn": turn, "decks": decks}
+        values: dict[str, Json] = {"coarse": coarse, "turn": turn, "decks": epoch_orders}
         return drawn(views, context), PluginState(values)
 
 

@@ -6,7 +6,14 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, Selection, ViewCounts
+from crossgrad_core.plugin import (
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    ViewCounts,
+    ViewSample,
+)
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
 from crossgrad_plugins.samplers.groups import groups_of
@@ -44,12 +51,12 @@ class NearFar(Sampler):
     def usual_views(self) -> int:
         return 1 if self.alternating else self.default_views
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 2)
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         groups = groups_of(context, "near-far", 2)
         if self.alternating:
             label = list(groups)[(context.step - 1) % 2]

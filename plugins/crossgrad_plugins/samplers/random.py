@@ -6,8 +6,15 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, Selection, ViewCounts
-from crossgrad_plugins.samplers.draws import Deck, Order, draw, training_views
+from crossgrad_core.plugin import (
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    ViewCounts,
+    ViewSample,
+)
+from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, training_views
 from crossgrad_plugins.samplers.groups import drawn
 
 
@@ -23,15 +30,15 @@ class Random(Sampler):
 
     distinct: bool = Field(False, description="draw K different views, not K independent ones")
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if selection.views_per_step > 1:
             return {}
         return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         order: Order = "distinct" if self.distinct else "iid"
         pool = training_views(context)
-        views, _ = draw(pool, context.views_per_step, order, Deck(), context.rng)
+        views, _ = draw(pool, context.views_per_step, order, EpochOrder(), context.rng)
         return drawn(views, context), state

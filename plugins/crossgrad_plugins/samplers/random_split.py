@@ -7,7 +7,6 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
-    Draw,
     Json,
     PluginState,
     SampleContext,
@@ -15,6 +14,7 @@ from crossgrad_core.plugin import (
     Selection,
     UserError,
     ViewCounts,
+    ViewSample,
 )
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order, training_views
@@ -41,12 +41,12 @@ class RandomSplit(Sampler):
         "epoch: every view once before any comes again",
     )
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, len(HALVES))
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         views = training_views(context)
         if len(views) < len(HALVES):
             raise UserError(

@@ -6,7 +6,14 @@ from typing import ClassVar
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler, Selection, ViewCounts
+from crossgrad_core.plugin import (
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    ViewCounts,
+    ViewSample,
+)
 from crossgrad_plugins.samplers.balanced import balanced_draw, idle_order
 from crossgrad_plugins.samplers.draws import Order
 from crossgrad_plugins.samplers.groups import groups_of
@@ -31,11 +38,11 @@ class ThreeWay(Sampler):
         "epoch: every view once before any comes again",
     )
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 3)
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         groups = groups_of(context, "three-way", 3)
         return balanced_draw(groups, context, state, self.order)

@@ -90,7 +90,7 @@ class Filled(Start):
         )
 
     @override
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
+    def messages(self, scene: Scene) -> tuple[str, ...]:
         filling = self._filling(scene)
         beyond = len(filling.points) - len(scene.points) - filling.inside
         aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were left aside"

@@ -47,7 +47,7 @@ class Triangulated(Start):
         return known[self]
 
     @override
-    def remarks(self, scene: Scene) -> tuple[str, ...]:
+    def messages(self, scene: Scene) -> tuple[str, ...]:
         more = self.more_points(scene)
         if more is None:
             return ("start: the scene has points; none are triangulated",)

@@ -29,9 +29,9 @@ from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, wit
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.machine import Machine, divided
 from crossgrad_plugins.sweep.plan import planned
+from crossgrad_plugins.sweep.progress import Screen
 from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.screen import Screen
-from crossgrad_plugins.sweep.standing import Standing, standings
+from crossgrad_plugins.sweep.run_status import Standing, standings
 from crossgrad_plugins.sweep.stopping import noted
 from crossgrad_plugins.sweep.summary import listing, table, write_plan
 from crossgrad_plugins.sweep.watch import Watch

@@ -15,7 +15,7 @@ from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.memory import Bound
 from crossgrad_plugins.sweep.records import Status, append
-from crossgrad_plugins.sweep.standing import begun, is_finished
+from crossgrad_plugins.sweep.run_status import begun, is_finished
 
 #: Seconds between two looks at a process.
 PAUSE = 0.1

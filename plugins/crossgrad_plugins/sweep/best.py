@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from crossgrad_core.commands import UserError, listed
 from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, Settings, choices, scene_name
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.standing import Standing, figure
+from crossgrad_plugins.sweep.run_status import Standing, figure
 
 #: Settings of which a run has one.
 LENGTHS = frozenset({"steps", "max_views", "seconds"})

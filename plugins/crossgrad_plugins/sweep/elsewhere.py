@@ -6,7 +6,7 @@ from time import sleep
 from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Outcome, Worker, is_free
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.standing import is_finished
+from crossgrad_plugins.sweep.run_status import is_finished
 
 #: Seconds between two looks at a folder that another process writes into.
 _WAIT = 1.0

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from crossgrad_core.commands import listened_to, tell
+from crossgrad_core.commands import signal_names, tell
 from crossgrad_plugins.sweep.engines import Stop
 
 _WORDS = "stopping: the runs under way save a checkpoint first (once more: without an evaluation)"
@@ -26,7 +26,7 @@ def noted(stop: Stop) -> Iterator[list[int]]:
         if stop.count == 1:
             tell(_WORDS)
 
-    before = {number: signal.signal(number, note) for number in listened_to()}
+    before = {number: signal.signal(number, note) for number in signal_names()}
     try:
         yield came
     finally:

@@ -15,7 +15,7 @@ from crossgrad_core.commands import (
 from crossgrad_plugins.sweep.grid import Metric
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.standing import Standing, figure, figures
+from crossgrad_plugins.sweep.run_status import Standing, figure, figures
 
 _COLUMNS = ("run", "scene", "configuration", "seed")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.records import Record, read_records
-from crossgrad_plugins.sweep.standing import Standing, newest_row
+from crossgrad_plugins.sweep.run_status import Standing, newest_row
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from crossgrad_backbones.levels.fitting import (
     root_above,
     root_cell,
 )
+from crossgrad_backbones.levels.init_anchors import init_anchors, visible_share
 from crossgrad_backbones.levels.lattice import Lattice
-from crossgrad_backbones.levels.planting import planted, visible_share
 
 
 def quantile(values, q):
@@ -121,7 +121,7 @@ def sites_by_loops(points, levels, origin, everywhere):
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_planting_rounds_to_every_level_once(everywhere):
     points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
-    anchors = planted(points, lattice(4, origin=-1.1), everywhere=everywhere)
+    anchors = init_anchors(points, lattice(4, origin=-1.1), everywhere=everywhere)
     positions, levels = anchors.positions, anchors.levels
     expected = sites_by_loops(points, 4, -1.1, everywhere)
     found = [
@@ -135,7 +135,7 @@ def test_planting_rounds_to_every_level_once(everywhere):
 
 @pytest.mark.parametrize(("everywhere", "wanted"), [(False, [0]), (True, [0, 1, 2])])
 def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywhere, wanted):
-    anchors = planted(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
+    anchors = init_anchors(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
     assert anchors.levels.tolist() == wanted
     assert anchors.positions[0].tolist() == [0.0, 0.0, 0.5]
 
@@ -146,15 +146,15 @@ def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywher
 def test_levels_that_part_no_points_are_passed_over(x, wanted):
     """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
     points = np.array([[each, 0.0, 0.0] for each in x])
-    assert planted(points, lattice(4), everywhere=False).levels.tolist() == wanted
+    assert init_anchors(points, lattice(4), everywhere=False).levels.tolist() == wanted
 
 
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_initial_scales_come_from_the_sites_of_the_same_level_planted_or_not(everywhere):
     points = np.random.default_rng(4).uniform(-1, 1, (60, 3))
-    anchors = planted(points, lattice(4), everywhere=everywhere)
+    anchors = init_anchors(points, lattice(4), everywhere=everywhere)
     assert anchors.levels.max() == 3
-    sites = planted(points, lattice(4), everywhere=True)
+    sites = init_anchors(points, lattice(4), everywhere=True)
     for position, level, found in zip(*(t.tolist() for t in vars(anchors).values()), strict=True):
         same = sites.positions[sites.levels == level].tolist()
         nearest = sorted(math.dist(position, other) ** 2 for other in same)[1:4]

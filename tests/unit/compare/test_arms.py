@@ -7,8 +7,8 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare.arms import arms_of, renamed
+from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.settings import settings_of
-from crossgrad_plugins.compare.source import read_runs
 
 SCAFFOLD = {"backbone": {"name": "scaffold", "offsets": 10}}
 
@@ -127,10 +127,10 @@ def test_a_setting_that_an_older_version_lacks_is_as_one_that_is_not_set(tmp_pat
     found = read_runs([tmp_path], skip_broken=False)
     assert [len(arm.runs) for arm in arms_of(found.runs)] == [2, 2]
     # Nor does what only newer versions write down: decisions that were made without a word.
-    config.write_text(config.read_text().replace("final_decay: null\n", ""))
+    config.write_text(config.read_text().replace("lr_tail: null\n", ""))
     for number in range(1, 4):
         newer = tmp_path / str(number) / "config.yaml"
-        newer.write_text(newer.read_text().replace("final_decay: null", "final_decay: 0.0"))
+        newer.write_text(newer.read_text().replace("lr_tail: null", "lr_tail: 0.0"))
     found = read_runs([tmp_path], skip_broken=False)
     assert [len(arm.runs) for arm in arms_of(found.runs)] == [2, 2]
 

@@ -12,7 +12,7 @@ from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Options, compared
 from crossgrad_plugins.compare.cost import ClockChoice
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.load_runs import read_runs
 
 LOADED = {"load": {"mean": 5.0, "max": 9.0}}
 

@@ -12,9 +12,9 @@ from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import Options, compared
 from crossgrad_plugins.compare.figures.phases import phases_of
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.narrative import headline
 from crossgrad_plugins.compare.targets import ratios
-from crossgrad_plugins.compare.words import headline
 
 OLD = Path(__file__).parents[2] / "integration" / "data" / "run-0.1"
 

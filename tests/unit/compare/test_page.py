@@ -17,8 +17,8 @@ from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.figures import differences
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases, phases_of
+from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.page import arm_rows
-from crossgrad_plugins.compare.source import read_runs
 from crossgrad_plugins.compare.tables import TABLES, tables_of
 
 SCENE = '<b>&"x"$y_$'

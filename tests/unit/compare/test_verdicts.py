@@ -9,7 +9,7 @@ from scipy.stats import trim_mean, ttest_1samp
 from support.run_folders import RunFolder
 
 from crossgrad_plugins.compare.comparison import Options, compared
-from crossgrad_plugins.compare.source import read_runs
+from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
 from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate
 from crossgrad_plugins.compare.statistics.holm import holm

@@ -3,8 +3,8 @@
 from support.run_folders import RunFolder
 
 from crossgrad_plugins.compare.comparison import Options, compared
-from crossgrad_plugins.compare.source import read_runs
-from crossgrad_plugins.compare.words import headline
+from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.narrative import headline
 
 
 def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_path):

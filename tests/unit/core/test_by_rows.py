@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy
 from crossgrad_core.gradients.finite import finite_and_present
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.sparse_rows import coalesced, dense, rows_of, sparse_rows
 from crossgrad_core.gradients.summed import SummedGradients
 
 ROWS = 900  # three chunks of the Gramians' kernel
@@ -22,7 +22,7 @@ GRANULARITIES = ("block", "kind", "global", "gaussian")
 def gradient(rng, share, shape):
     rows = np.flatnonzero(rng.random(ROWS) < share)
     values = rng.normal(size=(len(rows), *shape)).astype(np.float32)
-    return by_rows(torch.from_numpy(rows), torch.from_numpy(values), (ROWS, *shape))
+    return sparse_rows(torch.from_numpy(rows), torch.from_numpy(values), (ROWS, *shape))
 
 
 def drawn(seed, views):
@@ -60,11 +60,11 @@ def same(one, other):
 )
 def test_rows_are_sorted_and_each_is_there_once(rows):
     values = torch.arange(2.0 * len(rows)).view(len(rows), 2)
-    found = tidy(by_rows(torch.tensor(rows, dtype=torch.int64), values, (8, 2)))
+    found = coalesced(sparse_rows(torch.tensor(rows, dtype=torch.int64), values, (8, 2)))
     expected = torch.zeros(8, 2).index_add(0, torch.tensor(rows, dtype=torch.int64), values)
     assert rows_of(found).tolist() == sorted(set(rows))
     assert torch.equal(dense(found), expected)
-    assert tidy(found) is found
+    assert coalesced(found) is found
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 5])
@@ -96,8 +96,10 @@ def test_sums_and_what_needs_all_elements_have_the_bits_of_dense_gradients(views
             take(DenseGradients(as_dense(found), BLOCKS)),
         )
     ours, theirs = (DenseGradients(each, BLOCKS) for each in (copied(found), as_dense(found)))
-    assert np.array_equal(ours.remainders("block"), theirs.remainders("block"))
-    assert np.array_equal(ours.remainders("gaussian"), theirs.remainders("gaussian"))
+    assert np.array_equal(ours.rounding_residuals("block"), theirs.rounding_residuals("block"))
+    assert np.array_equal(
+        ours.rounding_residuals("gaussian"), theirs.rounding_residuals("gaussian")
+    )
 
 
 @pytest.mark.parametrize("views", [1, 2, 3])
@@ -129,7 +131,7 @@ def test_the_rows_of_a_sum_are_those_of_its_views():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_view_that_is_not_finite_is_left_out(bad):
     found = drawn(0, 2)
-    broken = by_rows(torch.tensor([4]), torch.full((1, 15, 3), bad), (ROWS, 15, 3))
+    broken = sparse_rows(torch.tensor([4]), torch.full((1, 15, 3), bad), (ROWS, 15, 3))
     assert finite_and_present(broken) == (False, True)
     found[0]["b"] = broken
     same(DenseGradients(found, BLOCKS).total(), DenseGradients(as_dense(found), BLOCKS).total())

@@ -10,9 +10,9 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
-from crossgrad_core.gradients.by_rows import by_rows, values_of
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.gradients.sparse_rows import sparse_rows, values_of
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.entries import build
 from crossgrad_operators.sum import Sum
@@ -469,10 +469,10 @@ def test_sums_are_looked_at_again_for_they_may_overflow():
 def test_rows_of_one_view_are_not_looked_at_twice():
     (view,) = make_views(1)
     rows, values = torch.tensor([3, 8]), torch.ones(2, 3)
-    gradients = summed([{**view, "means": by_rows(rows, values, (50, 3))}])
+    gradients = summed([{**view, "means": sparse_rows(rows, values, (50, 3))}])
     total = gradients.total(1)
     assert gradients.is_judged("means", total["means"])
-    assert not gradients.is_judged("means", by_rows(rows, values.clone(), (50, 3)))
+    assert not gradients.is_judged("means", sparse_rows(rows, values.clone(), (50, 3)))
     assert not gradients.is_judged("means", total["means"].to_dense())
     values_of(total["means"]).mul_(torch.inf)
     assert not gradients.is_judged("means", total["means"])

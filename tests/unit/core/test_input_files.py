@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.flight import _read as read_path
+from crossgrad_core.run.camera_path import _read as read_path
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
 from crossgrad_core.run.results.scene_file import read_scene_file

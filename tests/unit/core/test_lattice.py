@@ -99,9 +99,9 @@ def test_shares_count_cameras():
 def test_weeding_drops_what_few_see_and_never_what_all_see():
     grid = lattice(share=0.5)
     shares = torch.tensor([0.0, 0.5, 0.51, 1.0], dtype=torch.float64)
-    assert grid.lasting(shares).tolist() == [False, False, True, True]
+    assert grid.keep_levels(shares).tolist() == [False, False, True, True]
     everyone = lattice(share=1.0)
-    assert everyone.lasting(shares).tolist() == [False, False, False, True]
+    assert everyone.keep_levels(shares).tolist() == [False, False, False, True]
 
 
 def test_shares_without_cameras_are_0():

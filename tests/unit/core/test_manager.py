@@ -6,8 +6,8 @@ import pluggy
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from crossgrad_core.contract.contexts import Densified, Draw, Sampled
-from crossgrad_core.contract.marks import PROJECT
+from crossgrad_core.contract.contexts import DensifyResult, SampleResult, ViewSample
+from crossgrad_core.contract.markers import PROJECT
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
 from crossgrad_core.registry.manager import call_seam, make_manager
@@ -98,7 +98,7 @@ def test_a_method_that_only_looks_like_a_hook_is_refused():
 
 def test_a_hook_under_another_name_and_a_hook_of_the_future_are_welcome():
     class Modern:
-        @hookimpl(specname="crossgrad_message")
+        @hookimpl(specname="crossgrad_log")
         def say(self, text):
             return None
 
@@ -106,18 +106,18 @@ def test_a_hook_under_another_name_and_a_hook_of_the_future_are_welcome():
         def crossgrad_of_tomorrow(self, anything):
             return None
 
-    assert make_manager({"modern": Modern()}).hook.crossgrad_message.get_hookimpls()
+    assert make_manager({"modern": Modern()}).hook.crossgrad_log.get_hookimpls()
 
 
 def test_wrong_arguments_are_refused_with_the_signature():
     class Wrong:
         @hookimpl
-        def crossgrad_message(self, message):
+        def crossgrad_log(self, message):
             return None
 
     error = refusal(wrong=Wrong())
     assert error.what == "plugin wrong cannot be registered"
-    assert "crossgrad_message" in error.found
+    assert "crossgrad_log" in error.found
     assert "message" in error.found
 
 
@@ -130,11 +130,11 @@ def test_two_answers_to_one_seam_are_refused_with_both_names():
 def test_many_plugins_may_watch_an_event():
     class Watcher:
         @hookimpl
-        def crossgrad_message(self, text):
+        def crossgrad_log(self, text):
             return None
 
     manager = make_manager({"one": Watcher(), "two": Watcher()})
-    assert len(manager.hook.crossgrad_message.get_hookimpls()) == 2
+    assert len(manager.hook.crossgrad_log.get_hookimpls()) == 2
 
 
 def test_a_module_that_imports_us_is_no_misspelt_hook():
@@ -156,7 +156,7 @@ def test_properties_are_not_evaluated():
 
 def test_later_wrappers_are_outer_wrappers():
     events = []
-    answer = Densified(NO_EDIT)
+    answer = DensifyResult(NO_EDIT)
     manager = make_manager(
         {
             "densifier": Densifier(answer),
@@ -164,21 +164,23 @@ def test_later_wrappers_are_outer_wrappers():
             "second": Recorder("second", events),
         }
     )
-    assert call_seam(manager.hook.crossgrad_densify, None, Densified) is answer
+    assert call_seam(manager.hook.crossgrad_densify, None, DensifyResult) is answer
     assert events == ["second before", "first before", "first after", "second after"]
 
 
-@pytest.mark.parametrize("answer", [Densified(NO_EDIT), Densified(Edit())])
+@pytest.mark.parametrize("answer", [DensifyResult(NO_EDIT), DensifyResult(Edit())])
 def test_a_seam_gives_its_answer(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
-    assert call_seam(hook, None, Densified) is answer
+    assert call_seam(hook, None, DensifyResult) is answer
 
 
-@pytest.mark.parametrize("answer", [None, NO_EDIT, Densified(None), Sampled(Draw((0,)))], ids=str)
+@pytest.mark.parametrize(
+    "answer", [None, NO_EDIT, DensifyResult(None), SampleResult(ViewSample((0,)))], ids=str
+)
 def test_a_seam_that_is_not_answered_is_an_error(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
     with pytest.raises(UserError, match="a seam must answer") as caught:
-        call_seam(hook, None, Densified)
+        call_seam(hook, None, DensifyResult)
     assert caught.value.where == "plugins densifier"
     assert "NO_EDIT" in caught.value.todo
 
@@ -187,17 +189,17 @@ def test_a_draw_of_nothing_is_no_answer():
     class Sampler:
         @hookimpl
         def crossgrad_sample_views(self, context):
-            return Sampled(None)
+            return SampleResult(None)
 
     hook = make_manager({"sampler": Sampler()}).hook.crossgrad_sample_views
     with pytest.raises(UserError, match="crossgrad_sample_views"):
-        call_seam(hook, None, Sampled)
+        call_seam(hook, None, SampleResult)
 
 
 def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
-    plugins = {"densifier": Densifier(Densified(NO_EDIT)), "forgetful": Forgetful()}
+    plugins = {"densifier": Densifier(DensifyResult(NO_EDIT)), "forgetful": Forgetful()}
     with pytest.raises(UserError, match="was not answered") as caught:
-        call_seam(make_manager(plugins).hook.crossgrad_densify, None, Densified)
+        call_seam(make_manager(plugins).hook.crossgrad_densify, None, DensifyResult)
     assert "forgetful" in caught.value.where
     assert "yield" in caught.value.todo
 
@@ -224,7 +226,7 @@ def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers
         hook.crossgrad_densify(context=None)
     (note,) = caught.value.__notes__
     assert note.startswith("in hook crossgrad_densify of plugin failing, ")
-    answering = Densifier(Densified(NO_EDIT))
+    answering = Densifier(DensifyResult(NO_EDIT))
     hook = make_manager({"one": answering, "after": After(), "around": Around()}).hook
     with pytest.raises(LookupError) as caught:
         hook.crossgrad_densify(context=None)
@@ -234,7 +236,7 @@ def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers
 
 def test_a_seam_without_plugins_is_an_error():
     with pytest.raises(UserError, match="plugins none"):
-        call_seam(make_manager({}).hook.crossgrad_densify, None, Densified)
+        call_seam(make_manager({}).hook.crossgrad_densify, None, DensifyResult)
 
 
 class Marked:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from crossgrad_core.contract.images import eight_bit
+from crossgrad_core.contract.images import to_uint8
 from crossgrad_core.evaluation.metrics import PSNR_LIMIT, psnr
 from crossgrad_plugins.losses.photometric.reference import ssim_map
 from crossgrad_plugins.metrics.similarity import ssim, ssim_skimage
@@ -27,9 +27,9 @@ NOTHING = torch.zeros(30, 40, dtype=torch.bool)
 def test_eight_bit_clamps_rounds_and_is_idempotent():
     image = torch.tensor([[[-1.0, 0.5, 2.0], [torch.nan, 0.1, 1.0]]])
     expected = torch.tensor([[[0, 128, 255], [0, 26, 255]]], dtype=torch.uint8)
-    assert torch.equal(eight_bit(image), expected)
-    assert torch.equal(eight_bit(eight_bit(image)), expected)
-    assert torch.equal(eight_bit(expected / 255), expected)
+    assert torch.equal(to_uint8(image), expected)
+    assert torch.equal(to_uint8(to_uint8(image)), expected)
+    assert torch.equal(to_uint8(expected / 255), expected)
 
 
 @pytest.mark.parametrize("step", [1, 7, 200])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from crossgrad_core.contract.pace import Pace, ViewPlan
+from crossgrad_core.contract.pace import Pace, ViewsPerStepSpec
 
 PLANS = ["1", "2", "7", "1..2@0.5", "2..1@0.3", "1..2@0.25..4@0.75", "4..3@0.01..12@0.99"]
 
@@ -17,7 +17,7 @@ def ks(plan, total):
 
 @pytest.mark.parametrize("text", PLANS)
 def test_a_plan_is_its_text(text):
-    plan = ViewPlan.parsed(text)
+    plan = ViewsPerStepSpec.parsed(text)
     assert str(plan) == text
     assert plan.setting == (text if ".." in text else int(text))
 
@@ -25,7 +25,7 @@ def test_a_plan_is_its_text(text):
 @pytest.mark.parametrize("text", PLANS)
 @pytest.mark.parametrize("total", [1, 2, 3, 10, 57])
 def test_views_add_up_step_by_step(text, total):
-    plan = ViewPlan.parsed(text)
+    plan = ViewsPerStepSpec.parsed(text)
     pace, wanted = plan.paced(total), ks(plan, total)
     assert [pace.at(step) for step in range(1, total + 1)] == wanted
     sums = [sum(wanted[:step]) for step in range(total + 1)]
@@ -37,16 +37,16 @@ def test_views_add_up_step_by_step(text, total):
 @pytest.mark.parametrize("text", PLANS)
 @pytest.mark.parametrize("views", [*range(30), 1000, 2401])
 def test_a_length_in_views_is_the_most_steps_that_draw_no_more(text, views):
-    plan = ViewPlan.parsed(text)
+    plan = ViewsPerStepSpec.parsed(text)
     steps = plan.steps_of(views)
     assert plan.paced(steps).views(steps) <= views
     assert plan.paced(steps + 1).views(steps + 1) > views
 
 
 def test_k_at_the_half():
-    pace = ViewPlan.parsed("1..2@0.5").paced(10)
+    pace = ViewsPerStepSpec.parsed("1..2@0.5").paced(10)
     assert [pace.at(step) for step in range(1, 11)] == [1] * 5 + [2] * 5
-    assert pace.views(10) == 15 and ViewPlan.parsed("1..2@0.5").steps_of(15) == 10
+    assert pace.views(10) == 15 and ViewsPerStepSpec.parsed("1..2@0.5").steps_of(15) == 10
 
 
 @pytest.mark.parametrize(
@@ -58,17 +58,17 @@ def test_k_at_the_half():
 )
 def test_what_is_no_plan_is_refused(text):
     with pytest.raises(ValueError, match="must "):
-        ViewPlan.parsed(text)
+        ViewsPerStepSpec.parsed(text)
 
 
 @pytest.mark.parametrize(("step", "start"), [(10, 40), (19, 40), (20, 40), (21, 20), (30, 20)])
 def test_a_change_that_is_ahead_moves_with_the_length(step, start):
-    plan = ViewPlan.parsed("1..2@0.5")
+    plan = ViewsPerStepSpec.parsed("1..2@0.5")
     assert plan.paced(40).moved(plan.paced(80), step) == Pace((0, start), (1, 2))
 
 
 def test_a_change_that_would_be_behind_comes_at_once_and_rewrites_no_step():
-    plan = ViewPlan.parsed("1..2@0.5..3@0.9")
+    plan = ViewsPerStepSpec.parsed("1..2@0.5..3@0.9")
     pace = plan.paced(100)
     moved = pace.moved(plan.paced(50), 40)
     assert moved == replace(pace, starts=(0, 40, 45))

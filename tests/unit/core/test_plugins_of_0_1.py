@@ -84,7 +84,10 @@ def test_a_class_of_0_1_is_told_what_to_write_now(offered, slot, text, name, lin
         ("from crossgrad_core.plugin import NoEdit", "NO_EDIT is Edit()"),
         ("from crossgrad_core.plugin import Labelling", "Rule"),
         ("from crossgrad_core.plugin import ViewGradients", "SeparateGradients"),
-        ("from crossgrad_core.contexts import Draw", "crossgrad_core.plugin, whose names stay"),
+        (
+            "from crossgrad_core.contexts import ViewSample",
+            "crossgrad_core.plugin, whose names stay",
+        ),
         ("import crossgrad_core.optimizer.adam", "crossgrad_core.plugin, whose names stay"),
     ],
 )

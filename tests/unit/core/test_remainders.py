@@ -48,7 +48,7 @@ def exact_product(one, other, names, rows=slice(None)):
 
 def check(gradients, granularity, block, views, names, rows=slice(None)):
     gramian = gradients.gramians(granularity)[block]
-    rest = gradients.remainders(granularity)[block]
+    rest = gradients.rounding_residuals(granularity)[block]
     for i, one in enumerate(views):
         for j, other in enumerate(views):
             exact = exact_product(one, other, names, rows)
@@ -79,7 +79,7 @@ def test_so_have_those_of_single_primitives(dtype):
 def test_gradients_whose_squares_leave_float64_keep_their_digits():
     views = views_of(2, torch.float64, scale=1e160)
     gradients = DenseGradients(views, BLOCKS)
-    gramian, rest = gradients.gramians("global")[0], gradients.remainders("global")[0]
+    gramian, rest = gradients.gramians("global")[0], gradients.rounding_residuals("global")[0]
     found = [Fraction(gramian[i, 1]) + Fraction(rest[i, 1]) for i in range(2)]
     exact = [exact_product(views[i], views[1], list(SHAPES)) for i in range(2)]
     assert abs(found[0] / found[1] - exact[0] / exact[1]) <= 1e-29
@@ -90,7 +90,7 @@ def test_views_that_do_not_count_have_none():
     views[1]["means"][2, 1] = torch.inf
     views[2] = {"scales": views[2]["scales"], "mlp.0": None}
     gradients = DenseGradients(views, BLOCKS)
-    rest = gradients.remainders("block")
+    rest = gradients.rounding_residuals("block")
     assert np.isfinite(rest).all()
     assert not rest[0, 1].any() and not rest[0, :, 1].any()
     assert not rest[0, 2].any() and not rest[2, 2].any()

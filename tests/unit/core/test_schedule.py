@@ -7,7 +7,7 @@ import pytest
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import (
     SHORTEST_INTERVAL,
     SHORTEST_WARM_UP,
@@ -67,7 +67,7 @@ def test_edits_are_counted_without_looking_at_every_step(total, mode):
 
 def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
     schedule = Schedule.for_run(20_000)
-    longer = schedule.lengthened(Schedule.for_run(40_000), 3000)
+    longer = schedule.with_length(Schedule.for_run(40_000), 3000)
     assert (longer.total, longer.lr_until, longer.densify_until) == (40_000, 40_000, 20_000)
     for name in ("sh_interval", "densify_from", "densify_every", "reset_every", "coarse_until"):
         assert getattr(longer, name) == getattr(schedule, name)
@@ -75,21 +75,21 @@ def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
 
 @pytest.mark.parametrize(("step", "until"), [(700, 750), (900, 900), (1000, 1000), (1200, 1000)])
 def test_density_control_ends_where_it_may_and_never_comes_back(step, until):
-    schedule = Schedule.for_run(2000).lengthened(Schedule.for_run(1500), step)
+    schedule = Schedule.for_run(2000).with_length(Schedule.for_run(1500), step)
     assert schedule.densify_until == until
-    again = schedule.lengthened(Schedule.for_run(4000), 1300)
+    again = schedule.with_length(Schedule.for_run(4000), 1300)
     assert again.densify_until == until
 
 
 def test_large_gaussians_are_never_pruned_without_a_reset_whatever_the_length():
-    schedule = Schedule.for_run(9000).lengthened(Schedule.for_run(12_000), 100)
+    schedule = Schedule.for_run(9000).with_length(Schedule.for_run(12_000), 100)
     assert schedule.reset_every is None
     assert not any(schedule.prunes_large(step) for step in range(12_001))
 
 
 @pytest.mark.parametrize(("total", "mode"), [(20_000, "scaled"), (2500, "absolute")])
 def test_large_gaussians_are_pruned_after_the_first_reset_whatever_the_length(total, mode):
-    schedule = Schedule.for_run(total, mode).lengthened(Schedule.for_run(40_000, mode), 100)
+    schedule = Schedule.for_run(total, mode).with_length(Schedule.for_run(40_000, mode), 100)
     first = next(step for step in range(1, 40_001) if schedule.resets(step))
     assert not schedule.prunes_large(first) and schedule.prunes_large(first + 1)
 
@@ -109,16 +109,16 @@ def test_harmonics_that_are_drawn_do_not_go_when_the_run_gets_another_length(ste
     schedule = replace(Schedule.for_run(2000), sh_wait=1000)
     other = replace(Schedule.for_run(1800), sh_wait=900)
     longer = replace(Schedule.for_run(4000), sh_wait=2000)
-    assert schedule.lengthened(other, step).sh_wait == wait
-    later = schedule.lengthened(longer, step)
+    assert schedule.with_length(other, step).sh_wait == wait
+    later = schedule.with_length(longer, step)
     assert later.sh_wait == (2000 if step < 1000 else 1000)
     assert later.sh_degree(step) == schedule.sh_degree(step)
 
 
 def test_the_coarse_phase_never_gets_longer():
     schedule = Schedule.for_run(1000)
-    assert schedule.lengthened(Schedule.for_run(2000), 100).coarse_until == 250
-    assert schedule.lengthened(Schedule.for_run(800), 100).coarse_until == 200
+    assert schedule.with_length(Schedule.for_run(2000), 100).coarse_until == 250
+    assert schedule.with_length(Schedule.for_run(800), 100).coarse_until == 200
 
 
 def test_learning_rate_is_log_linear_and_clipped():
@@ -133,7 +133,7 @@ FEWEST_EDITS = 6
 
 
 def in_views(text="1", photos=24, reference=None):
-    return Counting("views", ViewPlan.parsed(text), photos, reference, FEWEST_EDITS)
+    return Counting("views", ViewsPerStepSpec.parsed(text), photos, reference, FEWEST_EDITS)
 
 
 def view_counts(schedule, happens=Schedule.densifies):
@@ -202,17 +202,19 @@ def test_edits_that_are_asked_for_from_a_length_on_follow_the_clock_there_and_ba
     short, long = (Schedule.for_run(views, counting=counting) for views in (599, 600))
     assert short.edits() == 0
     assert long.edits() == FEWEST_EDITS
-    assert short.lengthened(long, 100).edits() == FEWEST_EDITS
-    assert long.lengthened(short, 100).fewest_edits == 0
+    assert short.with_length(long, 100).edits() == FEWEST_EDITS
+    assert long.with_length(short, 100).min_refinements == 0
 
 
 def test_floors_hold_in_views_where_no_edits_are_asked_for():
     def default(steps, photos=24):
-        return Schedule.for_run(steps, counting=Counting("views", ViewPlan.parsed("2"), photos))
+        return Schedule.for_run(
+            steps, counting=Counting("views", ViewsPerStepSpec.parsed("2"), photos)
+        )
 
     assert not default(500).grows
     assert view_counts(default(900)) == [600, 700, 800]
-    assert default(900).lengthened(default(700), 100).fewest_edits == 0
+    assert default(900).with_length(default(700), 100).min_refinements == 0
     assert default(15_000, photos=300).densify_every == 300
     assert default(900, photos=300).densify_every == 100  # A pass would leave one edit.
 
@@ -251,7 +253,7 @@ def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
 @pytest.mark.parametrize("text", ["1", "2", "5..1@0.5"])
 @pytest.mark.parametrize("views", [250, 600, 605, 2400])
 def test_edits_of_a_flat_schedule_behind_the_end_of_the_run_do_not_count(text, views):
-    total = ViewPlan.parsed(text).steps_of(views)
+    total = ViewsPerStepSpec.parsed(text).steps_of(views)
     schedule = Schedule.for_run(total, "absolute", in_views(text, reference=1200))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     for after in (0, total // 2, total):
@@ -280,7 +282,7 @@ def test_a_run_whose_length_follows_the_clock_keeps_its_edits(text, planned, act
     lengths = [planned + (actual - planned) * k // 5 for k in range(1, 6)]
     for k, length in enumerate(lengths):
         step = after + k * after // 10
-        schedule = schedule.lengthened(Schedule.for_run(length, counting=counting), step)
+        schedule = schedule.with_length(Schedule.for_run(length, counting=counting), step)
         reached = after + (k + 1) * after // 10
         done += [s for s in range(step + 1, reached + 1) if schedule.densifies(s)]
     step = after + 5 * after // 10
@@ -299,7 +301,7 @@ def test_any_lengths_in_turn_keep_what_was_and_what_is_ahead(text, seed):
     while step + 1 < schedule.total:
         step = int(rng.integers(step + 1, schedule.total))
         length = step + int(rng.integers(1, 1500))
-        later = schedule.lengthened(Schedule.for_run(length, counting=counting), step)
+        later = schedule.with_length(Schedule.for_run(length, counting=counting), step)
         assert later.total == length and later.pace.views(step) == schedule.pace.views(step)
         edits = schedule.edits_before + schedule.edits() - schedule.edits(step)
         assert later.edits_before == edits or later.counted(step) >= later.densify_until
@@ -318,7 +320,7 @@ def test_times_that_the_user_set_stay_whatever_the_length():
     densifier = build("densifiers", "adc", {})
     schedule = schedule_of(config, densifier, 600, counting)
     assert view_counts(schedule) == list(range(70, 400, 40))
-    other = schedule.lengthened(schedule_of(config, densifier, 900, counting), 100)
+    other = schedule.with_length(schedule_of(config, densifier, 900, counting), 100)
     assert view_counts(other) == view_counts(schedule)
 
 

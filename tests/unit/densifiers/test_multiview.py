@@ -16,7 +16,7 @@ from support.multiview import TRAIN, VIEWS, Shown, context, parameters_of, recor
 from crossgrad_backbones.mip import MipSplatting
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import Counting, Phase, Schedule
 from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.contract.topology import apply_to_moment, apply_to_parameters
@@ -25,7 +25,7 @@ from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.clone_split import Plan
-from crossgrad_plugins.densifiers.marked_counts import ERROR, MARKED, VISITS
+from crossgrad_plugins.densifiers.error_pixel_counts import ERROR, MARKED, VISITS
 from crossgrad_plugins.densifiers.multiview import MultiViewDensityControl, some_of
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import TileLists
 
@@ -202,10 +202,10 @@ def test_edits_are_as_far_apart_as_published(total, every):
 
 @pytest.mark.parametrize("total", [98, 240, 700])
 def test_short_runs_have_edits_where_they_are_asked_for(total):
-    counting = Counting("views", ViewPlan((1,)), 12, fewest_edits=6)
+    counting = Counting("views", ViewsPerStepSpec((1,)), 12, min_refinements=6)
     window = MultiViewDensityControl().window(Schedule.for_run(total, counting=counting))
     assert window.edits() >= 6
-    without = replace(counting, fewest_edits=0)
+    without = replace(counting, min_refinements=0)
     assert MultiViewDensityControl().window(Schedule.for_run(total, counting=without)).edits() == 0
 
 
@@ -258,7 +258,7 @@ def test_a_run_that_becomes_shorter_prunes_once_for_all_that_it_passed():
 
 
 def test_options_that_do_nothing_are_named():
-    idle = lambda **options: set(MultiViewDensityControl(**options).idle_options(None))  # noqa: E731
+    idle = lambda **options: set(MultiViewDensityControl(**options).unused_options(None))  # noqa: E731
     assert idle() == {"share"}
     assert idle(count="running") == set()
     assert idle(count="running", late_prunings=()) == {"views", "late_opacity", "late_score"}

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from crossgrad_backbones.anchors.growth.control import AnchorControl
-from crossgrad_backbones.anchors.growth.new_anchors import Urge
+from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit
@@ -15,7 +15,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.resolve import resolved
-from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.densifiers import DensifierRun
 from crossgrad_core.testing.fixtures import sample_scene
@@ -107,9 +107,9 @@ def test_an_anchor_grows_only_where_it_may():
 
 
 def test_what_may_not_grow_asks_for_nothing():
-    urge = Urge(torch.ones(3, 2), torch.ones(3, 2, dtype=torch.bool))
-    assert urge.among(None) is urge
-    allowed = urge.among(torch.tensor([True, False, True])).eligible
+    request = GrowthRequest(torch.ones(3, 2), torch.ones(3, 2, dtype=torch.bool))
+    assert request.among(None) is request
+    allowed = request.among(torch.tensor([True, False, True])).eligible
     assert allowed.tolist() == [[True, True], [False, False], [True, True]]
 
 

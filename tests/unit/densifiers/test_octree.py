@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.anchors.growth.new_anchors import Urge
+from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.octree_control import OctreeControl
 from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
@@ -43,9 +43,9 @@ def parameters(rng, anchors=12, slots=3, levels=3, share=-1.0):
     }
 
 
-def urge(rng, anchors=12, slots=3):
+def request(rng, anchors=12, slots=3):
     gradient = torch.from_numpy(rng.uniform(0.5e-4, 4e-4, (anchors, slots))).float()
-    return Urge(gradient, torch.from_numpy(rng.random((anchors, slots)) < 0.8))
+    return GrowthRequest(gradient, torch.from_numpy(rng.random((anchors, slots)) < 0.8))
 
 
 def site(point, level):
@@ -84,7 +84,7 @@ def slow_growth(tensors, asked, levels):
 @pytest.mark.parametrize("seed", range(3))
 def test_new_anchors_are_those_of_a_loop_over_offsets(levels, seed):
     rng = np.random.default_rng(seed)
-    tensors, asked = parameters(rng, 40, levels=levels), urge(rng, 40)
+    tensors, asked = parameters(rng, 40, levels=levels), request(rng, 40)
     expected = slow_growth(tensors, asked, levels)
     new = grown(tensors, asked, THRESHOLDS, NEAR_CAMERA)
     at = new.further["levels"].tolist()
@@ -103,13 +103,13 @@ def test_new_anchors_are_those_of_a_loop_over_offsets(levels, seed):
 
 def test_without_eligible_offsets_nothing_grows():
     rng = np.random.default_rng(0)
-    asked = replace(urge(rng), eligible=torch.zeros(12, 3, dtype=torch.bool))
+    asked = replace(request(rng), eligible=torch.zeros(12, 3, dtype=torch.bool))
     assert len(grown(parameters(rng), asked, THRESHOLDS, NEAR_CAMERA)) == 0
 
 
 def test_candidates_that_too_few_cameras_see_are_weeded_out():
     rng = np.random.default_rng(1)
-    tensors, asked = parameters(rng, 40, share=0.5), urge(rng, 40)
+    tensors, asked = parameters(rng, 40, share=0.5), request(rng, 40)
     # L* of level 1 is reached within 4 * 2^-0.5 = 2.83, that of level 2 within 1.41.
     cameras = torch.tensor([[0.0, 0, 0], [0.0, 0, -90], [0.0, 0, 90]], dtype=torch.float64)
     levels = grown(tensors, asked, THRESHOLDS, cameras).further["levels"]
@@ -122,17 +122,17 @@ def test_an_offset_that_flew_away_grows_nothing():
     tensors = parameters(np.random.default_rng(2), 2)
     tensors["offsets"][0] = 1e38
     tensors["scales"][1] = 200.0
-    asked = Urge(torch.full((2, 3), 1.0), torch.ones(2, 3, dtype=torch.bool))
+    asked = GrowthRequest(torch.full((2, 3), 1.0), torch.ones(2, 3, dtype=torch.bool))
     assert len(grown(tensors, asked, THRESHOLDS, NEAR_CAMERA)) == 0
 
 
 def test_extra_levels_ask_for_a_quarter_of_the_own_threshold_on_average():
     rng = np.random.default_rng(3)
-    tensors, asked = parameters(rng, 50), urge(rng, 50)
+    tensors, asked = parameters(rng, 50), request(rng, 50)
     asked.eligible[:5] = False
     gradient = asked.gradient * 0.25
     quarter = Thresholds(0.25 * 2e-4, 2**0.2)
-    farther = seen_from_farther(tensors, Urge(gradient, asked.eligible), quarter)
+    farther = seen_from_farther(tensors, GrowthRequest(gradient, asked.eligible), quarter)
     for p, level in enumerate(tensors["levels"].tolist()):
         seen = [float(g) for g, e in zip(gradient[p], asked.eligible[p], strict=True) if e]
         wanted = bool(seen) and sum(seen) / len(seen) >= 0.25 * 2e-4 * 2 ** (0.2 * level)

@@ -9,7 +9,7 @@ from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run import usual_densifier as chosen
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.migration import migrated
-from crossgrad_core.run.usual_views import view_plan_of
+from crossgrad_core.run.usual_views import views_per_step_spec_of
 from crossgrad_core.testing.fixtures import sample_scene
 
 USUAL = {
@@ -75,7 +75,7 @@ def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
 def usual_of(**settings):
     config = configured(settings)
     backbone = build("backbones", config.backbone.name, {})
-    return chosen.usual_densifier(config, view_plan_of(config), backbone, photos=2)
+    return chosen.usual_densifier(config, views_per_step_spec_of(config), backbone, photos=2)
 
 
 @pytest.mark.parametrize("name", ["auto", "numba"])

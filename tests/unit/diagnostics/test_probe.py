@@ -249,7 +249,7 @@ def test_a_damaged_table_of_probes_is_one_error(line, tmp_path):
 def test_a_report_is_drawn_whatever_is_missing(model, monkeypatch, tmp_path):
     made_up(monkeypatch, model, lambda view, made: {"means": made["means"]} if view else {})
     watch = Watch(plan(2), 1, sample_phase().step, 0)
-    watch.crossgrad_model(model)
+    watch.crossgrad_model_ready(model)
     report = watch.report(model.scene, "a model of which little is known")
     report.write(tmp_path)
     text = "\n".join(report.lines())

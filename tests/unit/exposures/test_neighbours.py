@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_plugins.exposures import starts
+from crossgrad_plugins.exposures import initial_values
 from crossgrad_plugins.exposures.gain import Gain
 from crossgrad_plugins.exposures.neighbours import TELLING, Neighbours
 
@@ -82,13 +82,13 @@ def test_neighbours_are_asked_only_where_they_tell_more():
     scene = posed_scene(views, test=(0, 1))
     kinds = torch.tensor([1.0 if n % 2 else -1.0 for n in range(2, 20)])
     for number in (0, 1):
-        found = Gain().unseen(views[number], scene, {"stops": kinds})
+        found = Gain().predict_unseen(views[number], scene, {"stops": kinds})
         assert float(found["stops"]) == pytest.approx(1.0 if number else -1.0)
     # What has nothing to do with places is better told by the mean.
     drawn = torch.from_numpy(rng.normal(size=18)).float()
-    assert float(Gain().unseen(views[0], scene, {"stops": drawn})["stops"]) == pytest.approx(
-        float(drawn.mean())
-    )
+    assert float(
+        Gain().predict_unseen(views[0], scene, {"stops": drawn})["stops"]
+    ) == pytest.approx(float(drawn.mean()))
 
 
 def test_photos_that_nothing_tells_of_start_as_their_neighbours(monkeypatch):
@@ -100,10 +100,10 @@ def test_photos_that_nothing_tells_of_start_as_their_neighbours(monkeypatch):
     ]
     scene = posed_scene(views)
     told = {view.name: float(kind) for view, kind in zip(views[2:], kinds[2:], strict=True)}
-    monkeypatch.setattr(starts, "exposure_values", lambda _: told)
-    found = starts.starts_of(scene, "exif")
+    monkeypatch.setattr(initial_values, "exposure_values", lambda _: told)
+    found = initial_values.starts_of(scene, "exif")
     assert found.stops == pytest.approx(kinds - 0.5)
-    (note,) = (each for each in found.remarks if "2 photos start" in each)
+    (note,) = (each for each in found.messages if "2 photos start" in each)
     assert "the photos nearest in pose" in note and "00.png, 01.png" in note
 
 
@@ -112,6 +112,6 @@ def test_photos_of_one_place_and_one_direction_are_told_by_finite_numbers(count)
     views = [posed_view((0, 0, 0), f"{n}.png") for n in range(count)]
     scene = posed_scene([*views, posed_view((0, 0, 0), "held out.png")], test=(count,))
     stops = torch.linspace(-1, 1, count)
-    found = Gain().unseen(scene.test_views[0], scene, {"stops": stops})["stops"]
+    found = Gain().predict_unseen(scene.test_views[0], scene, {"stops": stops})["stops"]
     assert bool(torch.isfinite(found))
     assert -1.0 <= float(found) <= 1.0

@@ -11,7 +11,7 @@ from crossgrad_plugins.exposures import per_photo
 from crossgrad_plugins.exposures.affine import Affine
 from crossgrad_plugins.exposures.channel import ChannelGain
 from crossgrad_plugins.exposures.gain import Gain
-from crossgrad_plugins.exposures.starts import Starts
+from crossgrad_plugins.exposures.initial_values import Starts
 
 MODELS = [Gain(), ChannelGain(), Affine()]
 NAMES = [type(model).__name__ for model in MODELS]
@@ -63,7 +63,7 @@ def test_a_start_differs_by_the_stops_that_were_found(model, stops, monkeypatch)
 @given(STOPS, st.floats(-6, 6))
 def test_what_photos_differ_by_stays_when_the_mean_is_made_neutral(model, stops, level):
     values = model.of_stops(torch.tensor(stops).double() + level)
-    found = model.projected({"x": values})["x"]
+    found = model.project({"x": values})["x"]
     assert torch.allclose(found.double().mean(dim=0), neutral(model), atol=ROUNDING)
     assert torch.allclose(stops_between(model, found), stops_between(model, values), atol=1e-4)
 
@@ -74,7 +74,7 @@ def test_affine_maps_keep_what_one_is_after_another(seed):
     """Of general maps, too: A_i composed with the inverse of A_j is what it was."""
     noise = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
     values = Affine().neutral() + 0.1 * noise
-    found = Affine().projected({"matrix": values})["matrix"].double()
+    found = Affine().project({"matrix": values})["matrix"].double()
     assert torch.allclose(found.mean(dim=0), neutral(Affine()), atol=ROUNDING)
     before, after = (squares(each) for each in (values, found))
     for one, other in zip(before[1:], after[1:], strict=True):
@@ -92,7 +92,7 @@ def squares(maps):
 def test_maps_that_lose_all_colours_still_have_a_finite_neutral_mean(left):
     values = torch.zeros(3, 3, 4).double()
     values[:, range(3), range(3)] = torch.tensor([[2.0, -2.0, left]]).double().T
-    found = Affine().projected({"matrix": values})["matrix"]
+    found = Affine().project({"matrix": values})["matrix"]
     assert torch.allclose(found.double().mean(dim=0), neutral(Affine()), atol=ROUNDING)
 
 
@@ -100,7 +100,7 @@ def test_maps_that_lose_all_colours_still_have_a_finite_neutral_mean(left):
 def test_values_move_from_one_level_to_another(model):
     values, start, end = (model.of_stops(torch.tensor(s).double())
                           for s in ([-4.0, 0.0, 4.0], -4.0, 1.0))  # fmt: skip
-    found = model.moved(model.parameter, values, start, end)
+    found = model.shift(model.parameter, values, start, end)
     expected = model.of_stops(torch.tensor([1.0, 5.0, 9.0]).double())
     assert torch.allclose(found, expected, rtol=1e-9)
 
@@ -109,18 +109,18 @@ def test_values_move_from_one_level_to_another(model):
 @pytest.mark.parametrize("stops", [0.0, 3.5, 10.0])
 def test_photos_that_a_file_puts_far_from_the_mean_are_named(model, stops):
     levels = torch.tensor([stops, *[0.0] * 30, -stops]).double()
-    known = model.projected({model.parameter: model.of_stops(levels)})
-    remarks = model.remarks(scene_of(len(levels)), known)
+    known = model.project({model.parameter: model.of_stops(levels)})
+    messages = model.messages(scene_of(len(levels)), known)
     if stops < 4:
-        assert remarks == ()
+        assert messages == ()
     else:
-        assert len(remarks) == 1
-        assert "2 photos are more than 4 stops from the mean (0.png, 31.png)" in remarks[0]
+        assert len(messages) == 1
+        assert "2 photos are more than 4 stops from the mean (0.png, 31.png)" in messages[0]
 
 
 def test_one_channel_far_off_is_enough_and_black_is_far():
     for model, value in ((ChannelGain(), [0.0, -7, 7]), (Affine(), torch.zeros(3, 4).tolist())):
         known = torch.stack([model.neutral()] * 3)
         known[1] = torch.tensor(value)
-        (remark,) = model.remarks(scene_of(3), {model.parameter: known})
+        (remark,) = model.messages(scene_of(3), {model.parameter: known})
         assert "1 photos" in remark and "1.png" in remark

@@ -257,9 +257,9 @@ def test_auto_takes_a_gain_where_the_rule_says_so_and_says_why():
 
 
 def test_no_exposure_names_the_option_where_it_would_help():
-    (remark,) = NoExposure().remarks(grey_scene([0.1, 0.2, 0.4]), {})
+    (remark,) = NoExposure().messages(grey_scene([0.1, 0.2, 0.4]), {})
     assert "--exposure gain" in remark
-    assert NoExposure().remarks(grey_scene([0.2, 0.2, 0.2]), {}) == ()
+    assert NoExposure().messages(grey_scene([0.2, 0.2, 0.2]), {}) == ()
 
 
 class Unseen:
@@ -272,11 +272,11 @@ class Unseen:
 def test_photos_without_tracks_are_not_decoded():
     scene = grey_scene([0.2, 0.4], seen=[(), ()])
     scene = replace(scene, views=tuple(replace(view, photo=Unseen()) for view in scene.views))
-    assert NoExposure().remarks(scene, {}) == ()
+    assert NoExposure().messages(scene, {}) == ()
     assert not training_gains(scene).known.any()
 
 
 def test_a_damaged_photo_is_left_to_whoever_needs_it():
     scene = grey_scene([0.2, 0.4])
     scene = replace(scene, views=tuple(replace(view, photo=Unseen()) for view in scene.views))
-    assert NoExposure().remarks(scene, {}) == ()
+    assert NoExposure().messages(scene, {}) == ()

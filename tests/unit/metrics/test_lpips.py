@@ -156,7 +156,7 @@ def test_without_a_file_it_is_null_and_says_how_to_name_one(kind):
     assert kind().measure(pair()) is None
     told = kind().described().undefined
     assert f"--set metrics.{kind.entry}.trunk=FILE" in told and kind.net.published in told
-    assert kind().crossgrad_objections(NO_SELECTION) == []
+    assert kind().crossgrad_validate_selection(NO_SELECTION) == []
 
 
 def test_safetensors_and_a_trunk_without_prefix_are_read_alike(trunks, heads, tmp_path):
@@ -177,7 +177,7 @@ def test_results_say_which_weights_were_used(trunks, heads):
 def refused(metric):
     """The error before any training."""
     with pytest.raises(UserError) as caught:
-        metric.crossgrad_objections(NO_SELECTION)
+        metric.crossgrad_validate_selection(NO_SELECTION)
     assert caught.value.todo
     return caught.value
 
@@ -215,7 +215,7 @@ def test_a_pickle_that_would_run_code_is_not_run(heads, tmp_path):
 
 
 def test_heads_without_a_trunk_are_refused(heads):
-    reasons = LPIPS(heads=heads / "alex.pth").crossgrad_objections(NO_SELECTION)
+    reasons = LPIPS(heads=heads / "alex.pth").crossgrad_validate_selection(NO_SELECTION)
     assert len(reasons) == 1 and "metrics.lpips.trunk=FILE" in reasons[0]
 
 

@@ -38,7 +38,7 @@ def run_with(progress: Progress, steps: int = 20, first: int = 1) -> None:
             hook.crossgrad_evaluation(
                 report=EvaluationReport(step, {"psnr": 21.5, "ssim": 0.7, "train_seconds": 1.0})
             )
-            hook.crossgrad_message(text="something to know")
+            hook.crossgrad_log(text="something to know")
     hook.crossgrad_run_end(status="finished")
 
 
@@ -122,7 +122,7 @@ def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
     )
     hook.crossgrad_run_start(run=run)
     for step, total in enumerate(totals, 1):
-        hook.crossgrad_length(step=step, total=total)
+        hook.crossgrad_length_changed(step=step, total=total)
     assert len(capsys.readouterr().err.splitlines()) == 1
     hook.crossgrad_run_end(status="finished")
     assert capsys.readouterr().err.splitlines() == said

@@ -21,7 +21,7 @@ def objections(name, sampler, grouping=None, views=2):
         names={"operator": name, "sampler": sampler, "grouping": grouping},
         views_per_step=views,
     )
-    own = getattr(operator, "crossgrad_objections", lambda _: [])
+    own = getattr(operator, "crossgrad_validate_selection", lambda _: [])
     return objections_to_views(operator, selection) + own(selection)
 
 

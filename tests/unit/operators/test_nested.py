@@ -126,14 +126,14 @@ def selection(operator, views, blocks=()):
 
 def test_objections_of_links_are_passed_on():
     assert PCGrad().views == ViewCounts()
-    found = chain("pcgrad", "anchors").crossgrad_objections(selection(PCGrad(), 3))
+    found = chain("pcgrad", "anchors").crossgrad_validate_selection(selection(PCGrad(), 3))
     assert any("anchors needs K = 2" in reason for reason in found)
     assert any("labelled views" in reason for reason in found)
 
 
 def test_rules_for_blocks_that_do_not_exist_are_refused():
     operator = Dispatch(rules={"f_dcc": "sum", "geometry": "mean"})
-    (found,) = operator.crossgrad_objections(selection(operator, 2))
+    (found,) = operator.crossgrad_validate_selection(selection(operator, 2))
     assert "'f_dcc'" in found
 
 

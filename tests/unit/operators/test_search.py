@@ -23,8 +23,8 @@ from crossgrad_operators.stress.search.loop import Extent, fresh, search
 from crossgrad_operators.stress.search.quick import QUICK, exact
 from crossgrad_operators.stress.search.repeat import read_rows
 from crossgrad_operators.stress.search.report import failed
+from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.shrink import shrunk
-from crossgrad_operators.stress.search.specimens import Specimen
 from crossgrad_operators.stress.search.subject import Subject, subject_of
 from crossgrad_operators.stress.suite import made, reference_of
 from crossgrad_operators.symmetric import Symmetric
@@ -191,7 +191,7 @@ def test_a_worse_case_shrinks_to_what_it_needs():
     subject = symmetric_as(OffForThree())
     rows = rounded(np.random.default_rng(4).standard_normal((6, 7)), torch.float32)
     value = float(examine(subject, Batch(rows[None], torch.float32, "test")).error[0])
-    small = shrunk(subject, Specimen(rows, torch.float32, "test", 0, value), inside=True)
+    small = shrunk(subject, Sample(rows, torch.float32, "test", 0, value), inside=True)
     assert len(small.rows) == 3
     assert small.rows.shape[1] <= 2
 
@@ -199,7 +199,7 @@ def test_a_worse_case_shrinks_to_what_it_needs():
 def test_rows_are_printed_so_that_they_are_read_again_exactly():
     for dtype in BOTH:
         rows = rounded(FAMILIES["mixed"](np.random.default_rng(5), 1, 4, 3)[0], dtype)
-        text = Specimen(rows, dtype, "test", 0, 1.0).text()
+        text = Sample(rows, dtype, "test", 0, 1.0).text()
         assert np.array_equal(read_rows(text, dtype).exact_head, rows)
 
 

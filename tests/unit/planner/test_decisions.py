@@ -235,9 +235,9 @@ def test_pairs_bring_two_views():
     assert (found.choice, found.basis, found.settings) == ("2", "decided", {})
 
 
-@pytest.mark.parametrize("name", ["backward", "batch_rule", "density_views"])
+@pytest.mark.parametrize("name", ["backward", "batch_rule", "densify_views"])
 def test_the_views_of_pairs_are_told_whatever_else_was_set(name):
-    value = {"backward": "joint", "batch_rule": "sqrt", "density_views": "one"}[name]
+    value = {"backward": "joint", "batch_rule": "sqrt", "densify_views": "one"}[name]
     assert (
         groups.views_per_step(evidence_of("city_hybrid", PAIRS_PAY, **{name: value})).choice == "2"
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.commands import ComponentChoice, UserError, configured
-from crossgrad_core.run import planning
+from crossgrad_core.run import apply_plan
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
@@ -108,7 +108,7 @@ def missing(*_arguments):
     ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
 )
 def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeypatch):
-    monkeypatch.setattr(planning, name, value)
+    monkeypatch.setattr(apply_plan, name, value)
     assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
     asked = configured({"scene": "x", "steps": 100, "plan": "turns"})
     with pytest.raises((RuntimeError, UserError)):

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from crossgrad_plugins.prepare.findings import (
     bridges_of,
+    fallbacks,
     joins_of,
     lost_photos,
     parts_of,
-    rungs,
 )
 from crossgrad_plugins.prepare.matching import Link
 from crossgrad_plugins.prepare.plan import Photo, Plan, Settings
@@ -91,7 +91,7 @@ def test_pairs_across_are_counted():
 
 @given(st.floats(1.0, 50.0), st.floats(1.5, 60.0))
 def test_rungs_lead_from_end_to_end_in_equal_factors(low, factor):
-    found = rungs(low, low * factor)
+    found = fallbacks(low, low * factor)
     assert found[0] == pytest.approx(low)
     assert found[-1] == pytest.approx(low * factor)
     steps = [after / before for before, after in itertools.pairwise(found)]

@@ -11,13 +11,13 @@ from PIL import Image
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_core.system import writability
+from crossgrad_core.system import check_writable
 from crossgrad_plugins.prepare import features, mapping, matching, undistortion
 from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_damaged, clear_leftovers
 from crossgrad_plugins.prepare.plan import Photo, Plan, Settings
+from crossgrad_plugins.prepare.refine_poses import _Again
 from crossgrad_plugins.prepare.results import _place
-from crossgrad_plugins.prepare.second_look import _Again
-from crossgrad_plugins.prepare.whole import is_whole, write_model
+from crossgrad_plugins.prepare.scene_integrity import is_whole, write_model
 
 FULL = "not enough disk space"
 FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
@@ -53,7 +53,7 @@ def free(monkeypatch):
     """Sets how many bytes are free."""
 
     def set_free(count):
-        monkeypatch.setattr(writability, "free_bytes", lambda _: count)
+        monkeypatch.setattr(check_writable, "free_bytes", lambda _: count)
 
     return set_free
 

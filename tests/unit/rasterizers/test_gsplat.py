@@ -1,6 +1,6 @@
 """Rasterizer `gsplat` held against the rule set, on gsplat's own plain-torch reference (CPU).
 
-What only a GPU can show, the CUDA kernels themselves, is what `burn_in` looks at before a run.
+What only a GPU can show, the CUDA kernels themselves, is what `self_test` looks at before a run.
 """
 
 import gc
@@ -12,7 +12,7 @@ import torch
 from support import gsplat_on_cpu
 from support.gaussians import posed_camera, random_gaussians
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
 from crossgrad_plugins.rasterizers.gpu import blended
 from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
 from crossgrad_plugins.rasterizers.reference.harmonics import harmonics

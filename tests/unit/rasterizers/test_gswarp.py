@@ -171,7 +171,7 @@ def test_no_gaussians_give_the_background(gswarp):
 def test_a_package_that_fails_to_start_ends_in_a_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "gswarp", None)
     with pytest.raises(UserError, match="GswarpRasterizer cannot draw on this machine"):
-        GswarpRasterizer().burn_in("cpu")
+        GswarpRasterizer().self_test("cpu")
 
 
 def test_matrices_project_a_point_to_the_pixel_that_our_camera_does():

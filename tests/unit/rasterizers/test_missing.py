@@ -43,7 +43,7 @@ def machine(monkeypatch, tmp_path):
 
 def objections(rasterizer, device="cuda", **more):
     selection = selection_of(rasterizer=rasterizer, device=device, **more)
-    return rasterizer.crossgrad_objections(selection)
+    return rasterizer.crossgrad_validate_selection(selection)
 
 
 def test_a_package_that_is_not_there_is_named_with_its_extra(machine):
@@ -150,7 +150,7 @@ def test_gswarp_refuses_a_dilation_of_ones_own(machine):
     machine("gswarp", "warp")
 
     class Own(type(build("backbones", "vanilla", {}))):
-        own_dilation = True
+        sets_dilation = True
 
     assert "by its own" in objections(GswarpRasterizer(), backbone=Own())[0]
 

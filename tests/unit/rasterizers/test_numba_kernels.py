@@ -21,7 +21,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, RECORD, RED
 from crossgrad_plugins.rasterizers.numba_kernels.records import log2_of
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
-from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade
+from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import sh_forward
 
 BLACK = np.zeros(3, np.float32)
 FOCAL = 100.0
@@ -346,7 +346,7 @@ def test_what_nobody_asks_the_harmonics_changes_no_other_gradient(degree, rows):
     size = (40, 30)
     dc, rest = harmonics(200, 3)
     base = cloud(200, size, seed=6)
-    given = replace(base, colors=None, dc=dc, rest=rest, degree=degree, by_rows=rows)
+    given = replace(base, colors=None, dc=dc, rest=rest, degree=degree, sparse_rows=rows)
     frame = forward(
         replace(given, bring=lambda _: None), camera(*size), BLACK, DrawOptions(max_alpha=0.999)
     )
@@ -396,7 +396,7 @@ def basis_values(directions, k):
     records = np.zeros(count * RECORD, np.float32)
     sizes = np.array([min(CHUNK, count - chunk * CHUNK) for chunk in range(chunks)])
     share(
-        shade,
+        sh_forward,
         3, np.zeros(3), directions.astype(np.float32), dc, rest, sizes,
         np.arange(count, dtype=np.int32), records, np.ones(count, np.int32),
     )  # fmt: skip

@@ -165,7 +165,7 @@ def parameters_after(path, reader):
         # Steps by size are up to five times as long, and so is what rounding makes of them, those
         # of sizes in a hurry twice; a first moment of few steps averages less of it.
         backbone={"name": "vanilla", "lr_scales": 0.0025},
-        position_steps="extent",
+        position_lr="extent",
         beta1=0.9,
         threads=1,
         start={"name": "sfm"},

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossgrad_core.contract.contexts import Draw, ScaleContext
-from crossgrad_core.contract.pace import ViewPlan
+from crossgrad_core.contract.contexts import ScaleContext, ViewSample
+from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import Counting, Schedule
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import PluginState
@@ -75,7 +75,7 @@ ALIKE, APART = scene_of(4, 4), scene_of(2, 12)
 def asked(resolution, schedule, step, state=None, scene=APART, views=(0, 8)):
     """Scales of a far and a near view, and the state."""
     fields = {**step_fields(step), "schedule": schedule, "scene": scene}
-    context = ScaleContext(**fields, draw=Draw(tuple(views)), last=None)
+    context = ScaleContext(**fields, draw=ViewSample(tuple(views)), last=None)
     return resolution.scales(context, state or PluginState())
 
 
@@ -157,7 +157,7 @@ def test_regimes_have_scales_of_their_own_where_their_spectra_differ(scene, per_
     photos = {name: each.photos for name, each in resolution.courses.items()}
     assert sum(photos.values()) == len(scene.train_views)
     schedule = Schedule.for_run(3000)
-    (text,) = resolution.remarks(schedule)
+    (text,) = resolution.messages(schedule)
     assert text.startswith("resolution: far 1/" if len(names) == 2 else "resolution: 1/")
     # Blurred photos keep their spectrum at a coarser scale, and so they stay there for longer.
     (far, near), _ = asked(resolution, schedule, 1100, scene=scene)
@@ -233,7 +233,7 @@ def test_views_have_their_full_size_from_the_end_of_density_control_on(name, tot
     assert window_of(schedule, 0.25) == total / 4
 
 
-PLANS = [ViewPlan(), ViewPlan((3,)), ViewPlan((1, 4), (0.3,))]
+PLANS = [ViewsPerStepSpec(), ViewsPerStepSpec((3,)), ViewsPerStepSpec((1, 4), (0.3,))]
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
@@ -270,7 +270,7 @@ def test_no_scale_falls_when_the_length_of_a_run_changes(resolution, lengths, se
     schedule, state, last = Schedule.for_run(lengths[0]), PluginState(), (0.0, 0.0)
     step = 0
     for length in lengths:
-        schedule = schedule.lengthened(Schedule.for_run(max(length, step + 1)), step)
+        schedule = schedule.with_length(Schedule.for_run(max(length, step + 1)), step)
         for _ in range(8):
             step = min(schedule.total, step + int(rng.integers(1, 60)))
             scales, state = asked(resolution, schedule, step, state)
@@ -286,7 +286,7 @@ def test_octaves_are_a_quarter_then_a_half_then_all():
         replace(v, camera=v.camera.resized(800, 600)) for v in APART.views))  # fmt: skip
     scales = [asked(resolution, schedule, step, scene=scene)[0][0] for step in range(1, 101)]
     assert scales == [0.25] * 20 + [0.5] * 30 + [1.0] * 50
-    assert resolution.remarks(schedule) == (
+    assert resolution.messages(schedule) == (
         "resolution: 1/4 to step 20, 1/2 from step 21, full size from step 51; "
         "no side is below 96 pixels",
     )
@@ -301,7 +301,7 @@ def test_octaves_are_a_quarter_then_a_half_then_all():
     ],
 )
 def test_a_size_may_be_left_out(options, text):
-    (told,) = Octaves(**options).remarks(Schedule.for_run(100))
+    (told,) = Octaves(**options).messages(Schedule.for_run(100))
     assert told == f"resolution: {text}; no side is below 96 pixels"
 
 
@@ -312,7 +312,7 @@ def test_sizes_out_of_order_are_refused():
 
 def test_the_steps_of_the_note_are_those_of_the_scales():
     resolution, schedule = Spectral().fitted_to(APART), Schedule.for_run(2000)
-    (text,) = resolution.remarks(schedule)
+    (text,) = resolution.messages(schedule)
     told = dict(zip(("far", "near"), text.removeprefix("resolution: ").split("; "), strict=True))
     for place, (name, line) in enumerate(told.items()):
         coarsest, half, full = (part.split()[-1] for part in line.split(", "))

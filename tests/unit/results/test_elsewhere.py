@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from crossgrad_core.run.elsewhere import SAME_DIRECTION, SAME_PLACE, _are_trained
+from crossgrad_core.run.cross_capture import SAME_DIRECTION, SAME_PLACE, _are_trained
 from crossgrad_core.testing.posed import posed_view
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.afterwards.places import writing_if_possible
+from crossgrad_core.run.postprocess.output_paths import writing_if_possible
 from crossgrad_core.run.results.lock import FILE, RunInUseError, locked, writer_of
 
 HOLD = """

@@ -41,7 +41,7 @@ def test_a_resumed_run_begins_where_it_stopped():
 
 
 def test_progress_is_measured_against_the_newest_length():
-    pace = Pace(total=1000).after(record(300)).lengthened(600)
+    pace = Pace(total=1000).after(record(300)).with_length(600)
     assert "step 300/600 (50 %)" in progress_line(pace)
 
 
@@ -94,10 +94,10 @@ def test_log_holds_what_the_run_says(tmp_path: Path):
     hook.crossgrad_run_start(run=run)
     for step in range(1, 5):
         hook.crossgrad_step_end(record=record(step))
-    hook.crossgrad_message(text="first\n\nthird")
+    hook.crossgrad_log(text="first\n\nthird")
     hook.crossgrad_evaluation(report=EvaluationReport(4, {"psnr": 20.0, "ssim": 0.5}))
-    hook.crossgrad_length(step=4, total=50)
-    hook.crossgrad_length(step=5, total=60)
+    hook.crossgrad_length_changed(step=4, total=50)
+    hook.crossgrad_length_changed(step=5, total=60)
     hook.crossgrad_run_end(status="stopped")
     lines = (tmp_path / "log.txt").read_text().splitlines()
     assert all(line.startswith("09:08:07") for line in lines)

@@ -4,7 +4,7 @@ from math import nan
 
 import pytest
 
-from crossgrad_core.run.ending import WORSE, overdone
+from crossgrad_core.run.finish import WORSE, overdone
 
 
 def rows_of(*figures):

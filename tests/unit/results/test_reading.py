@@ -17,7 +17,7 @@ from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row
 from crossgrad_core.run.results.per_view import write_per_view
 from crossgrad_core.run.results.reading import find_runs, read_run
 from crossgrad_core.run.results.summary import Summary, write_summary
-from crossgrad_core.training.clock import PHASES, Clock, Laps
+from crossgrad_core.training.clock import PHASES, Clock, PhaseTimer
 
 RUNS = 60
 PROGRAM = """
@@ -116,7 +116,7 @@ def test_another_folder_is_refused(tmp_path: Path):
 
 
 def test_phases_of_a_step_add_up_and_leave_out_what_is_left_out():
-    clock, laps = Clock(), Laps()
+    clock, laps = Clock(), PhaseTimer()
     laps.lap("decode")
     laps.lap("render")
     laps.lap("decode")

@@ -316,7 +316,7 @@ def test_the_margin_is_where_no_training_photo_looks_that_shows_as_far():
         pixels, depth = view.camera.project(beyond)
         shown = ((pixels >= 0) & (pixels <= [WIDTH, HEIGHT])).all(axis=1) & (depth > 0)
         assert not shown.any()
-    told = Filled(margin=0.5).remarks(scene)
+    told = Filled(margin=0.5).messages(scene)
     assert told == (
         f"start: {len(inner.positions)} Gaussians fill what photos show without points, "
         f"{len(beyond)} stand beyond their edges",
@@ -348,7 +348,7 @@ def test_the_margin_goes_on_behind_what_another_photo_sees_before_it(away, hides
 def test_photos_that_say_nothing_are_left_aside():
     scene = ground_scene(LEFT, seen=np.arange(7))
     assert Filled().more_points(scene) is None
-    assert "2 photos with fewer than 8 points were left aside" in Filled().remarks(scene)[0]
+    assert "2 photos with fewer than 8 points were left aside" in Filled().messages(scene)[0]
     hidden = ground_scene(LEFT)
     views = tuple(
         replace(view, photo=Picture(view.camera, hidden=True)) for view in hidden.train_views

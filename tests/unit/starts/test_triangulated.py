@@ -45,7 +45,7 @@ def test_points_lie_among_those_of_colmap_and_have_their_colour(scene, bare):
     assert np.isnan(more.sizes).all()
     begun = FEW.begun(bare)
     assert begun.points.tobytes() == more.positions.tobytes()
-    assert f"{len(more.positions)} points triangulated" in FEW.remarks(bare)[0]
+    assert f"{len(more.positions)} points triangulated" in FEW.messages(bare)[0]
 
 
 def test_it_answers_alike(bare):
@@ -55,7 +55,7 @@ def test_it_answers_alike(bare):
 
 def test_a_scene_with_points_starts_from_those(scene):
     assert Triangulated().more_points(scene) is None
-    assert "has points" in Triangulated().remarks(scene)[0]
+    assert "has points" in Triangulated().messages(scene)[0]
 
 
 def test_without_points_the_start_or_the_user_has_to_give_some(bare):

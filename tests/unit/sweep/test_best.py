@@ -9,7 +9,7 @@ from crossgrad_plugins.sweep.app import Request, Sweep
 from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.grid import choices, read_grid, scene_name
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.standing import Standing
+from crossgrad_plugins.sweep.run_status import Standing
 
 GRID = """
 name: tuning

@@ -9,8 +9,8 @@ import pytest
 from support.run_folders import RunFolder
 
 from crossgrad_core.commands import UserError
-from crossgrad_plugins.compare.source import read_runs
-from crossgrad_plugins.sweep.standing import is_finished
+from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.sweep.run_status import is_finished
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "kept.py"
 

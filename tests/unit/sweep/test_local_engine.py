@@ -12,7 +12,7 @@ from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.machine import Machine
 from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.standing import standings
+from crossgrad_plugins.sweep.run_status import standings
 
 GIB = 2**30
 

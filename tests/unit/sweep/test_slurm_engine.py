@@ -10,7 +10,7 @@ from crossgrad_plugins.sweep.engines import Work, engine
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.layout import Layout
 from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.standing import standings
+from crossgrad_plugins.sweep.run_status import standings
 
 pytest.importorskip("submitit")
 

@@ -11,13 +11,13 @@ from crossgrad_core.testing.densifiers import DENSIFIER_CHECKS, DensifierRun
 
 SAMPLER = """
 import sys
-from crossgrad_core.plugin import Draw, PluginState, Sampler, hookimpl
+from crossgrad_core.plugin import ViewSample, PluginState, Sampler, hookimpl
 
 class Fixed(Sampler):
     '''Draws the first views.'''
 
     def sample(self, context, state):
-        return Draw(tuple(range(context.views_per_step))), state
+        return ViewSample(tuple(range(context.views_per_step))), state
 
 class Ends(Fixed):
     def sample(self, context, state):

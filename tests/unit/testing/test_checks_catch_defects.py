@@ -169,7 +169,9 @@ class InTurn(api.Sampler):
         views = tuple((start + k) % number for k in range(context.views_per_step))
         groups = context.groups
         labels = None if groups is None else tuple(groups[view] for view in views)
-        return api.Draw(views, labels), api.PluginState({"start": start + context.views_per_step})
+        return api.ViewSample(views, labels), api.PluginState(
+            {"start": start + context.views_per_step}
+        )
 
 
 class UsualViewsRefused(InTurn):
@@ -179,32 +181,32 @@ class UsualViewsRefused(InTurn):
 class OneViewTooFew(InTurn):
     def sample(self, context, state):
         draw, state = super().sample(context, state)
-        return api.Draw(draw.views[1:]), state
+        return api.ViewSample(draw.views[1:]), state
 
 
 class NumpyPositions(InTurn):
     def sample(self, context, state):
         draw, state = super().sample(context, state)
-        return api.Draw(tuple(np.array(draw.views))), state
+        return api.ViewSample(tuple(np.array(draw.views))), state
 
 
 class BeyondTheEnd(InTurn):
     def sample(self, context, state):
         draw, state = super().sample(context, state)
-        return api.Draw(tuple(view + 1 for view in draw.views)), state
+        return api.ViewSample(tuple(view + 1 for view in draw.views)), state
 
 
 class NeverTheFirst(InTurn):
     def sample(self, context, state):
         draw, state = super().sample(context, state)
-        return api.Draw(tuple(view or 1 for view in draw.views)), state
+        return api.ViewSample(tuple(view or 1 for view in draw.views)), state
 
 
 class GlobalDraws(InTurn):
     def sample(self, context, state):
         number = len(context.scene.train)
         views = np.random.randint(number, size=context.views_per_step)  # noqa: NPY002
-        return api.Draw(tuple(int(view) for view in views)), state
+        return api.ViewSample(tuple(int(view) for view in views)), state
 
 
 class RemembersOnItself(InTurn):
@@ -213,7 +215,7 @@ class RemembersOnItself(InTurn):
     def sample(self, context, state):
         self.seen.append(1)
         number = len(context.scene.train)
-        return api.Draw((len(self.seen) % number,) * context.views_per_step), state
+        return api.ViewSample((len(self.seen) % number,) * context.views_per_step), state
 
 
 class ChangesItsState(InTurn):
@@ -302,7 +304,7 @@ class Flickers(Torch):
 
 
 class AsksForNoRows(Torch):
-    by_rows: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
 
 
 class LessOpaque(Torch):
@@ -470,7 +472,7 @@ class Drifts(Vanilla):
 
 
 class ReadsWhatItPassesOn(Vanilla):
-    passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
+    passthrough: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
 
     def decode(self, parameters, camera, phase):
         gaussians = super().decode(parameters, camera, phase)
@@ -479,7 +481,7 @@ class ReadsWhatItPassesOn(Vanilla):
 
 
 class HandsOverACopy(Vanilla):
-    passed_on: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
+    passthrough: ClassVar[Mapping[str, str]] = {"sh_dc": "f_dc"}
 
     def decode(self, parameters, camera, phase):
         return replace(super().decode(parameters, camera, phase), sh_dc=parameters["f_dc"].clone())
@@ -600,7 +602,7 @@ class DropsAView(api.Observer):
     @api.hookimpl(wrapper=True)
     def crossgrad_sample_views(self, context):
         sampled = yield
-        return replace(sampled, draw=api.Draw(sampled.draw.views[:1]))
+        return replace(sampled, draw=api.ViewSample(sampled.draw.views[:1]))
 
 
 class ScalesBeyondOne(api.Observer):
@@ -619,7 +621,7 @@ class NoScale(api.Observer):
 
 class ObjectsInOneText(api.Observer):
     @api.hookimpl
-    def crossgrad_objections(self, selection):
+    def crossgrad_validate_selection(self, selection):
         return f"{selection.names['backbone']} is not for me"
 
 
@@ -650,28 +652,28 @@ class BareLoss(api.Observer):
 class LossOfEachPrimitive(api.Observer):
     @api.hookimpl
     def crossgrad_regularize(self, context):
-        return api.Regularized(context.parameters["scales"].mean(dim=1))
+        return api.RegularizeResult(context.parameters["scales"].mean(dim=1))
 
 
 class LossOfNothing(api.Observer):
     @api.hookimpl
     def crossgrad_regularize(self, context):
         if context.gaussians is None:
-            return api.Regularized(context.parameters["scales"][:0].mean())
+            return api.RegularizeResult(context.parameters["scales"][:0].mean())
         return None
 
 
 class BareState(api.Observer):
     @api.hookimpl
     def crossgrad_regularize(self, context):
-        term = api.Regularized(context.parameters["scales"].mean())
+        term = api.RegularizeResult(context.parameters["scales"].mean())
         return term.with_state("bare", {"step": context.step})
 
 
 class StateOfSets(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
-        return api.Densified(api.NO_EDIT).with_state("sets", api.PluginState({"seen": {1}}))
+        return api.DensifyResult(api.NO_EDIT).with_state("sets", api.PluginState({"seen": {1}}))
 
 
 class BareEdit(api.Observer):
@@ -683,20 +685,20 @@ class BareEdit(api.Observer):
 class NoEditInside(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
-        return api.Densified(None)
+        return api.DensifyResult(None)
 
 
 class ClampsWhatIsNotThere(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
         scales = context.parameters["scales"].detach().clamp(max=0.0)
-        return api.Densified(api.Edit(values={"scale": api.Rows(scales)}))
+        return api.DensifyResult(api.Edit(values={"scale": api.Rows(scales)}))
 
 
 class CopiesTheParameters(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
-        return None if context.parameters.copy() else api.Densified(api.NO_EDIT)
+        return None if context.parameters.copy() else api.DensifyResult(api.NO_EDIT)
 
 
 class LooksAtSingleViews(api.Observer):
@@ -738,7 +740,7 @@ class CountsSingleViews(api.Operator):
 
     def aggregate(self, context, state):
         count = int(context.separate.present().sum())
-        return api.Aggregated(context.gradients.total(), {"present": count}), state
+        return api.AggregateResult(context.gradients.total(), {"present": count}), state
 
 
 class FillsBareScenesWithNothing(load("starts", "sfm")):
@@ -756,7 +758,7 @@ class TremblesByItself(api.Observer):
     def crossgrad_after_step(self, context):
         means = context.parameters["means"].detach()
         noise = 1e-3 * torch.randn_like(means)
-        return api.Densified(api.Edit(values={"means": api.Rows(means + noise)}))
+        return api.DensifyResult(api.Edit(values={"means": api.Rows(means + noise)}))
 
 
 class ClampsInPlace(api.Observer):
@@ -767,13 +769,13 @@ class ClampsInPlace(api.Observer):
 
 class Renders(api.Observer):
     @api.hookimpl
-    def crossgrad_model(self, model):
+    def crossgrad_model_ready(self, model):
         assert model.render(0, 0.5).loss.isfinite()
 
 
 class Shifts(api.Observer):
     @api.hookimpl
-    def crossgrad_model(self, model):
+    def crossgrad_model_ready(self, model):
         model.parameters["means"].data.add_(1.0)
 
 
@@ -781,13 +783,13 @@ class KeepsATuple(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
         state = api.PluginState({"range": (0.0, 1.0)})
-        return api.Densified(api.NO_EDIT).with_state("range", state)
+        return api.DensifyResult(api.NO_EDIT).with_state("range", state)
 
 
 class CountsInNumpy(api.Observer):
     @api.hookimpl
     def crossgrad_after_step(self, context):
-        return api.Densified(api.Edit(counts={"clamped": np.int64(3)}))
+        return api.DensifyResult(api.Edit(counts={"clamped": np.int64(3)}))
 
 
 class FitsToItself(NoExposure):

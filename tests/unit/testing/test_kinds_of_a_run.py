@@ -75,7 +75,7 @@ class KindsOfTheModel(Kinds):
     """Likewise."""
 
     @hookimpl
-    def crossgrad_model(self, model):
+    def crossgrad_model_ready(self, model):
         self.note(model)
 
 

@@ -28,7 +28,7 @@ class EndsTheProgram(api.Observer):
 
 class ShiftsLate(api.Observer):
     @api.hookimpl
-    def crossgrad_model(self, model):
+    def crossgrad_model_ready(self, model):
         if model.phase.step >= 100:
             model.parameters["means"].data.add_(1.0)
 
@@ -54,7 +54,7 @@ class NoLossLate(api.Observer):
     @api.hookimpl
     def crossgrad_regularize(self, context):
         term = context.parameters["means"].mean()
-        return api.Regularized(term * torch.nan if context.step > 10 else term)
+        return api.RegularizeResult(term * torch.nan if context.step > 10 else term)
 
 
 class RemembersAll(api.Observer):
@@ -77,7 +77,7 @@ class KeepsTensors(api.Observer):
     _kept: list[torch.Tensor] = PrivateAttr(default_factory=list)
 
     @api.hookimpl
-    def crossgrad_model(self, model):
+    def crossgrad_model_ready(self, model):
         self._kept.append(torch.zeros(100_000))
 
 

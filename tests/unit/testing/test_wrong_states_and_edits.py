@@ -22,12 +22,12 @@ def longer(context, state):
 class Hoards(api.Sampler):
     def sample(self, context, state):
         drawn = context.rng.integers(len(context.scene.train), size=context.views_per_step)
-        return api.Draw(tuple(map(int, drawn))), longer(context, state)
+        return api.ViewSample(tuple(map(int, drawn))), longer(context, state)
 
 
 class Unlabelled(api.Sampler):
     def sample(self, context, state):
-        return api.Draw((0,) * context.views_per_step), state
+        return api.ViewSample((0,) * context.views_per_step), state
 
 
 class HoardsScales(FullSize):
@@ -88,7 +88,7 @@ class RepeatsOne(NoDensification):
 @pytest.mark.parametrize(
     ("check", "make", "words"),
     [
-        (samplers.draws_hand_on_the_groups, Unlabelled, "a Draw without labels"),
+        (samplers.draws_hand_on_the_groups, Unlabelled, "a ViewSample without labels"),
         (samplers.states_stay_bounded, Hoards, "that sample returns grows for ever"),
         (resolutions.states_stay_bounded, HoardsScales, "that scales returns grows for ever"),
         (densifiers.states_stay_bounded, HoardsEdits, "that densify returns grows for ever"),

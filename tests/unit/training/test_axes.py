@@ -17,9 +17,9 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.contents import Checkpoint
+from crossgrad_core.run.checkpoint_io import check_settings, settings_of
 from crossgrad_core.run.migration import migrated
-from crossgrad_core.run.persist import check_settings, settings_of
-from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.axes import LIMIT, _usual, step_along_axes
 from crossgrad_core.training.rates import axes_of
@@ -201,10 +201,10 @@ def setup_of(backbone="vanilla", **settings):
         ({}, True),
         ({"steps": 29_999}, True),
         ({"steps": 30_000}, False),
-        ({"steps": 30_000, "position_steps": "size"}, True),
-        ({"position_steps": "extent"}, False),
+        ({"steps": 30_000, "position_lr": "per-axis"}, True),
+        ({"position_lr": "extent"}, False),
         ({"preset": "inria"}, False),
-        ({"preset": "inria", "position_steps": "size"}, True),
+        ({"preset": "inria", "position_lr": "per-axis"}, True),
         ({"schedule": "absolute"}, False),
         ({"schedule": "absolute", "reference": 10}, True),
     ],
@@ -216,15 +216,15 @@ def test_short_runs_step_by_size(settings, by_size):
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_a_step_moves_positions_along_the_axes(backbone):
     moved = {}
-    for way in ("extent", "size"):
-        setup = setup_of(backbone, position_steps=None if backbone in ANCHORS else way)
+    for way in ("extent", "per-axis"):
+        setup = setup_of(backbone, position_lr=None if backbone in ANCHORS else way)
         state = first_state(setup)
         names = setup.backbone.axes and (setup.backbone.positions, *setup.backbone.axes)
         before = {name: tensor.detach().clone() for name, tensor in state.parameters.items()}
         take_step(setup, state)
         after = {name: tensor.detach() for name, tensor in state.parameters.items()}
         moved[way] = before, after, names
-    before, after, names = moved["size"]
+    before, after, names = moved["per-axis"]
     if backbone in ANCHORS:
         assert axes_of(setup) is None
         return
@@ -242,18 +242,18 @@ def test_a_step_moves_positions_along_the_axes(backbone):
 @pytest.mark.parametrize("backbone", sorted(ANCHORS))
 def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
     setup = setup_of(backbone)
-    config = setup.config.model_copy(update={"position_steps": "size"})
+    config = setup.config.model_copy(update={"position_lr": "per-axis"})
     with pytest.raises(UserError, match="no Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)
 
 
 def test_runs_of_before_go_on_as_they_began(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["position_steps"] == "extent"
-    assert "position_steps" not in migrated({}, tmp_path)
+    assert migrated({"revisions": []}, tmp_path)["position_lr"] == "extent"
+    assert "position_lr" not in migrated({}, tmp_path)
     # A setting that a checkpoint does not know yet is none that was changed.
     config = setup_of().config
     stored = settings_of(config)
-    del stored["position_steps"]
+    del stored["position_lr"]
     # A component, and an option of one, are known all the same.
     given = config.model_copy(update={"grouping": ComponentChoice(name="altitude")})
     fields = {name: {} for name in ("parameters", "exp_avg", "exp_avg_sq", "adam_steps")}

@@ -17,7 +17,7 @@ from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.run import select as selecting
-from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state

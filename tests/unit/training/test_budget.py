@@ -19,14 +19,14 @@ from crossgrad_core.training.budget import (
     Timed,
     _fitting,
     _without_edits,
-    caught_up,
-    lengthened,
+    replay_length,
     seconds_ahead,
     steps_for,
+    with_length,
 )
 from crossgrad_core.training.clock import Clock
-from crossgrad_core.training.expected_cost import Crowd, cost_of_run, growth_ahead
-from crossgrad_core.training.room import curve, usual_budget
+from crossgrad_core.training.expected_cost import PrimitiveCounts, cost_of_run, growth_ahead
+from crossgrad_core.training.growth_budget import curve, usual_budget
 from crossgrad_core.training.schedules import growth_note
 
 
@@ -36,10 +36,10 @@ class Hook:
     def __init__(self):
         self.lengths, self.texts = [], []
 
-    def crossgrad_length(self, step, total):
+    def crossgrad_length_changed(self, step, total):
         self.lengths.append((step, total))
 
-    def crossgrad_message(self, text):
+    def crossgrad_log(self, text):
         self.texts.append(text)
 
 
@@ -70,7 +70,7 @@ def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
 
 
 #: As many primitives as at the start.
-CROWD = Crowd(start=1000, present=1000)
+CROWD = PrimitiveCounts(start=1000, present=1000)
 
 
 def reached(step, present=1000):
@@ -140,7 +140,7 @@ def test_probed_steps_gather_statistics_and_have_all_bands(monkeypatch, name, vi
 def along_the_curve(steps, start):
     """A run whose growth follows the curve, on the sample scene."""
     run = assemble(RunConfig(steps=steps, views=2), sample_scene(), "none")
-    return run, Crowd(start, start)
+    return run, PrimitiveCounts(start, start)
 
 
 def test_growth_along_the_curve_costs_what_the_curve_adds():
@@ -156,7 +156,7 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
     mean = sum(n * (empty + count) for n, count in zip(steps, counts, strict=True)) / 1000
     assert growth_ahead(run, crowd, run.schedule, 0) == pytest.approx(mean / (empty + 30_000))
     # What was not added is not counted on: half-way the run has fewer than the curve allows.
-    behind = growth_ahead(run, Crowd(30_000, 31_000), run.schedule, ends[-4])
+    behind = growth_ahead(run, PrimitiveCounts(30_000, 31_000), run.schedule, ends[-4])
     left = zip(steps[-3:], [31_000, *counts[-2:]], strict=True)
     mean = sum(n * (empty + count) for n, count in left) / sum(steps[-3:])
     assert behind == pytest.approx(mean / (empty + 31_000))
@@ -164,12 +164,12 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
 
 def test_growth_along_the_curve_is_never_taken_for_more_than_free_growth():
     run, _ = along_the_curve(2000, 1)
-    assert growth_ahead(run, Crowd(1, 1), run.schedule, 0) == 2.0
+    assert growth_ahead(run, PrimitiveCounts(1, 1), run.schedule, 0) == 2.0
 
 
 def test_once_density_control_is_over_every_step_costs_the_same():
     run, _ = along_the_curve(2000, 30_000)
-    assert growth_ahead(run, Crowd(30_000, 60_000), run.schedule, 1000) == 1.0
+    assert growth_ahead(run, PrimitiveCounts(30_000, 60_000), run.schedule, 1000) == 1.0
 
 
 def test_without_density_control_every_step_costs_the_same():
@@ -238,10 +238,10 @@ def test_the_written_lengths_repeat_the_schedule_of_every_step():
     revisions = run.config.revisions
     assert list(revisions) == run.hook.lengths
     start = replace(run, schedule=Schedule.for_run(3000))
-    assert caught_up(start, 10**9).schedule == run.schedule
+    assert replay_length(start, 10**9).schedule == run.schedule
     step = revisions[3][0]
-    assert caught_up(start, step - 1).schedule.total == revisions[2][1]
-    assert caught_up(start, step).schedule.total == revisions[3][1]
+    assert replay_length(start, step - 1).schedule.total == revisions[2][1]
+    assert replay_length(start, step).schedule.total == revisions[3][1]
 
 
 def test_a_length_that_fits_stays():
@@ -263,13 +263,13 @@ def growth_notes(run):
 def test_notes_that_the_clock_overtakes_are_withdrawn():
     run = noted(setup(steps=935))
     assert len(growth_notes(run)) == 1
-    longer = lengthened(run, 100, 3000)
+    longer = with_length(run, 100, 3000)
     assert growth_notes(longer) == []
     assert longer.notes[-1] == "the length followed the clock: 3000 steps instead of 935"
-    shorter = lengthened(longer, 200, 900)
+    shorter = with_length(longer, 200, 900)
     assert growth_notes(shorter) == list(growth_note(shorter)) != []
     assert shorter.notes[-1] == "the length followed the clock: 900 steps instead of 935"
-    back = lengthened(shorter, 300, 935)
+    back = with_length(shorter, 300, 935)
     assert back.notes == run.notes
 
 
@@ -374,7 +374,7 @@ def test_the_probe_tells_what_goes_with_the_pixels(monkeypatch, name, views):
 def test_photos_that_were_reduced_stay_when_the_length_changes():
     run = assemble(RunConfig(steps=400), sample_scene(), "none")
     run = replace(run, config=run.config.model_copy(update={"revisions": ((3, 500),)}))
-    assert caught_up(run, 4).scaled_photos is run.scaled_photos
+    assert replay_length(run, 4).scaled_photos is run.scaled_photos
 
 
 def test_the_note_on_scales_is_that_of_the_length_that_holds():
@@ -383,7 +383,7 @@ def test_the_note_on_scales_is_that_of_the_length_that_holds():
     told = [note for note in run.notes if note.startswith("resolution")]
     assert told == [octaves_note(200, 400)]
     config = run.config.model_copy(update={"revisions": ((3, 500), (9, 600))})
-    longer = caught_up(replace(run, config=config), 20)
+    longer = replay_length(replace(run, config=config), 20)
     told = [note for note in longer.notes if note.startswith("resolution")]
     assert told == [octaves_note(120, 240)]
 

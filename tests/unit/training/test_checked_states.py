@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.contexts import Densified
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import DensifyResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.failure import TrainingFailedError
 from crossgrad_core.training.loop import CHECK_EVERY, train
@@ -42,7 +42,7 @@ class Poison:
         opacities[0] = -30.0
         colors = context.parameters["f_dc"].detach().clone()
         colors[0] = float("nan")
-        return Densified(Edit(values={"opacities": Rows(opacities), "f_dc": Rows(colors)}))
+        return DensifyResult(Edit(values={"opacities": Rows(opacities), "f_dc": Rows(colors)}))
 
 
 class Watching:
@@ -143,7 +143,7 @@ def test_a_signal_after_the_look_leaves_a_good_state():
 
 def test_too_many_dropped_gradients_leave_a_good_state():
     sink = Watching()
-    setup = watched(Poison(7), sink, max_dropped=1)
+    setup = watched(Poison(7), sink, max_nonfinite_blocks=1)
     state = first_state(setup)
     state.counters.dropped = 1
     with pytest.raises(TrainingFailedError, match="dropped"):

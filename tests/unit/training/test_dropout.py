@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.contexts import Draw
+from crossgrad_core.contract.contexts import ViewSample
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.run.migration import migrated
-from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_core.training.dropout import DROPOUT, FEW_PHOTOS, dropped, photos_per_point
-from crossgrad_core.training.on_request import OnRequest
+from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.views import render_views
@@ -82,13 +82,13 @@ def test_no_share_is_no_change_and_no_draw():
 def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
     setup = setup_of(dropout=0.5)
     state = first_state(setup)
-    rendered, _ = render_views(setup, state, Draw((0,)), (1.0,))
+    rendered, _ = render_views(setup, state, ViewSample((0,)), (1.0,))
     left_out = rendered.records[0].gaussians.opacities == 0.0
     assert 0 < int(left_out.sum()) < len(left_out)
     part = dropped(setup, state, decoded(setup, state))
     (gradient,) = torch.autograd.grad(part.opacities.sum(), [state.parameters["opacities"]])
     assert torch.equal(gradient == 0.0, part.opacities == 0.0)
-    asked = OnRequest(setup, state, counted=False)(0)
+    asked = RenderCallback(setup, state, counted=False)(0)
     assert torch.equal(asked.gaussians.opacities, decoded(setup, state).opacities)
 
 

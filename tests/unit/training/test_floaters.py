@@ -15,9 +15,10 @@ from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.resolve import resolved
-from crossgrad_core.run.settings_for_nothing import refuse_settings_for_nothing
+from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.training.averaging import STATE, eval_parameters
 from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import (
     EMPTY,
@@ -28,7 +29,6 @@ from crossgrad_core.training.floaters import (
     told_of,
 )
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.steady import STATE, shown
 from crossgrad_core.training.step import take_step
 
 BACKBONES = sorted(n for n, e in entries("backbones").items() if e.distribution == "crossgrad")
@@ -131,12 +131,12 @@ def test_moments_states_and_the_average_come_along():
     state.commit({"other": PluginState(per_primitive={"rows": rows})})
     gone = floaters(setup, state)
     kept = np.setdiff1d(np.arange(state.primitives(setup)), gone.numpy())
-    wanted = {name: t.detach()[kept] for name, t in shown(state).items()}
+    wanted = {name: t.detach()[kept] for name, t in eval_parameters(state).items()}
     moments = {name: t[kept] for name, t in state.adam.exp_avg_sq.items()}
     assert cleaned(setup, state) == len(gone) > 0
     assert state.states[STATE].values == {"count": 3}
     assert state.states["other"].per_primitive["rows"].tolist() == kept.tolist()
-    assert all(torch.equal(shown(state)[name].detach(), t) for name, t in wanted.items())
+    assert all(torch.equal(eval_parameters(state)[name].detach(), t) for name, t in wanted.items())
     assert all(torch.equal(state.adam.exp_avg_sq[name], t) for name, t in moments.items())
     take_step(setup, state)
 

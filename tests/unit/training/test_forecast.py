@@ -8,7 +8,7 @@ import pytest
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run.forecast import LOOK_STEPS, Forecast
+from crossgrad_core.run.eta import LOOK_STEPS, Forecast
 from crossgrad_core.run.results.lines import roughly
 from crossgrad_core.training.budget import Planned
 from crossgrad_core.training.clock import Clock
@@ -34,8 +34,8 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
     """What a run says whose steps take `each` seconds, the first one `wait` more."""
     said, revised = [], []
     hook = SimpleNamespace(
-        crossgrad_message=lambda text: said.append((state.step, text)),
-        crossgrad_length=lambda step, total: revised.append((step, total)),
+        crossgrad_log=lambda text: said.append((state.step, text)),
+        crossgrad_length_changed=lambda step, total: revised.append((step, total)),
     )
     run = RUN(
         config=RunConfig(steps=steps, growth="free"),

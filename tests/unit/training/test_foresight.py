@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.contexts import Draw, StepRecord
+from crossgrad_core.contract.contexts import StepRecord, ViewSample
 from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import WIDTH, sample_scene
-from crossgrad_core.training.foresight import Foresight
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.view_prefetch import Prefetcher
 
 SAMPLERS = ("random", "epoch", "near-far", "fps", "horizon", "random-split", "three-way")
 
@@ -41,7 +41,7 @@ def setup_of(sampler, **changes):
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
     setup = setup_of(sampler)
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(12):
         foresight.look(state)
         expected = list(setup.photos_ahead.names[-1])
@@ -54,7 +54,7 @@ def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
 @pytest.mark.parametrize("sampler", [*SAMPLERS, "active"])
 def test_looking_ahead_touches_nothing(sampler):
     setup = setup_of(sampler)
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(6):
         before = deepcopy((state.states.get("sampler"), state.rngs, state.step))
         foresight.look(state)
@@ -66,7 +66,7 @@ def test_looking_ahead_touches_nothing(sampler):
 
 def test_a_step_that_drew_something_else_begins_the_guess_anew():
     setup = setup_of("random")
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
     foresight.look(state)
     timed_step(setup, state)
     state.last = replace(state.last, views=(-1, -1))
@@ -85,7 +85,7 @@ def test_views_in_an_array_are_foreseen():
         return replace(draw, views=np.array(draw.views)), state
 
     object.__setattr__(setup.sampler, "sample", as_array)
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(3):
         foresight.look(state)
         drawn = timed_step(setup, state).names
@@ -96,15 +96,15 @@ def test_views_in_an_array_are_foreseen():
 @pytest.mark.parametrize("views", [(99,), None])
 def test_nothing_is_foreseen_of_views_that_are_not_there(views):
     setup = setup_of("random")
-    wrong = Draw(views)
+    wrong = ViewSample(views)
     object.__setattr__(setup.sampler, "sample", lambda *_: (wrong, EMPTY_STATE))
-    Foresight(setup).look(first_state(setup))
+    Prefetcher(setup).look(first_state(setup))
     assert setup.photos_ahead.names == []
 
 
 def test_nothing_is_foreseen_of_a_sampler_that_fails():
     setup = setup_of("random")
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
 
     def fail(*_):
         raise ValueError
@@ -127,7 +127,7 @@ def test_photos_that_are_kept_in_the_size_they_are_taken_from_are_not_decoded(re
     odd, asked = {view.name for view in setup.train_views[1::2]}, []
     state = first_state(setup)
     state.last = StepRecord(0, (0,), ("",), None, (0.1,), 1, {}, 0.0, scales=(0.5,))
-    Foresight(setup).look(state)
+    Prefetcher(setup).look(state)
     assert set(asked) == {width}
     (expected,) = setup.photos_ahead.names
     assert expected and not odd & set(expected)

@@ -11,22 +11,22 @@ import torch
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.adam_state import AdamRule, AdamState
-from crossgrad_core.contract.contexts import Regularized
+from crossgrad_core.contract.contexts import RegularizeResult
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
-from crossgrad_core.gradients.by_rows import by_rows, dense, rows_of, tidy, values_of
+from crossgrad_core.gradients.sparse_rows import coalesced, dense, rows_of, sparse_rows, values_of
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
 from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.late import Late
-from crossgrad_core.training.keeper import Keeper
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.rollback import RollbackGuard
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Snapshot, TrainState
 from crossgrad_operators.graddrop import GradDrop
@@ -51,7 +51,7 @@ class Both:
         self.adam, self.other, self.late = AdamState(), AdamState(), Late()
 
     def step(self, rows, values, lr, rule, scale=1.0):
-        gradient = by_rows(torch.from_numpy(rows), torch.from_numpy(values), self.whole.shape)
+        gradient = sparse_rows(torch.from_numpy(rows), torch.from_numpy(values), self.whole.shape)
         adam_step(
             {"x": self.whole}, {"x": dense(gradient)}, self.adam, {"x": lr}, rule, {"x": scale}
         )
@@ -204,7 +204,7 @@ class PerView:
     def crossgrad_regularize(self, context):
         if context.gaussians is None or context.step % 5:
             return None
-        return Regularized(1e-3 * context.gaussians.sh_rest.square().sum())
+        return RegularizeResult(1e-3 * context.gaussians.sh_rest.square().sum())
 
     @hookimpl(wrapper=True)
     def crossgrad_densify(self, context):
@@ -263,7 +263,7 @@ class Decay:
     def crossgrad_regularize(self, context):
         if context.gaussians is not None or context.step % 5:
             return None
-        return Regularized(1e-3 * context.parameters["f_rest"].square().sum())
+        return RegularizeResult(1e-3 * context.parameters["f_rest"].square().sum())
 
 
 class Seen:
@@ -321,7 +321,7 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
     lazy, waited = trained(setup_of(**settings), [plugin() for plugin in plugins])
     monkeypatch.setattr(late, "MOST_ROWS", 0.2)
     mixed, _ = trained(setup_of(**settings), [plugin() for plugin in plugins])
-    monkeypatch.setattr(NumbaRasterizer, "by_rows", False)
+    monkeypatch.setattr(NumbaRasterizer, "sparse_rows", False)
     plain, none = trained(setup_of(**settings), [plugin() for plugin in plugins])
     assert none == 0 and (waited > 5 or settings.get("operator") == "graddrop")
     theirs, others = everything(plain)
@@ -339,7 +339,7 @@ def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
     tmp_path, monkeypatch, stop, settings
 ):
     with monkeypatch.context() as patched:
-        patched.setattr(NumbaRasterizer, "by_rows", False)
+        patched.setattr(NumbaRasterizer, "sparse_rows", False)
         whole, none = trained(setup_of(**settings))
     setup = setup_of(**settings)
     first = first_state(setup)
@@ -365,10 +365,10 @@ class Brightened(Vanilla):
 
 
 def test_what_a_backbone_passes_on_is_not_inherited():
-    assert Brightened.passed_on == {} and Vanilla.passed_on
+    assert Brightened.passthrough == {} and Vanilla.passthrough
     setup = setup_of()
     own = replace(setup.selection, backbone=Brightened())
-    assert setup.by_rows and not replace(setup, selection=own).by_rows
+    assert setup.sparse_rows and not replace(setup, selection=own).sparse_rows
 
 
 class Clipped(Sum):
@@ -392,10 +392,15 @@ class Clip:
 
 
 def test_what_an_operator_hands_on_is_not_inherited():
-    assert not Clipped.by_rows and not GradDrop.by_rows and Sum.by_rows and PCGrad.by_rows
+    assert (
+        not Clipped.sparse_rows
+        and not GradDrop.sparse_rows
+        and Sum.sparse_rows
+        and PCGrad.sparse_rows
+    )
     setup = setup_of()
     own = replace(setup.selection, operator=Clipped())
-    assert setup.by_rows and not replace(setup, selection=own).by_rows
+    assert setup.sparse_rows and not replace(setup, selection=own).sparse_rows
 
 
 def test_wrappers_of_the_aggregation_get_dense_gradients():
@@ -406,9 +411,9 @@ def test_wrappers_of_the_aggregation_get_dense_gradients():
 def test_other_sparse_gradients_are_brought_into_order():
     """Rows in any order or twice, as autograd and a wrapper's sums leave them."""
     rows, values = torch.tensor([4, 1, 4]), torch.tensor([[1.0], [2.0], [4.0]])
-    found = tidy(by_rows(rows, values, (6, 1)))
+    found = coalesced(sparse_rows(rows, values, (6, 1)))
     assert rows_of(found).tolist() == [1, 4] and values_of(found).tolist() == [[2.0], [5.0]]
-    assert tidy(dense(found).to_sparse()).tolist() == dense(found).tolist()
+    assert coalesced(dense(found).to_sparse()).tolist() == dense(found).tolist()
 
 
 def behind():
@@ -416,7 +421,7 @@ def behind():
     state = TrainState({"x": torch.ones(3, 2), "y": torch.ones(1)}, AdamState(), {})
     for step in range(3):
         rows = torch.tensor([0, 1, 2] if step == 0 else [0, 2])
-        gradient = by_rows(rows, torch.ones(len(rows), 2), (3, 2))
+        gradient = sparse_rows(rows, torch.ones(len(rows), 2), (3, 2))
         coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
         state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     state.late.finish()
@@ -452,7 +457,7 @@ def test_going_back_forgets_what_was_late(go_back):
     state.rngs = make_streams(0)
     snapshot = Snapshot.of(state)
     kept = state.tensors["x"].clone()
-    gradient = by_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
+    gradient = sparse_rows(torch.tensor([1]), torch.full((1, 2), 9.0), (3, 2))
     coefficients = counted("x", state.tensors["x"], state.moments, 0.1, AdamRule(), 1.0)
     state.late.step("x", state.tensors["x"], gradient, state.moments, coefficients)
     go_back(snapshot, state)
@@ -476,7 +481,7 @@ class Failing:
 def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     state = behind()
     state.rngs = make_streams(0)
-    keeper, kept = Keeper(state), state.parameters["x"].clone()
+    keeper, kept = RollbackGuard(state), state.parameters["x"].clone()
     state.touched = True
     state.late._under_way["x"] = Failing(state.tensors["x"])
     keeper.settle(state)

@@ -8,7 +8,7 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run.opening import parsed
+from crossgrad_core.run.load_run import parsed
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss, ssim_map
 
 RNG = np.random.default_rng(0)
@@ -57,7 +57,7 @@ def test_an_unknown_loss_is_refused_by_name(tmp_path):
 
 
 def test_the_fused_loss_is_what_a_default_run_brings_down(tmp_path):
-    from crossgrad_core.run.opening import set_up
+    from crossgrad_core.run.load_run import set_up
 
     write_tiny_scene(tmp_path / "scene", views=4)
     setup, _ = set_up(parsed({"scene": str(tmp_path / "scene"), "ssim_weight": 0.4}), -1)

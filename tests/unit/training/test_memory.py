@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.results.cost_totals import Totals
 from crossgrad_core.run.results.table import cost_line
-from crossgrad_core.run.results.totals import Totals
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import memory, room, step
+from crossgrad_core.training import growth_budget, memory, step
 from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes
 from crossgrad_core.training.start import first_state
 
@@ -76,7 +76,9 @@ def looked(monkeypatch, available=GIB, **settings):
     demands = []
     room_for = memory.room_for_primitives
     monkeypatch.setattr(
-        room, "room_for_primitives", lambda d, demand: demands.append(demand) or room_for(d, demand)
+        growth_budget,
+        "room_for_primitives",
+        lambda d, demand: demands.append(demand) or room_for(d, demand),
     )
     times = {"densify_from": 1, "densify_until": 9, "densify_every": 2, "events": "steps"}
     given = {"steps": 9, **times, "sh_from": 3}
@@ -129,7 +131,7 @@ def test_where_the_system_does_not_say_nothing_is_shown(monkeypatch):
 
 def test_no_module_of_ours_needs_one_that_only_some_systems_have():
     absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
-    ours = "import crossgrad_core.run.app, crossgrad_core.run.afterwards.figures\n"
+    ours = "import crossgrad_core.run.app, crossgrad_core.run.postprocess.evaluate\n"
     ours += "import crossgrad_plugins.diagnostics.app"
     subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
 

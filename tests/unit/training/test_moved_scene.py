@@ -20,15 +20,15 @@ TIMES = {"events": "steps", "densify_from": 10, "densify_every": 10, "densify_un
 #: How a run steps -> how far apart in PSNR perturbed runs may end. A step by size is up to five
 #: times as long, and so is a difference of the last bit, one of sizes in a hurry twice; a first
 #: moment of few steps averages less.
-WAYS = {"extent": 0.01, "size": 0.03, "as by default": 0.05}
+WAYS = {"extent": 0.01, "per-axis": 0.03, "as by default": 0.05}
 SETTINGS = {
     **{
         way: {
-            "position_steps": way,
+            "position_lr": way,
             "beta1": 0.9,
             "backbone": {"name": "vanilla", "lr_scales": 0.0025},
         }
-        for way in ("extent", "size")
+        for way in ("extent", "per-axis")
     },
     "as by default": {},
 }

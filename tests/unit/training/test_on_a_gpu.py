@@ -68,7 +68,7 @@ class Dense(Rasterizer):
 
 
 class Together(Dense):
-    together: ClassVar[bool] = True
+    batched: ClassVar[bool] = True
 
 
 def blend(gaussians, camera, background, tensors):
@@ -212,7 +212,7 @@ def test_photos_stay_on_the_device_as_far_as_there_is_room(room):
 
 
 class NumbaTogether(NumbaRasterizer):
-    together: ClassVar[bool] = True
+    batched: ClassVar[bool] = True
 
 
 @pytest.mark.parametrize(

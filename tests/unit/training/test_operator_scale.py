@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.contexts import Aggregated
+from crossgrad_core.contract.contexts import AggregateResult
 from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.errors import UserError
@@ -62,7 +62,7 @@ class Halves(Operator):
                 return None
             return sum(views[1:], views[0]) / 2
 
-        return Aggregated(context.gradients.elementwise(half)), state
+        return AggregateResult(context.gradients.elementwise(half)), state
 
 
 class Broken(GramianOperator):
@@ -168,7 +168,7 @@ def test_weights_that_are_not_finite_are_refused_by_name():
 
 class Overflowing(Operator):
     def aggregate(self, context, state):
-        return Aggregated({name: torch.tensor([torch.inf]) for name in TENSORS}), state
+        return AggregateResult({name: torch.tensor([torch.inf]) for name in TENSORS}), state
 
 
 def test_answers_that_are_not_finite_are_refused_by_name():

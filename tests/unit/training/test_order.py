@@ -9,10 +9,10 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import order
+from crossgrad_core.training import morton_order
 from crossgrad_core.training.edits import apply_edit, put_in_order
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.order import along_curve, in_order, ordered
+from crossgrad_core.training.morton_order import along_curve, in_order, ordered
 from crossgrad_core.training.start import first_state
 
 BLOCKS = (
@@ -24,7 +24,7 @@ BLOCKS = (
 
 @pytest.fixture(autouse=True)
 def few_are_many(monkeypatch):
-    monkeypatch.setattr(order, "FEWEST", 2)
+    monkeypatch.setattr(morton_order, "FEWEST", 2)
 
 
 def code(position):
@@ -116,7 +116,7 @@ def test_a_run_is_in_order_after_each_of_its_edits():
 
 
 def test_few_stay_in_their_order(monkeypatch):
-    monkeypatch.setattr(order, "FEWEST", 51)
+    monkeypatch.setattr(morton_order, "FEWEST", 51)
     parameters = random_parameters(50)
     assert in_order(parameters, BLOCKS, "means") is None
     assert in_order(random_parameters(51), BLOCKS, "means") is not None

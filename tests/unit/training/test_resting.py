@@ -8,8 +8,8 @@ import torch
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.contexts import Regularized
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.contexts import RegularizeResult
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
@@ -30,7 +30,7 @@ class Decay:
     def crossgrad_regularize(self, context):
         if context.gaussians is not None:
             return None
-        return Regularized(1e-3 * context.parameters["f_rest"].square().sum())
+        return RegularizeResult(1e-3 * context.parameters["f_rest"].square().sum())
 
 
 def setup_of(backbone="vanilla", **settings):

@@ -11,7 +11,7 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.export import export_scene
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
-from crossgrad_core.training.budget import lengthened
+from crossgrad_core.training.budget import with_length
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -43,7 +43,7 @@ def test_it_begins_with_all_bands_of_the_file(trained):
     assert torch.equal(ours.sh_rest, wanted.sh_rest) and ours.sh_rest.abs().max() > 0
     assert torch.allclose(ours.means, wanted.means, atol=1e-6)
     assert torch.allclose(ours.opacities, wanted.opacities, atol=1e-6)
-    assert lengthened(again, 10, 2000).schedule.sh_from == 3
+    assert with_length(again, 10, 2000).schedule.sh_from == 3
 
 
 def test_file_and_degree_are_written_down(trained, monkeypatch):

@@ -54,7 +54,7 @@ def setup_of(backbone, densifier, operator, views, rasterizer="numba", way=None)
         "steps": STEPS,
         "start": {"name": "sfm"},
         "rasterizer": {"name": rasterizer},
-        "position_steps": way,
+        "position_lr": way,
         **TIMES,
     }
     return assemble(RunConfig.model_validate(config), sample_scene(), "none")
@@ -142,7 +142,7 @@ def test_sum_and_mean_of_two_views_train_alike(backbone, densifier):
     assert edited[:1] == ([] if densifier == "none" else [20])
 
 
-@pytest.mark.parametrize("way", ["extent", "size"])
+@pytest.mark.parametrize("way", ["extent", "per-axis"])
 def test_sum_and_mean_of_three_views_train_alike(way):
     """A third is no binary number: they differ less than runs from positions a bit aside."""
     of_sum = trained(setup_of("vanilla", "mcmc", "sum", 3, way=way))

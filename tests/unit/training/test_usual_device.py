@@ -8,7 +8,7 @@ import torch
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.opening import _config, parsed
+from crossgrad_core.run.load_run import _config, parsed
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_plugins.rasterizers.gpu import missing
@@ -28,7 +28,7 @@ def on_a_gpu(monkeypatch):
     """A machine with a GPU and these packages; gswarp's trial raises what `tried` holds."""
     tried = SimpleNamespace(error=None, devices=[])
 
-    def burn_in(_rasterizer, device):
+    def self_test(_rasterizer, device):
         tried.devices.append(device)
         if tried.error is not None:
             raise tried.error
@@ -39,7 +39,7 @@ def on_a_gpu(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: GPU)
-    monkeypatch.setattr(GswarpRasterizer, "burn_in", burn_in)
+    monkeypatch.setattr(GswarpRasterizer, "self_test", self_test)
     return of
 
 

@@ -10,10 +10,10 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract import densifier, operator, resolution, sampler
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.contexts import Densified, Draw, Regularized
+from crossgrad_core.contract.contexts import DensifyResult, RegularizeResult, ViewSample
 from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting, _kinds
-from crossgrad_core.contract.marks import hookimpl
+from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.start import MorePoints
 from crossgrad_core.contract.state import TAKEN, PluginState
@@ -24,7 +24,7 @@ from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run import select as selecting
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import photo_parameters, regrouping, room, start, steady
+from crossgrad_core.training import averaging, growth_budget, per_image_params, relabel, start
 from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
@@ -191,11 +191,11 @@ class Answers:
     "plugin",
     [
         Answers(after=NO_EDIT),
-        Answers(after=Densified(None)),
+        Answers(after=DensifyResult(None)),
         Answers(term=torch.ones(())),
         Answers(term=1.0),
-        Answers(term=Regularized(1.0)),
-        Answers(term=Regularized(torch.ones(3))),
+        Answers(term=RegularizeResult(1.0)),
+        Answers(term=RegularizeResult(torch.ones(3))),
     ],
 )
 def test_a_question_answered_with_something_else_names_the_plugin(plugin):
@@ -205,14 +205,14 @@ def test_a_question_answered_with_something_else_names_the_plugin(plugin):
 
 
 def test_right_answers_pass():
-    plugin = Answers(Densified(NO_EDIT), Regularized(torch.ones(1)))
+    plugin = Answers(DensifyResult(NO_EDIT), RegularizeResult(torch.ones(1)))
     setup = setup_of(stranger=plugin)
     assert take_step(setup, first_state(setup)).step == 1
 
 
 @pytest.mark.parametrize("name", sorted(TAKEN))
 def test_names_of_others_are_refused(name):
-    plugin = Answers(Densified(NO_EDIT, states={name: PluginState({"n": 1})}))
+    plugin = Answers(DensifyResult(NO_EDIT, states={name: PluginState({"n": 1})}))
     error = refused(setup_of(stranger=plugin))
     assert repr(name) in error.what
     assert error.where == "crossgrad_after_step, one of stranger"
@@ -220,7 +220,7 @@ def test_names_of_others_are_refused(name):
 
 @pytest.mark.parametrize("states", [None, [PluginState()]])
 def test_states_are_a_mapping(states):
-    plugin = Answers(Densified(NO_EDIT, states=states))
+    plugin = Answers(DensifyResult(NO_EDIT, states=states))
     assert refused(setup_of(stranger=plugin)).expected.startswith("a mapping")
 
 
@@ -230,7 +230,7 @@ def test_a_component_keeps_its_own_state_in_every_hook_that_it_has():
     class Own(kind):
         @hookimpl
         def crossgrad_after_step(self, context):
-            return Densified(NO_EDIT, states={"densifier": PluginState({"n": context.step})})
+            return DensifyResult(NO_EDIT, states={"densifier": PluginState({"n": context.step})})
 
     setup = setup_of({"densifier": Own()})
     state = first_state(setup)
@@ -239,13 +239,13 @@ def test_a_component_keeps_its_own_state_in_every_hook_that_it_has():
 
 
 def test_a_state_that_is_none_is_refused_at_once():
-    plugin = Answers(Densified(NO_EDIT, states={"stranger": {"n": 1}}))
+    plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": {"n": 1}}))
     assert refused(setup_of(stranger=plugin)).found == "dict"
 
 
 def test_the_names_of_the_core_are_those_that_it_uses():
     slots = {each.STATE for each in (sampler, operator, densifier, resolution)}
-    own = {each.STATE for each in (photo_parameters, regrouping, room, steady)}
+    own = {each.STATE for each in (per_image_params, relabel, growth_budget, averaging)}
     assert slots | own | {start.THINNED} == TAKEN
 
 
@@ -275,7 +275,7 @@ def test_the_names_of_the_core_are_those_that_it_uses():
     ],
 )
 def test_an_edit_that_does_not_fit_says_how(edit, found):
-    setup = setup_of(stranger=Answers(Densified(edit)))
+    setup = setup_of(stranger=Answers(DensifyResult(edit)))
     state = first_state(setup)
     assert state.primitives(setup) == 40
     with pytest.raises(UserError, match="does not fit the primitives") as caught:
@@ -285,7 +285,7 @@ def test_an_edit_that_does_not_fit_says_how(edit, found):
 
 @pytest.mark.parametrize("values", [torch.zeros(()), torch.zeros(3), torch.zeros(1, 3)])
 def test_values_that_spread_over_the_rows_fit(values):
-    setup = setup_of(stranger=Answers(Densified(Edit(values={"means": Rows(values)}))))
+    setup = setup_of(stranger=Answers(DensifyResult(Edit(values={"means": Rows(values)}))))
     state = first_state(setup)
     take_step(setup, state)
     assert not state.parameters["means"].detach().any()
@@ -342,7 +342,7 @@ def test_a_tensor_may_be_skipped_and_counts_be_numbers_of_numpy():
 
 
 def labelled(labels):
-    return of_slot("samplers", "random", "sample", (Draw((0,), labels), PluginState()))
+    return of_slot("samplers", "random", "sample", (ViewSample((0,), labels), PluginState()))
 
 
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
@@ -379,17 +379,17 @@ def test_scales_of_numpy_are_numbers_in_the_record():
     ],
 )
 def test_a_state_that_no_checkpoint_can_hold_is_refused_at_once(held, found):
-    error = refused(setup_of(stranger=Answers(Densified(NO_EDIT, states={"stranger": held}))))
+    error = refused(setup_of(stranger=Answers(DensifyResult(NO_EDIT, states={"stranger": held}))))
     assert error.what == "a checkpoint cannot hold the state of plugin stranger"
     assert found in error.where
 
 
 def test_a_state_is_looked_at_where_it_has_new_names():
-    plugin = Answers(Densified(NO_EDIT, states={"stranger": PluginState()}))
+    plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": PluginState()}))
     setup = setup_of(stranger=plugin)
     state = first_state(setup)
     take_step(setup, state)
-    plugin.after = Densified(NO_EDIT, states={"stranger": PluginState({"seen": {1}})})
+    plugin.after = DensifyResult(NO_EDIT, states={"stranger": PluginState({"seen": {1}})})
     with pytest.raises(UserError, match="a checkpoint cannot hold"):
         take_step(setup, state)
 
@@ -397,7 +397,7 @@ def test_a_state_is_looked_at_where_it_has_new_names():
 def test_fresh_rows_without_new_primitives_lose_moments_and_statistics():
     fresh = torch.arange(40) < 3
     held = PluginState(per_primitive={"seen": torch.ones(40)})
-    plugin = Answers(Densified(NO_EDIT, states={"stranger": held}))
+    plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": held}))
     setup = setup_of(stranger=plugin)
     state = first_state(setup)
     take_step(setup, state)
@@ -413,7 +413,7 @@ def test_fresh_rows_without_new_primitives_lose_moments_and_statistics():
 def test_a_state_without_a_row_for_each_primitive_names_its_plugin(rows):
     held = PluginState(per_primitive={"seen": rows})
     edit = Edit(source=torch.arange(40))
-    plugin = Answers(Densified(edit, states={"stranger": held}))
+    plugin = Answers(DensifyResult(edit, states={"stranger": held}))
     error = refused(setup_of(stranger=plugin))
     assert error.what == "the state of plugin stranger does not fit the primitives"
     assert error.found == f"shape {list(rows.shape)}"

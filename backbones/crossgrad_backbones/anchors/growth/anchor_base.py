@@ -17,7 +17,7 @@ from crossgrad_backbones.anchors.growth.anchor_statistics import (
     VIEWS,
     observed,
 )
-from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
+from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest, NewAnchors
 from crossgrad_core.plugin import (
     NO_EDIT,
     Densifier,
@@ -52,16 +52,18 @@ class AnchorDensifier(Densifier):
     largest_log_scale: float = Field(0.05, description="cap of the Gaussians' log size, extents")
 
     @abstractmethod
-    def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:
+    def grown(
+        self, context: DensifyContext, parameters: Parameters, request: GrowthRequest
+    ) -> NewAnchors:
         """The anchors to be added, given what their offsets ask for.
 
         Args:
             context: The step.
             parameters: Its parameters, detached.
-            urge: What the offsets ask for.
+            request: What the offsets ask for.
         """
 
-    def changed(self, parameters: Parameters, urge: Urge) -> Mapping[str, Tensor]:
+    def changed(self, parameters: Parameters, request: GrowthRequest) -> Mapping[str, Tensor]:
         """New rows of tensors [P, ...] of the present anchors; by default the capped scales."""
         scales = parameters["scales"]
         capped = scales[:, 3:].clamp(max=self.largest_log_scale)
@@ -84,14 +86,16 @@ class AnchorDensifier(Densifier):
         enough = self.success_threshold * context.schedule.densify_every * context.share
         judged = sums[VIEWS] > enough
         transparent = sums[OPACITY] < self.prune_opacity * sums[VIEWS]
-        urge = Urge(screen_statistics.mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2)
-        allowed = urge.among(context.may_grow)
+        request = GrowthRequest(
+            screen_statistics.mean(sums, GRADIENT, RENDERS), sums[RENDERS] > enough / 2
+        )
+        allowed = request.among(context.may_grow)
         new, held_back = self.grown(context, parameters, allowed).limited(context.room)
-        changed = self.changed(parameters, urge)
+        changed = self.changed(parameters, request)
         edit = edit_of(parameters, changed, judged & transparent, new)
         if held_back > 0:
             edit = replace(edit, counts={**edit.counts, "held_back": held_back})
-        return edit, PluginState(per_primitive=_cleared(state, urge.eligible, judged))
+        return edit, PluginState(per_primitive=_cleared(state, request.eligible, judged))
 
 
 def edit_of(

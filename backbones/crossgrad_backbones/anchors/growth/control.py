@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
 from crossgrad_backbones.anchors.growth.anchor_growing import Level, grown
-from crossgrad_backbones.anchors.growth.new_anchors import NewAnchors, Urge
+from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest, NewAnchors
 from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selection
 
 
@@ -23,8 +23,8 @@ class AnchorControl(AnchorDensifier):
     coarsest: int = Field(16, ge=1, description="edge of the coarsest cell, voxels")
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
 
-    def idle_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasIdleOptions`."""
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
         if self.levels > 1:
             return {}
         why = "there is one size of cells (levels = 1); leave it out"
@@ -40,9 +40,11 @@ class AnchorControl(AnchorDensifier):
         return replace(edited, reset_every=None)
 
     @override
-    def grown(self, context: DensifyContext, parameters: Parameters, urge: Urge) -> NewAnchors:
+    def grown(
+        self, context: DensifyContext, parameters: Parameters, request: GrowthRequest
+    ) -> NewAnchors:
         levels = self._levels(float(parameters["voxel_size"]))
-        return grown(parameters, urge.gradient, urge.eligible, levels, context.rng)
+        return grown(parameters, request.gradient, request.eligible, levels, context.rng)
 
     def _levels(self, voxel: float) -> tuple[Level, ...]:
         """The levels of growth for voxels of that edge."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Urge:
+class GrowthRequest:
     """New anchors at offsets of the present ones.
 
     Attributes:
@@ -19,7 +19,7 @@ class Urge:
     gradient: Tensor
     eligible: Tensor
 
-    def among(self, may_grow: Tensor | None) -> "Urge":
+    def among(self, may_grow: Tensor | None) -> "GrowthRequest":
         """That of the anchors that may grow [P]; None: all may."""
         if may_grow is None:
             return self

@@ -13,7 +13,7 @@ from crossgrad_core.commands import write_table
 from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_operators.stress.search.batch import Batch, results
 from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, rounded
-from crossgrad_operators.stress.search.specimens import Specimen
+from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.subject import Subject
 
 #: Types of gradients.
@@ -40,7 +40,7 @@ class Finite:
     not_finite: int
     longest: float
     seconds: float
-    example: Specimen | None
+    example: Sample | None
 
 
 @on_one_thread()
@@ -58,7 +58,7 @@ def run_finite(
         bad += int(wrong.sum())
         if wrong.any() and example is None:
             rows = batch.rows[int(np.argmax(wrong))].copy()
-            example = Specimen(rows, batch.dtype, batch.family, turn, float("inf"))
+            example = Sample(rows, batch.dtype, batch.family, turn, float("inf"))
         longest = max(longest, _longest(batch, np.where(wrong[:, None], 0.0, found)))
     return Finite(subject.name, matrices, bad, longest, perf_counter() - start, example)
 

@@ -15,10 +15,10 @@ from crossgrad_operators.stress.runner import UNPROVEN, judged
 from crossgrad_operators.stress.search.batch import Batch, search_views
 from crossgrad_operators.stress.search.examine import Examined, examine, jumps
 from crossgrad_operators.stress.search.families import FAMILIES, rounded, sizes
+from crossgrad_operators.stress.search.samples import mutants
 from crossgrad_operators.stress.search.shrink import shrunk
-from crossgrad_operators.stress.search.specimens import mutants
 from crossgrad_operators.stress.search.subject import Subject
-from crossgrad_operators.stress.search.tally import Tally, specimen
+from crossgrad_operators.stress.search.worst_cases import WorstCases, specimen
 from crossgrad_operators.stress.verdict import ExactCase
 
 #: Cases of a batch.
@@ -49,15 +49,15 @@ class Extent:
 def search(
     subjects: Sequence[Subject],
     extent: Extent,
-    progress: Callable[[int, Sequence[Tally]], None] = lambda _turn, _tallies: None,
-) -> list[Tally]:
+    progress: Callable[[int, Sequence[WorstCases]], None] = lambda _turn, _tallies: None,
+) -> list[WorstCases]:
     """Looks for the worst gradients of every operator.
 
     Raises:
         UserError: mpmath is not installed.
     """
     mpmath = require_mpmath()
-    tallies = [[Tally(each.name, dtype) for each in subjects] for dtype in extent.dtypes]
+    tallies = [[WorstCases(each.name, dtype) for each in subjects] for dtype in extent.dtypes]
     every = [tally for group in tallies for tally in group]
     end, turn = monotonic() + extent.seconds, 0
     with mpmath.mp.workdps(DIGITS), on_one_thread():
@@ -74,7 +74,7 @@ def search(
     return every
 
 
-def _simplify(subject: Subject, tally: Tally) -> None:
+def _simplify(subject: Subject, tally: WorstCases) -> None:
     """Leaves out of the worst cases what they do not need."""
     for pool, inside in ((tally.inside_pool, True), (tally.outside_pool, False)):
         if pool and np.isfinite(pool[0].value):
@@ -91,7 +91,7 @@ def fresh(extent: Extent, turn: int) -> Batch:
     return Batch(rounded(FAMILIES[family](rng, BATCH, views, elements), dtype), dtype, family)
 
 
-def _round(subject: Subject, tally: Tally, batch: Batch, at: tuple[int, int]) -> None:
+def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int]) -> None:
     admitted = subject.operator.views
     if not admitted.admits(batch.views):
         # Pairs of the same kind instead, for operators that take no more.
@@ -115,7 +115,7 @@ def _round(subject: Subject, tally: Tally, batch: Batch, at: tuple[int, int]) ->
         tally.add(examine(subject, mutants(rng, tally.pool, admitted, size)), turn)
 
 
-def _sample(subject: Subject, tally: Tally, examined: Examined, turn: int) -> None:
+def _sample(subject: Subject, tally: WorstCases, examined: Examined, turn: int) -> None:
     """Holds one case, over several steps, against the 50-digit oracle."""
     batch = examined.batch
     if batch.views > SAMPLED_VIEWS or subject.reference.oracle is None or examined.broken[0]:

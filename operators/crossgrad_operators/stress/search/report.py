@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from crossgrad_core.commands import write_table
-from crossgrad_operators.stress.search.specimens import Specimen
-from crossgrad_operators.stress.search.tally import Tally
+from crossgrad_operators.stress.search.samples import Sample
+from crossgrad_operators.stress.search.worst_cases import WorstCases
 
 #: Share of usual gradients that may lie outside a set, and gradients from which it is judged.
 SHARE, ENOUGH = 0.01, 2000
@@ -37,7 +37,7 @@ LEGEND = (
 )
 
 
-def as_text(tallies: Sequence[Tally]) -> str:
+def as_text(tallies: Sequence[WorstCases]) -> str:
     """The table, the worst case of each operator, and what broke a promise."""
     used = [tally for tally in tallies if tally.matrices]
     worst = [line for tally in used for line in _worst(tally)]
@@ -45,12 +45,12 @@ def as_text(tallies: Sequence[Tally]) -> str:
     return "\n\n".join([*parts, _failures(used)])
 
 
-def write_csv(tallies: Sequence[Tally], path: Path) -> None:
+def write_csv(tallies: Sequence[WorstCases], path: Path) -> None:
     """One row per operator and type."""
     write_table(path, [_row(tally) for tally in tallies])
 
 
-def _row(tally: Tally) -> dict[str, str | int | float]:
+def _row(tally: WorstCases) -> dict[str, str | int | float]:
     worst = [pool[0] if pool else None for pool in (tally.inside_pool, tally.outside_pool)]
     figures = zip(("error_u_kappa", "u_longest", "jump"), (*worst, tally.jump), strict=True)
     return {
@@ -61,16 +61,16 @@ def _row(tally: Tally) -> dict[str, str | int | float]:
     }
 
 
-def failed(tally: Tally) -> bool:
+def failed(tally: WorstCases) -> bool:
     """Whether a promise was broken."""
     return tally.broken > 0 or _too_often_outside(tally)
 
 
-def _too_often_outside(tally: Tally) -> bool:
+def _too_often_outside(tally: WorstCases) -> bool:
     return tally.usual >= ENOUGH and tally.usual_share > SHARE
 
 
-def _line(tally: Tally) -> str:
+def _line(tally: WorstCases) -> str:
     error = f"{tally.inside_pool[0].value:.3g}" if tally.inside_pool else "-"
     ratio = f"{tally.outside_pool[0].value:.3g}" if tally.outside_pool else "-"
     jump = f"{tally.jump.value:.1e}" if tally.jump is not None else "-"
@@ -82,14 +82,14 @@ def _line(tally: Tally) -> str:
     )
 
 
-def _worst(tally: Tally) -> Iterator[str]:
+def _worst(tally: WorstCases) -> Iterator[str]:
     if tally.inside_pool:
         yield _described(tally, tally.inside_pool[0], f"error {tally.inside_pool[0].value:.3g}")
     if tally.outside_pool:
         yield _described(tally, tally.outside_pool[0], f"|u| {tally.outside_pool[0].value:.3g}")
 
 
-def _described(tally: Tally, specimen: Specimen, what: str) -> str:
+def _described(tally: WorstCases, specimen: Sample, what: str) -> str:
     views, elements = specimen.rows.shape
     return (
         f"{tally.operator}, {tally.precision}: {what} (K = {views}, P = {elements}, "
@@ -97,7 +97,7 @@ def _described(tally: Tally, specimen: Specimen, what: str) -> str:
     )
 
 
-def _failures(tallies: Sequence[Tally]) -> str:
+def _failures(tallies: Sequence[WorstCases]) -> str:
     lines = [
         _described(tally, specimen, reason)
         for tally in tallies

@@ -8,7 +8,7 @@ import numpy as np
 from crossgrad_operators.stress.search.batch import Batch
 from crossgrad_operators.stress.search.examine import Examined, examine
 from crossgrad_operators.stress.search.families import Rows, rounded
-from crossgrad_operators.stress.search.specimens import Specimen
+from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.subject import Subject
 
 #: What a smaller case must keep of the value.
@@ -17,7 +17,7 @@ KEPT = 0.7
 DIGITS = (1, 2, 4)
 
 
-def shrunk(subject: Subject, specimen: Specimen, *, inside: bool) -> Specimen:
+def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
     """The case without the rows, elements and digits that it does not need.
 
     Args:
@@ -45,7 +45,7 @@ def _values(examined: Examined, *, inside: bool) -> np.ndarray:
     return np.where(of_kind & examined.finite, value, -1.0)
 
 
-def _smaller(subject: Subject, specimen: Specimen) -> Iterator[Rows]:
+def _smaller(subject: Subject, specimen: Sample) -> Iterator[Rows]:
     """[B, K', P'] cases with one row or element less, then with fewer digits."""
     rows = specimen.rows
     views, elements = rows.shape

@@ -14,5 +14,5 @@ class Template(Exposure):
     gain: float = Field(1.0, gt=0.0, description="factor of every render")
 
     @override
-    def exposed(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return image * self.gain

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Draw, PluginState, SampleContext, Sampler
+from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewSample
 
 
 class Template(Sampler):
@@ -14,7 +14,7 @@ class Template(Sampler):
     reads_groups: ClassVar[bool] = False
 
     @override
-    def sample(self, context: SampleContext, state: PluginState) -> tuple[Draw, PluginState]:
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         views = context.rng.integers(len(context.scene.train), size=context.views_per_step)
         labels = None if context.groups is None else tuple(context.groups[view] for view in views)
-        return Draw(tuple(int(view) for view in views), labels), state
+        return ViewSample(tuple(int(view) for view in views), labels), state

@@ -65,7 +65,7 @@ class Perceptual(Metric):
         return None if path is None else path.expanduser().absolute()
 
     @hookimpl
-    def crossgrad_objections(self, selection: Selection) -> list[str]:
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
         """Reads the weights before anything is trained."""
         if self.trunk is not None:
             self._weights(self.trunk)

@@ -38,7 +38,7 @@ class GaussianArrays:
         dc: [N, 1, 3] harmonics of degree 0.
         rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
         degree: Active degree, 0 to 3.
-        by_rows: Fields whose rows `bring` must bring up to date before they are read, and whose
+        sparse_rows: Fields whose rows `bring` must bring up to date before they are read, and whose
             gradients are of these rows only.
         bring: [R] int32 rows -> None.
     """
@@ -51,7 +51,7 @@ class GaussianArrays:
     dc: Float32 | None = None
     rest: Float32 | None = None
     degree: int = 0
-    by_rows: frozenset[str] = frozenset()
+    sparse_rows: frozenset[str] = frozenset()
     bring: Callable[[Int32], None] | None = None
 
 

@@ -180,11 +180,11 @@ def _blend(
         v_red = load_wide(state, at + V_RED)
         v_green = load_wide(state, at + V_GREEN)
         v_blue = load_wide(state, at + V_BLUE)
-        toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
+        weighted_color = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
             v_z = load_wide(state, DEPTHS + patch * WIDE)
-            toned = fma(v_z, z, toned)
-        weight, s = blend(alpha, odds, capped, toned, state, at, constants)
+            weighted_color = fma(v_z, z, weighted_color)
+        weight, s = blend(alpha, odds, capped, weighted_color, state, at, constants)
         store(responses, response + _ALPHA, s)
         response += _RESPONSE
         sum_red = fma(weight, v_red, sum_red)
@@ -212,8 +212,8 @@ def _moments(
     is multiplied by. Six sums of eight lanes also fit into the registers of machines with sixteen.
     """
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
-    pull = broadcast(records, record + ROW_DECAY)
-    lean = broadcast(records, record + DECAY) * broadcast(records, record + SLOPE)
+    decay_row = broadcast(records, record + ROW_DECAY)
+    grad_y_slope = broadcast(records, record + DECAY) * broadcast(records, record + SLOPE)
     sum_1 = sum_d = sum_y = sum_dd = sum_yy = sum_dy = splat(np.float32(0.0))
     sum_abs_x = sum_abs_y = splat(np.float32(0.0))
     response = 0
@@ -239,9 +239,9 @@ def _moments(
         sum_dy = fma(sd, dy, sum_dy)
         if absolute is not None:
             sum_abs_x = sum_abs_x + (magnitude(first_d) + magnitude(second_d))
-            pulled = pull * dy
-            sum_abs_y = sum_abs_y + magnitude(fnma(lean, first_d, pulled * first))
-            sum_abs_y = sum_abs_y + magnitude(fnma(lean, second_d, pulled * second))
+            grad_y_row = decay_row * dy
+            sum_abs_y = sum_abs_y + magnitude(fnma(grad_y_slope, first_d, grad_y_row * first))
+            sum_abs_y = sum_abs_y + magnitude(fnma(grad_y_slope, second_d, grad_y_row * second))
     return sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y
 
 
@@ -326,11 +326,11 @@ def _gather_analytic(
         v_red = load_wide(state, at + V_RED)
         v_green = load_wide(state, at + V_GREEN)
         v_blue = load_wide(state, at + V_BLUE)
-        toned = fma(v_blue, blue, fma(v_green, green, v_red * red))
+        weighted_color = fma(v_blue, blue, fma(v_green, green, v_red * red))
         if v_depth is not None:
             v_z = load_wide(state, DEPTHS + patch * WIDE)
-            toned = fma(v_z, z, toned)
-        weight, s = blend(alpha, odds, constants, toned, state, at, constants)
+            weighted_color = fma(v_z, z, weighted_color)
+        weight, s = blend(alpha, odds, constants, weighted_color, state, at, constants)
         sum_red = fma(weight, v_red, sum_red)
         sum_green = fma(weight, v_green, sum_green)
         sum_blue = fma(weight, v_blue, sum_blue)

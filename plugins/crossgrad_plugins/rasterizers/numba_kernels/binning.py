@@ -53,7 +53,7 @@ PARTS = 16
 _GROUP = 32
 
 #: Where the numbers of the ellipses of a group begin.
-_OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_LEAN = range(0, 6 * _GROUP, _GROUP)
+_OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_TILT = range(0, 6 * _GROUP, _GROUP)
 
 #: Records ahead for which memory is asked: first the slot numbers, then the slots.
 _FAR, _NEAR = 32, 16
@@ -121,9 +121,9 @@ def _ellipses(
         width, budget = load(ellipses, _OF_WIDTH + k), load(ellipses, _OF_BUDGET + k)
         # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
         extent_y = square_root(budget / row_decay)
-        lean = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
+        tilt = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
         store(ellipses, _OF_EXTENT + k, extent_y)
-        store(ellipses, _OF_LEAN + k, lean)
+        store(ellipses, _OF_TILT + k, tilt)
 
 
 @device
@@ -154,13 +154,13 @@ def _spans(
     width = broadcast(ellipses, _OF_WIDTH + k)
     budget = broadcast(ellipses, _OF_BUDGET + k)
     extent_y = broadcast(ellipses, _OF_EXTENT + k)
-    lean = broadcast(ellipses, _OF_LEAN + k)
+    tilt = broadcast(ellipses, _OF_TILT + k)
     row = ramp() + splat(np.float32(first_row))
     top = row * splat(np.float32(TILE_HEIGHT))
     bottom = smaller(top + splat(np.float32(TILE_HEIGHT - 1)), round_down(v + extent_y)) - v
     top = larger(top, round_up(v - extent_y)) - v
-    left = smaller(larger(zero - lean, top), bottom)
-    right = smaller(larger(lean, top), bottom)
+    left = smaller(larger(zero - tilt, top), bottom)
+    right = smaller(larger(tilt, top), bottom)
     left_extent = square_root(larger(fnma(row_decay * left, left, budget) * width, zero))
     right_extent = square_root(larger(fnma(row_decay * right, right, budget) * width, zero))
     first = round_up(fma(slope, left, u) - left_extent)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
+from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
 #: px^4; footprints whose determinant is not larger are erased by the antialiased response.

@@ -48,9 +48,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.longest_axes import add_directions, longest_axes
 from crossgrad_plugins.rasterizers.numba_kernels.marked import count_marked
 from crossgrad_plugins.rasterizers.numba_kernels.projection import listed, project
-from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import unproject
+from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import project_backward
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
-from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import shade, unshade
+from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import sh_backward, sh_forward
 
 
 def forward(
@@ -147,7 +147,7 @@ def backward(
         directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
     )
     share(
-        unproject,
+        project_backward,
         projected.camera,
         _dilation(options),
         options.response == "antialiased",
@@ -173,7 +173,7 @@ def backward(
     if gradients.dc is not None and gaussians.rest is not None:
         nothing = np.empty((0, *gaussians.rest.shape[1:]), np.float32)
         share(
-            unshade,
+            sh_backward,
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,
@@ -185,7 +185,7 @@ def backward(
             gradients.dc,
             nothing if gradients.rest is None else gradients.rest,
             gradients.means,
-            ("sh_dc" in gaussians.by_rows, "sh_rest" in gaussians.by_rows, harmonics),
+            ("sh_dc" in gaussians.sparse_rows, "sh_rest" in gaussians.sparse_rows, harmonics),
         )
     return gradients
 
@@ -195,7 +195,7 @@ def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
     if like is None:
         return None
     rows = frame.projected.rows
-    if rows is not None and field in frame.gaussians.by_rows:
+    if rows is not None and field in frame.gaussians.sparse_rows:
         return np.empty((len(rows), *like.shape[1:]), np.float32)
     return np.zeros(like.shape, np.float32)
 
@@ -344,7 +344,7 @@ def _project(
         gaussians.bring(projected.rows)
     if gaussians.dc is not None and gaussians.rest is not None:
         share(
-            shade,
+            sh_forward,
             gaussians.degree,
             projected.camera.eye,
             gaussians.means,

@@ -10,7 +10,7 @@ so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of 
 
 import math
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 
 #: Pixels of a tile.
 TILE_WIDTH = 64

@@ -66,7 +66,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.pixel_states import (
 
 
 @device
-def _toned(
+def _weighted_color(
     patch: int,
     records: NDArray[np.float32],
     record: int,
@@ -75,13 +75,17 @@ def _toned(
 ) -> Lanes:
     """The gradients of a patch's pixels times the colour of the Gaussian."""
     at = patch * STATE
-    toned = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
-    toned = fma(load_wide(state, at + V_GREEN), broadcast_wide(records, record + GREEN), toned)
-    toned = fma(load_wide(state, at + V_BLUE), broadcast_wide(records, record + BLUE), toned)
+    weighted_color = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
+    weighted_color = fma(
+        load_wide(state, at + V_GREEN), broadcast_wide(records, record + GREEN), weighted_color
+    )
+    weighted_color = fma(
+        load_wide(state, at + V_BLUE), broadcast_wide(records, record + BLUE), weighted_color
+    )
     if v_depth is not None:
         v_z = load_wide(state, DEPTHS + patch * WIDE)
-        toned = fma(v_z, broadcast_wide(records, record + DEPTH), toned)
-    return toned
+        weighted_color = fma(v_z, broadcast_wide(records, record + DEPTH), weighted_color)
+    return weighted_color
 
 
 @device
@@ -123,15 +127,15 @@ def mean_gradients(
         touched = alpha >= load_wide(constants, LEAST)
         free = touched & (alpha <= load_wide(constants, LARGEST_ALPHA))
     alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
-    toned = _toned(patch, records, record, state, v_depth)
+    weighted_color = _weighted_color(patch, records, record, state, v_depth)
     odds = where(free, odds_of(alpha, constants), load_wide(constants, FIXED))
-    _, s = blend(alpha, odds, constants, toned, state, patch * STATE, constants)
+    _, s = blend(alpha, odds, constants, weighted_color, state, patch * STATE, constants)
     if analytic is None:
         sd = s * dx
-        lean = decay * broadcast_wide(records, record + SLOPE)
-        pull = broadcast_wide(records, record + ROW_DECAY)
-        pulled = pull * broadcast_four_wide(rows, row + ROW_DY)
-        return decay * sd, fnma(lean, sd, pulled * s)
+        grad_y_slope = decay * broadcast_wide(records, record + SLOPE)
+        decay_row = broadcast_wide(records, record + ROW_DECAY)
+        grad_y_row = decay_row * broadcast_four_wide(rows, row + ROW_DY)
+        return decay * sd, fnma(grad_y_slope, sd, grad_y_row * s)
     su = where(free, s * by_u * inverse_1, zero)
     sv = where(free, s * by_v * inverse_2, zero)
     return fnma(cosine, su, sine * sv), zero - fma(cosine, sv, sine * su)

@@ -174,7 +174,7 @@ def blend(
     alpha: Lanes,
     odds: Lanes,
     capped: NDArray[np.float32] | None,
-    toned: Lanes,
+    weighted_color: Lanes,
     state: NDArray[np.float32],
     at: int,
     constants: NDArray[np.float32],
@@ -186,7 +186,7 @@ def blend(
         odds: alpha / (1 - alpha); negative where alpha does not depend on the parameters, since it
             is capped.
         capped: None says that no odds are negative.
-        toned: The gradients of the pixels times the colour of the Gaussian.
+        weighted_color: The gradients of the pixels times the colour of the Gaussian.
         state: State of the tile.
         at: Where that of the patch begins.
         constants: From `vector_constants`.
@@ -202,7 +202,7 @@ def blend(
     blended = after >= load_wide(constants, STOPPED)
     store(state, at + PASSED, where(blended, after, load_wide(constants, FINISHED)))
     weight = where(blended, weight, zero)
-    own = weight * toned
+    own = weight * weighted_color
     rest = load_wide(state, at + REST) - own
     store(state, at + REST, rest)
     s = fnma(rest, odds, own)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, take
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import BLOCK, get, put
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
@@ -182,7 +182,7 @@ def _project_block(
 
 
 @device
-def _tint(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]) -> bool:
+def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]) -> bool:
     """Writes the colour of Gaussian i to record j; returns whether it is finite."""
     red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
     records[j * RECORD + RED] = red
@@ -236,7 +236,7 @@ def _record_block(
             radius, pixels, plain = plain_shape(k, width, height, within, found)
         else:
             radius, pixels, turned = analytic_shape(k, opacity, width, height, within, found)
-        if radius == 0 or (colors is not None and not _tint(i, j, colors, records)):
+        if radius == 0 or (colors is not None and not _write_color(i, j, colors, records)):
             continue
         if analytic is None:
             write_plain(j, plain, records)
@@ -305,7 +305,7 @@ def project(
         quats: [N, 4] wxyz, any norm.
         scales: [N, 3] linear.
         opacities: [N].
-        colors: [N, 3] RGB; None leaves the records' colours to `shade`.
+        colors: [N, 3] RGB; None leaves the records' colours to `sh_forward`.
         radii: [N] written, pixels; 0 where nothing is touched.
         records: [N * RECORD] written.
         depths: [N] written per record.

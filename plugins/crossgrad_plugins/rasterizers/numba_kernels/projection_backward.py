@@ -257,7 +257,7 @@ def _write_block(
 
 
 @kernel
-def unproject(
+def project_backward(
     jobs: Jobs,
     camera: KernelCamera,
     dilation: float,

@@ -28,7 +28,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.third_degree import (
     FLOATS,
     HIGHER,
-    pull,
+    rest_basis_gradients,
     spread,
     sum_up,
 )
@@ -69,7 +69,7 @@ def _look(
 
 
 @kernel
-def shade(
+def sh_forward(
     jobs: Jobs,
     degree: int,
     eye: NDArray[np.float64],
@@ -131,7 +131,7 @@ def shade(
 
 
 @kernel
-def unshade(
+def sh_backward(
     jobs: Jobs,
     degree: int,
     eye: NDArray[np.float64],
@@ -150,7 +150,7 @@ def unshade(
 
     Args:
         jobs: From `share`.
-        degree: As in `shade`, like the next six.
+        degree: As in `sh_forward`, like the next six.
         eye: [3].
         means: [N, 3].
         rest: [N, B - 1, 3].
@@ -168,8 +168,8 @@ def unshade(
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
     ways, table = np.ones(WAYS, np.float64), aligned(TABLE)
-    bases, pulls, v_bases = aligned(TABLE), aligned(TABLE), aligned(TABLE)
-    table[:] = pulls[:] = v_bases[:] = np.float32(0.0)
+    bases, v_rgb, v_bases = aligned(TABLE), aligned(TABLE), aligned(TABLE)
+    table[:] = v_rgb[:] = v_bases[:] = np.float32(0.0)
     chunks = drawn.shape[0]
     chunk = take(jobs, chunks)
     while chunk < chunks:
@@ -186,7 +186,7 @@ def unshade(
                     # A channel clamped at 0 has no gradient.
                     free = seen and records[j * RECORD + RED + channel] > np.float32(0.0)
                     v = v_colors[i, channel] if free else np.float32(0.0)
-                    pulls[row + channel] = v
+                    v_rgb[row + channel] = v
                     v_dc[to_dc, 0, channel] = C0 * np.float64(v)
             for j in range(first, last):
                 _bring_near(rest, np.intp(owners[min(j + _BLOCK, end - 1)]))
@@ -194,8 +194,8 @@ def unshade(
                 to_rest = before + j if rest_by_rows else i
                 if whole:
                     if learns:
-                        spread(bases, row, pulls, v_rest, to_rest * FLOATS)
-                    pull(pulls, row, rest, i * FLOATS, v_bases)
+                        spread(bases, row, v_rgb, v_rest, to_rest * FLOATS)
+                    rest_basis_gradients(v_rgb, row, rest, i * FLOATS, v_bases)
                     continue
                 if learns and rest_by_rows:
                     v_rest[to_rest] = np.float32(0.0)
@@ -203,8 +203,8 @@ def unshade(
                     along = np.float32(0.0)
                     for channel in range(3):
                         if learns:
-                            v_rest[to_rest, k - 1, channel] = pulls[row + channel] * bases[row + k]
-                        along += pulls[row + channel] * rest[i, k - 1, channel]
+                            v_rest[to_rest, k - 1, channel] = v_rgb[row + channel] * bases[row + k]
+                        along += v_rgb[row + channel] * rest[i, k - 1, channel]
                     v_bases[row + k - 1] = along
             turned(v_bases, table)
             pull_ways(degree, table, ways)

@@ -81,7 +81,7 @@ def sum_up(
 def spread(
     bases: NDArray[np.float32],
     row: int,
-    pulls: NDArray[np.float32],
+    v_rgb: NDArray[np.float32],
     v_rest: NDArray[np.float32],
     to: int,
 ) -> None:
@@ -90,11 +90,11 @@ def spread(
     Args:
         bases: As in `sum_up`, like `row`.
         row: See `bases`.
-        pulls: The gradients of the colour, from `row` on.
+        v_rgb: The gradients of the colour, from `row` on.
         v_rest: Written from float `to` on.
         to: See `v_rest`.
     """
-    basis, three = load_wide(bases, row), load_wide(pulls, row)
+    basis, three = load_wide(bases, row), load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
     # In this order: the float to spare of a vector is written anew by the next one.
     store(v_rest, to, _spread_first(basis, basis) * rgb)
@@ -103,8 +103,8 @@ def spread(
 
 
 @device
-def pull(
-    pulls: NDArray[np.float32],
+def rest_basis_gradients(
+    v_rgb: NDArray[np.float32],
     row: int,
     rest: NDArray[np.float32],
     at: int,
@@ -113,13 +113,13 @@ def pull(
     """Writes the gradients of the basis functions of higher degrees.
 
     Args:
-        pulls: The gradients of the colour, from `row` on.
-        row: See `pulls`.
+        v_rgb: The gradients of the colour, from `row` on.
+        row: See `v_rgb`.
         rest: Coefficients.
         at: Where they begin.
         v_bases: Written from `row` on: fifteen numbers, and one that does not count.
     """
-    three = load_wide(pulls, row)
+    three = load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
     first = load_wide(rest, at) * rgb
     second = load_wide(rest, at + _SECOND) * rgb

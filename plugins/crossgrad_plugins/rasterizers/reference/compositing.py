@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import embedding
 from torch.utils.checkpoint import checkpoint
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
 from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.reference.responses import Shape, coverage
 from crossgrad_plugins.rasterizers.reference.statistics import offsets

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
 from crossgrad_core.numerics.rotations import unit_rotation_matrices
-from crossgrad_core.numerics.rules import JACOBIAN_MARGIN
 from crossgrad_core.plugin import Camera
 
 

@@ -10,7 +10,7 @@ from math import pi, sqrt
 import torch
 from torch import Tensor
 
-from crossgrad_core.numerics.rules import ALPHA_THRESHOLD
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.reference.projection import Projection
 

@@ -8,7 +8,7 @@ from typing import Final
 from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Worker, is_free
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.tries import Tries
+from crossgrad_plugins.sweep.retries import Retries
 
 OPTIONS: Final = ()
 
@@ -32,7 +32,7 @@ class _Crew:
     def __init__(self, work: Work) -> None:
         self._work = work
         self._waiting = deque(work.jobs)
-        self._tries = Tries(work.out)
+        self._tries = Retries(work.out)
         self._free = list(reversed(_workers(work)))
         self._under_way: list[Attempt] = []
         self._asked = Counter[Attempt]()

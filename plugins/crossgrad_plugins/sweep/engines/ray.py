@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, Final
 
-from crossgrad_core.commands import UserError, listened_to
+from crossgrad_core.commands import UserError, signal_names
 from crossgrad_plugins.sweep.attempt import Outcome, Worker
 from crossgrad_plugins.sweep.elsewhere import carried_out
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.tries import Tries
+from crossgrad_plugins.sweep.retries import Retries
 
 OPTIONS: Final = ("address",)
 #: Seconds between two looks.
@@ -48,7 +48,7 @@ class _Crew:
     def __init__(self, work: Work, ray: ModuleType) -> None:
         self._work, self._ray = work, ray
         self._waiting = deque(work.jobs)
-        self._tries = Tries(work.out)
+        self._tries = Retries(work.out)
         self._under_way: dict[Any, Job] = {}
         self._asked = 0
         needs: dict[str, Any] = {"num_cpus": work.threads, "max_retries": -1}
@@ -107,9 +107,9 @@ def _connected(work: Work) -> ModuleType:
             todo="pip install 'crossgrad[ray]'",
         ) from error
     address = work.options.get("address")
-    handlers = {number: signal.getsignal(number) for number in listened_to()}
+    handlers = {number: signal.getsignal(number) for number in signal_names()}
     try:
-        _knock(address)
+        _ping(address)
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
@@ -124,7 +124,7 @@ def _connected(work: Work) -> ModuleType:
     return found
 
 
-def _knock(address: str | None) -> None:
+def _ping(address: str | None) -> None:
     """Raises an OSError within seconds where nobody answers; Ray would wait for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():

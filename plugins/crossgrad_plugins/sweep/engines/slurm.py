@@ -16,7 +16,7 @@ from crossgrad_plugins.sweep.attempt import Outcome, Worker
 from crossgrad_plugins.sweep.elsewhere import carried_out
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.tries import Tries
+from crossgrad_plugins.sweep.retries import Retries
 
 #: Options that sbatch is given as they are.
 SBATCH: Final = (
@@ -104,7 +104,7 @@ class _Crew:
         queued = self._executor.cluster == "slurm"
         self._most = len(work.jobs) if queued else work.workers or 1
         self._waiting = deque(work.jobs)
-        self._tries = Tries(work.out)
+        self._tries = Retries(work.out)
         self._under_way: list[tuple[Any, Job]] = []
         self._asked = 0
 

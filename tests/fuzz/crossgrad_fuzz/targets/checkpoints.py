@@ -18,7 +18,7 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import persist
+from crossgrad_core.run import checkpoint_io
 from crossgrad_core.run.checkpoint import checkpoint
 from crossgrad_core.run.checkpoint import folders as checkpoint_folders
 from crossgrad_core.run.checkpoint import state as checkpoint_state
@@ -26,7 +26,7 @@ from crossgrad_core.run.checkpoint import tensors as checkpoint_tensors
 from crossgrad_core.run.checkpoint.checkpoint import Checkpoint, latest, load, save
 from crossgrad_core.run.checkpoint.folders import STATE, TENSORS
 from crossgrad_core.run.checkpoint.state import digest
-from crossgrad_core.run.persist import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.system import text_files
 from crossgrad_core.training import rngs
 from crossgrad_core.training.rngs import make_streams
@@ -179,7 +179,7 @@ TARGET = Target(
         checkpoint_folders: ("Keep", "scratch_folder", "discard", "_take_name", "_clear"),
         checkpoint_state: ("state_text", "check_json"),
         checkpoint_tensors: ("pack", "packed_bytes", "write_tensors", "_all"),
-        persist: ("to_checkpoint",),
+        checkpoint_io: ("to_checkpoint",),
         rngs: ("make_streams", "stream_states"),
         text_files: ("read_rows", "parse_number"),
     },

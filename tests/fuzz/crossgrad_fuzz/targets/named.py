@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.run import flight
+from crossgrad_core.run import camera_path
 from crossgrad_core.training import photo_file
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
@@ -36,7 +36,7 @@ def _paths() -> Sequence[Case]:
 
 
 def _parse_path(folder: Path) -> None:
-    found = flight._read(folder / _FILE, Similarity(np.ones(3), 0.5))
+    found = camera_path._read(folder / _FILE, Similarity(np.ones(3), 0.5))
     assert 0 < found.fps <= 1000
     assert found.cameras
     for camera in found.cameras:
@@ -78,7 +78,7 @@ PATH = Target(
     seeds=_paths,
     parse=_parse_path,
     parser={
-        flight: ("flight", "ladder", "_distance", "_ends", "_way", "_between", "_unit"),
+        camera_path: ("flight", "ladder", "_distance", "_ends", "_way", "_between", "_unit"),
     },
     words=_WORDS,
     mutators=_FORMAT,

@@ -1,0 +1,219 @@
+"""Cameras without photos: a path from a file, or from the farthest photos down to the nearest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import radians, tan
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.validation import as_user_error
+from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL
+from crossgrad_core.system.text_files import read_json
+
+#: Instead of a file: from the farthest photos down to the nearest.
+LADDER: Final = "ladder"
+FRAMES_PER_SECOND: Final = 24.0
+#: Of a ladder.
+FRAMES: Final = 120
+#: Views that observe fewer SfM points say too little about what they look at.
+FEWEST_SEEN: Final = 8
+#: Of more views the ends of a ladder are sought among so many, spread over all.
+MOST_VIEWS: Final = 500
+_TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
+#: Longer paths are a mistake.
+MOST_FRAMES: Final = 100_000
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Cameras in the local frame, one per frame.
+
+    Attributes:
+        name: A part of file names.
+        cameras: One for each frame.
+        fps: Frames per second.
+    """
+
+    name: str
+    cameras: tuple[Camera, ...]
+    fps: float = FRAMES_PER_SECOND
+
+
+def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
+    """The cameras of a path.
+
+    Args:
+        scene: The scene of the run.
+        path: `ladder`, or a camera path as nerfstudio's viewer writes it, in input coordinates.
+        frames: How many a ladder has.
+
+    Raises:
+        UserError: There is no such file, it holds no path, or the photos give no ladder.
+    """
+    if path == LADDER:
+        return CameraPath(LADDER, ladder(scene.train_views, scene.points, frames))
+    return _read(Path(path), scene.similarity)
+
+
+def ladder(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
+    """Along a line from a far photo to a near one that shows the same, nearer by equal factors.
+
+    The ends are one of the farthest fifth of the views and one of the nearest fifth: those that
+    have the most SfM points in common, and of equals the pair whose directions differ least.
+
+    Args:
+        views: The training views.
+        points: [P, 3] SfM points.
+        frames: At least 2.
+
+    Raises:
+        UserError: Fewer than two views observe enough SfM points.
+    """
+    known = [view for view in views if len(view.seen) >= FEWEST_SEEN]
+    known = known[:: 1 + len(known) // MOST_VIEWS]
+    if len(known) < 2:  # noqa: PLR2004 - two ends
+        raise UserError(
+            "the photos give no ladder",
+            where=f"--path {LADDER}",
+            expected=f"two photos that observe {FEWEST_SEEN} SfM points or more",
+            found=f"{len(known)}",
+            todo="give a file of cameras: --path FILE.json",
+        )
+    distances = np.array([_distance(view.camera, points[view.seen]) for view in known])
+    first, last = _ends(known, distances, len(points))
+    nearer = distances[last] / distances[first]
+    ends = known[first].camera, known[last].camera
+    return tuple(_between(*ends, share, nearer) for share in np.linspace(0.0, 1.0, frames))
+
+
+def _distance(camera: Camera, seen: _Floats) -> float:
+    """The median depth of what a camera observes, local units."""
+    depths = camera.local(seen)[:, 2]
+    return float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
+
+
+def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, int]:
+    order, few = np.argsort(distances, kind="stable"), max(1, len(views) // 5)
+    forward = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
+    seen = {int(near): np.unique(views[near].seen) for near in order[:few]}
+    found = []
+    for far in map(int, order[-few:]):
+        mark = np.zeros(points, dtype=np.bool_)
+        mark[views[far].seen] = True
+        found += [
+            (int(mark[rows].sum()), float(forward[far] @ forward[near]), (far, near))
+            for near, rows in seen.items()
+            if near != far
+        ]
+    return max(found)[2]
+
+
+def _way(share: float, nearer: float) -> float:
+    """The share of the line at which the distance has fallen by `nearer` to the power `share`."""
+    if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of what follows
+        return share
+    return float((1.0 - nearer**share) / (1.0 - nearer))
+
+
+def _between(first: Camera, last: Camera, share: float, nearer: float) -> Camera:
+    """The camera at a share of the time, which turns evenly as its field of view changes."""
+    ends = first.world_to_camera.numpy(), last.world_to_camera.numpy()
+    down, ahead = ((1.0 - share) * ends[0][row, :3] + share * ends[1][row, :3] for row in (1, 2))
+    forward = _unit(ahead)
+    right = _unit(np.cross(down, forward))
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    way = _way(share, nearer)
+    center = (1.0 - way) * first.center.numpy() + way * last.center.numpy()
+    pose[:3, 3] = -pose[:3, :3] @ center
+    zoom = (last.fx / last.width / (first.fx / first.width)) ** share
+    return replace(
+        first, fx=first.fx * zoom, fy=first.fy * zoom, cx=first.width / 2, cy=first.height / 2,
+        world_to_camera=torch.from_numpy(pose),
+    )  # fmt: skip
+
+
+def _unit(vector: _Floats) -> _Floats:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+class _Frame(BaseModel):
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    camera_to_world: list[Annotated[float, Field(strict=True, ge=-FARTHEST, le=FARTHEST)]] = Field(
+        min_length=16, max_length=16
+    )
+    fov: float = Field(strict=True, ge=0.01, lt=180)
+
+
+class _Path(BaseModel):
+    """A file of nerfstudio's viewer: OpenGL axes, matrices row by row, vertical field of view."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    camera_path: list[_Frame] = Field(min_length=1, max_length=MOST_FRAMES)
+    render_width: float = Field(strict=True, ge=1, le=16_384, multiple_of=1)
+    render_height: float = Field(strict=True, ge=1, le=16_384, multiple_of=1)
+    fps: float = Field(FRAMES_PER_SECOND, strict=True, ge=0.01, le=1_000)
+    camera_type: Literal["perspective"] = "perspective"
+
+
+def _read(path: Path, similarity: Similarity) -> CameraPath:
+    try:
+        found = _Path.model_validate(read_json(path))
+    except ValidationError as error:
+        raise as_user_error(error, _Path, subject=f"camera path {path}", todo=_TODO) from error
+    except (FileNotFoundError, ValueError) as error:
+        raise UserError(
+            "unreadable camera path", where=f"--path {path}", found=str(error), todo=_TODO
+        ) from error
+    size = round(found.render_width), round(found.render_height)
+    cameras = [_camera(frame, size, similarity, path) for frame in found.camera_path]
+    return CameraPath(path.stem, tuple(cameras), found.fps)
+
+
+def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: Path) -> Camera:
+    matrix = np.array(frame.camera_to_world).reshape(4, 4)
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        raise UserError(
+            "a camera of the path has no last row of a pose",
+            where=f"{path}, camera_to_world",
+            expected="16 numbers row by row, the last four 0, 0, 0, 1",
+            found=str(matrix[3].tolist()),
+            todo=_TODO,
+        )
+    turned = matrix[:3, :3] * np.array([1.0, -1.0, -1.0])
+    lengths = np.linalg.norm(turned, axis=0)
+    rotation = turned / np.where(lengths > 0, lengths, 1.0)
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise UserError(
+            "a camera of the path has no rotation",
+            where=f"{path}, camera_to_world",
+            expected="three orthogonal axes, right-handed",
+            found=str(frame.camera_to_world),
+            todo=_TODO,
+        )
+    center = similarity.to_local(matrix[None, :3, 3])[0]
+    if np.abs(center).max() > FARTHEST_LOCAL:
+        raise UserError(
+            "a camera of the path is too far from the scene",
+            where=f"{path}, camera_to_world",
+            expected=f"at most {FARTHEST_LOCAL:g} times the extent of the training cameras",
+            found=str(matrix[:3, 3].tolist()),
+            todo=_TODO,
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ center
+    focal = size[1] / 2 / tan(radians(frame.fov) / 2)
+    return Camera(*size, focal, focal, size[0] / 2, size[1] / 2, torch.from_numpy(pose))

@@ -1,0 +1,258 @@
+"""A run from its first step to its last file: whatever ends it, what there is gets kept."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from shlex import quote
+from typing import Final, TypeVar
+
+from crossgrad_core.contract.contexts import RunInfo
+from crossgrad_core.registry.entries import notes_on
+from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
+from crossgrad_core.run.failure_report import is_unexpected, reason_of, traceback_of
+from crossgrad_core.run.results.config_file import read_notes, write_config
+from crossgrad_core.run.results.log import FILE as LOG
+from crossgrad_core.run.results.log import RunLog
+from crossgrad_core.run.results.metrics_csv import Row, read_metrics
+from crossgrad_core.run.results.seal import seal
+from crossgrad_core.run.results.summary import Status, best_of
+from crossgrad_core.run.session import PANELS, Session
+from crossgrad_core.scene.photo_check import fits
+from crossgrad_core.system.checksums import SUMS
+from crossgrad_core.training.budget import Length
+from crossgrad_core.training.clock import PhaseTimer
+from crossgrad_core.training.edits import keep
+from crossgrad_core.training.floaters import removes_floaters, rows_without_floaters, told_of
+from crossgrad_core.training.loop import evaluates_after, train
+from crossgrad_core.training.rollback import RollbackGuard
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.wording import one_line
+
+#: A run that ends so many decibels below its best evaluation says so; where few photos are held out
+#: single evaluations differ by less all the time.
+WORSE: Final = 0.3
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended.
+
+    Attributes:
+        status: `finished`, `stopped` (resumable) or `failed`.
+        error: What went wrong and what there is not therefore; None where nothing did.
+        traced: Whether log.txt holds a traceback.
+        cause: The exception that ended training; None where none did.
+    """
+
+    status: Status
+    error: str | None = None
+    traced: bool = False
+    cause: BaseException | None = None
+
+
+@dataclass
+class RunLoop:
+    """A run under way.
+
+    Attributes:
+        setup: What it is made of; a run that follows the clock revises it.
+        state: Its state; after an exception the last good one.
+        session: Where its results go.
+        log: Its log.txt.
+        stopper: Whether it is to stop.
+        ending: How it ends, as far as that is known.
+    """
+
+    setup: Setup
+    state: TrainState
+    session: Session
+    log: RunLog
+    stopper: Stopper
+    ending: Ending = Ending("finished")
+
+    def to_the_end(self, length: Length) -> Ending:
+        """Trains, and then saves and describes the last state.
+
+        Part by part: none that fails costs another, and the ending says which did.
+        """
+        self._attempt("", lambda: self._train(length))
+        config, densifier = self.setup.config, self.setup.densifier
+        if self.ending.status == "finished" and removes_floaters(config, densifier):
+            self._attempt("floaters are left", self._remove_floaters)
+        self._attempt("", lambda: self.session.align(self.setup, self.state))
+        if self.session.gone:
+            return self.ending
+        # What a step left half done, and nothing could put back, is no state to go on from.
+        if self.state.step > 0 and not self.state.touched:
+            self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
+            self._describe()
+        self._summarise()
+        described = self.ending
+        self._attempt("", lambda: self.setup.hook.crossgrad_run_end(status=described.status))
+        if self.ending != described:
+            self._summarise()
+        sealed = self.ending
+        self._attempt(f"no {SUMS}", lambda: seal(self.session.folder))
+        if self.ending != sealed:
+            self._summarise()
+        return self.ending
+
+    def _train(self, length: Length) -> None:
+        setup = self.setup
+        keep = fits(setup.scene, setup.config.reading.cache_mib)
+        views = (*setup.train_views, *setup.scene.test_views)
+        with (
+            self.stopper.interruptible(),
+            setup.photos_ahead.at_work(views, self.stopper.fail, keep=keep),
+        ):
+            setup.hook.crossgrad_run_start(run=self._info())
+            self._catch_up()
+            state, keeper = self.state, RollbackGuard(self.state)
+            while True:
+                ended = train(self.setup, state, self.session, self.stopper, length.due, keeper)
+                if ended != "paused":
+                    self.ending = Ending(ended)
+                    return
+                revised = length.revised(self.setup, state)
+                if revised is not self.setup:
+                    keeper.copy(state)  # A length is written down with its step: none goes behind.
+                if revised.config is not self.setup.config:  # A planned length is written already.
+                    folder = self.session.folder
+                    write_config(folder, revised.config, read_notes(folder))
+                self.setup = revised
+
+    def _remove_floaters(self) -> None:
+        setup, state = self.setup, self.state
+        state.laps = PhaseTimer()
+        rows = self._unless_interrupted(partial(rows_without_floaters, setup, state))
+        if rows is not None:
+            count = state.primitives(setup) - len(rows)
+            keep(setup, state, rows)
+            self.session.renew(setup, state.step)
+            setup.hook.crossgrad_log(text=told_of(count))
+        state.laps.lap("density_control")
+        state.clock.count(state.laps)
+
+    def _catch_up(self) -> None:
+        """Evaluates where an earlier session ended before it could."""
+        setup, state, session = self.setup, self.state, self.session
+        if evaluates_after(setup, state.step) and not session.has_row(state.step):
+            session.evaluate(setup, state)
+
+    def _describe(self) -> None:
+        setup, state, session = self.setup, self.state, self.session
+        parts: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("no evaluation", lambda: session.evaluate(setup, state, panels=PANELS)),
+            ("no per_view.csv", lambda: session.write_views(state)),
+            ("no curve.png", lambda: session.draw(setup, state)),
+            ("no point_cloud.ply", lambda: session.export(setup, state)),
+        )
+        for missing, write in parts:
+            self._attempt(missing, partial(self._unless_interrupted, write))
+
+    def _unless_interrupted(self, part: Callable[[], _T]) -> _T:
+        with self.stopper.interruptible():
+            if self.stopper.at_once:
+                raise KeyboardInterrupt
+            try:
+                return part()
+            except Exception as error:
+                # Compiled code makes an error of its own of an interrupt that it was met by.
+                if self.stopper.at_once:
+                    raise KeyboardInterrupt from error
+                raise
+
+    def _summarise(self) -> None:
+        ending = self.ending
+        self._attempt(
+            "no summary.json",
+            lambda: self.session.summarise(self.setup, self.state, ending.status, ending.error),
+        )
+
+    def _attempt(self, missing: str, part: Callable[[], None]) -> None:
+        """Does a part of the run; where it fails, the ending says so.
+
+        Args:
+            missing: What there is not where the part fails.
+            part: The part.
+        """
+        try:
+            part()
+        except KeyboardInterrupt:
+            if self.ending.error is None:
+                self.ending = replace(self.ending, status="stopped")
+        except (Exception, SystemExit) as error:  # Third-party code may raise anything.
+            self._note(error, missing)
+
+    def _note(self, error: BaseException, missing: str) -> None:
+        reason, traced = reason_of(error), is_unexpected(error)
+        if traced:
+            self.log.write(traceback_of(error))
+        known = self.ending.error
+        if known is None or reason not in known:
+            parts = [known, ": ".join(part for part in (missing, *notes_on(error), reason) if part)]
+            known = "\n".join(part for part in parts if part)
+        before = self.ending
+        self.ending = Ending("failed", known, before.traced or traced, before.cause or error)
+
+    def _info(self) -> RunInfo:
+        setup = self.setup
+        return RunInfo(
+            folder=self.session.folder,
+            scene=setup.scene,
+            config=setup.config.model_dump(mode="json"),
+            schedule=setup.schedule,
+            blocks=setup.blocks,
+            notes=setup.notes,
+        )
+
+
+def exit_messages(course: RunLoop) -> list[str]:
+    """What the user is told of a run that came to nothing or did not finish, and how to go on."""
+    ending, folder = course.ending, course.session.folder
+    lines = []
+    if not course.state.primitives(course.setup):
+        name = course.setup.selection.names["densifier"]
+        lines.append(f"no primitive is left: look at densifier {name} and at the photos")
+    if ending.error is not None:
+        lines += f"training failed: {ending.error}".splitlines()
+    if course.session.gone:
+        return lines
+    if ending.traced:
+        lines.append(f"the traceback is in {one_line(folder / LOG)}")
+    lines += _kept(course)
+    if ending.status == "finished":
+        return [*lines, *overdone(read_metrics(folder))]
+    return [*lines, resume_line(folder)]
+
+
+def overdone(rows: Sequence[Row]) -> list[str]:
+    """Says that a run ended more than `WORSE` decibels below its best evaluation."""
+    best, last = best_of(rows), rows[-1].get("psnr") if rows else None
+    if best is None or last is None or not best["psnr"] - last > WORSE:
+        return []
+    gap, step = best["psnr"] - last, best["step"]
+    return [
+        f"the last evaluation is {gap:.2f} dB below that of step {step:.0f}, "
+        f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
+        "may be enough (--max-views N, or --plan auto)"
+    ]
+
+
+def resume_line(folder: Path) -> str:
+    """How a run goes on."""
+    return f"continue with: crossgrad run --resume {one_line(quote(str(folder)))}"
+
+
+def _kept(course: RunLoop) -> list[str]:
+    """What to say about the state, where not all of it is in the newest checkpoint."""
+    step = course.state.step
+    saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
+    if saved >= step:
+        return []
+    there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"
+    return [f"the state of step {step} could not be saved; {there}"]

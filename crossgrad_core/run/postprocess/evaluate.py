@@ -1,0 +1,158 @@
+"""Figures of a run that was trained: of its held-out views, of a file, of another capture."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.defaults import EXPORTER
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import evaluate as measured
+from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.cross_capture import Elsewhere, elsewhere
+from crossgrad_core.run.export import drawer, plain_drawer, plain_renderer, renderer
+from crossgrad_core.run.load_run import require_checkpoint
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
+from crossgrad_core.run.postprocess.output_paths import is_changed, own_name, writing_if_possible
+from crossgrad_core.run.results.cost_totals import Totals
+from crossgrad_core.run.results.panel_names import ending
+from crossgrad_core.run.results.per_view import FILE as PER_VIEW
+from crossgrad_core.run.results.per_view import read_per_view, write_per_view
+from crossgrad_core.run.results.sources import name_for
+from crossgrad_core.run.results.table import final_table, metric_lines
+from crossgrad_core.run.session import totals
+from crossgrad_core.system.checksums import relisted, warn_if_changed
+from crossgrad_core.wording import listed
+
+_LOG = logging.getLogger(__name__)
+
+
+def evaluate(
+    folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None, on: Path | None = None
+) -> None:
+    """Evaluates the held-out views of a run again, or others; prints the table.
+
+    Args:
+        folder: The run's folder.
+        how: How the run is opened.
+        ply: A file that is drawn instead of the run's model.
+        on: Another capture of the place, whose views are drawn instead of the held-out ones.
+
+    Raises:
+        UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
+    """
+    if ply is not None:
+        result, gaussians, place = evaluated_file(folder, ply, how, on)
+        told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
+        print("\n".join([*metric_lines(result), told, *(place.messages() if place else ())]))  # noqa: T201
+    elif on is not None:
+        result, there = evaluated_on(folder, on, how)
+        print("\n".join([*metric_lines(result), *there.messages()]))  # noqa: T201
+    else:
+        print(final_table(*evaluated(folder, how)))  # noqa: T201
+
+
+def evaluated_on(
+    folder: Path, on: Path, how: Opens = AS_IT_IS
+) -> tuple[EvaluationResult, Elsewhere]:
+    """Evaluates a run on another capture of its place; writes per_view_on_<name>.csv.
+
+    Views that the run was trained on are left out. Renders have no exposure: nothing is known of
+    those of other photos.
+
+    Args:
+        folder: The run's folder.
+        on: The other scene, in the coordinates of the run's.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `elsewhere`; or it is no run, or it has no checkpoint.
+    """
+    require_checkpoint(folder)
+    with writing_if_possible(folder, "evaluating") as writes:
+        setup, state = how.open(folder)
+        there = elsewhere(setup, on)
+        draw, points = plain_renderer(setup, state), there.points
+        result = measured(there.views, draw, setup.metrics, points=points)
+        if writes:
+            name = name_for(folder, ending(there.name), on)
+            file = f"per_view_on_{name}.csv"
+            with relisted(folder, file):
+                write_per_view(folder, result, file)
+        return result, there
+
+
+def evaluated_file(
+    folder: Path, ply: Path, how: Opens = AS_IT_IS, on: Path | None = None
+) -> tuple[EvaluationResult, int, Elsewhere | None]:
+    """Evaluates Gaussians of a PLY on the held-out views of a run, exposures of the run included.
+
+    Nothing is written.
+
+    Args:
+        folder: The run's folder.
+        ply: The file, in the coordinates of the scene's input; this or another program wrote it.
+        how: How the run is opened.
+        on: Another capture of the place, whose views are drawn instead, without exposures; see
+            `evaluated_on`.
+
+    Returns:
+        The figures, the number of Gaussians, and the other capture where there is one.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, or the file cannot be read; see also
+            `elsewhere`.
+    """
+    require_checkpoint(folder)
+    setup, state = how.open(folder)
+    warn_if_changed(ply)
+    gaussians = build(Exporter, EXPORTER, {}).read(ply, setup.scene.similarity)
+    if on is None:
+        there, views, points = None, setup.scene.test_views, setup.scene.points
+        draw = drawer(setup, state, gaussians)
+    else:
+        there = elsewhere(setup, on)
+        views, points, draw = there.views, there.points, plain_drawer(setup, gaussians)
+    return measured(views, draw, setup.metrics, points=points), len(gaussians), there
+
+
+def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
+    """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
+
+    The folder of a run that is training, and one that may not be written to, is only read; so is
+    one whose per_view.csv has figures that cannot be measured here.
+
+    Raises:
+        UserError: It is no run, or it has no checkpoint.
+    """
+    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    with writing_if_possible(folder, "evaluating") as writes:
+        setup, state = how.open(folder)
+        draw, points = renderer(setup, state), setup.scene.points
+        result = measured(setup.scene.test_views, draw, setup.metrics, points=points)
+        if writes:
+            name = own_name(folder, PER_VIEW, state.step)
+            name = name.replace(".", "_accepted.") if is_changed(setup) else name
+            if name != PER_VIEW or not _loses_figures(folder, result):
+                with relisted(folder, name):
+                    write_per_view(folder, result, name)
+        return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
+
+
+def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
+    """Whether per_view.csv has figures that could not be measured now; then says that it stays."""
+    try:
+        before = read_per_view(folder)
+    except UserError:  # A damaged one is written anew.
+        return False
+    lost = _known(before) - _known(result.views)
+    if lost:
+        _LOG.warning("%s stays as it is: %s not measured here", PER_VIEW, listed(sorted(lost)))
+    return bool(lost)
+
+
+def _known(views: Sequence[ViewMetrics]) -> set[str]:
+    """The figures that some view has."""
+    return {name for view in views for name, value in view.values.items() if value is not None}

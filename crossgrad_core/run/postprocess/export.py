@@ -1,0 +1,110 @@
+"""Files of Gaussians of a run that was trained."""
+
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.georeference import INPUT, check_coordinates
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build, find
+from crossgrad_core.run.export import Exported, described, export_scene, georef_of
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
+from crossgrad_core.run.postprocess.output_paths import own_name, writing
+from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.run.session import CLOUD
+from crossgrad_core.system.check_writable import check_file, check_new
+from crossgrad_core.system.checksums import relisted
+from crossgrad_core.system.files import clear_leftovers
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import one_line
+
+#: Files of Gaussians by the names that programs give them: none holds what another one's says.
+_OF_FORMATS: Final = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
+
+
+def export(
+    folder: Path,
+    *,
+    file_format: str | None,
+    out: Path | None,
+    camera: str | None = None,
+    coordinates: str = INPUT,
+    how: Opens = AS_IT_IS,
+) -> None:
+    """As `exported`; prints what is in the file."""
+    path, content = exported(
+        folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
+    )
+    for line in described(content, path):
+        print(line)  # noqa: T201
+    print(f"{content.gaussians:,} Gaussians in {one_line(path)}")  # noqa: T201
+
+
+def exported(
+    folder: Path,
+    *,
+    file_format: str | None,
+    out: Path | None,
+    camera: str | None = None,
+    coordinates: str = INPUT,
+    how: Opens = AS_IT_IS,
+) -> tuple[Path, Exported]:
+    """Writes the trained scene to a file that viewers open.
+
+    Args:
+        folder: The run's folder.
+        file_format: Name of an exporter; None takes the run's own.
+        out: The file; by default one in the run's folder that summary.json does not describe as
+            something else.
+        camera: Name of the view to bake for; by default the average over the training views.
+        coordinates: Of the file, as `check_coordinates` takes them.
+        how: How the run is opened.
+
+    Returns:
+        The file and what is in it.
+
+    Raises:
+        UserError: There is no such format, it is no run, it has no checkpoint, the file exists,
+            there is no such view or nothing to bake for it, the scene cannot be put into these
+            coordinates, or the run is training and no other file is named.
+    """
+    check_coordinates(coordinates)
+    if file_format is not None:
+        find("exporters", file_format)
+    with writing(folder, out, "exporting"):
+        if out is not None:
+            check_file(out)
+            check_new(out, georef_of(out))
+            clear_leftovers(out.parent, shared=True)
+        setup, state = how.open(folder)
+        exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
+        if file_format not in {None, setup.selection.names["exporter"]}:
+            exporter = build(Exporter, str(file_format), {})
+        if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
+            raise UserError(
+                "the file is named as one of another format",
+                where=f"--out {out}",
+                expected=f"a name that ends in .{exporter.suffix}",
+                todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
+            )
+        if camera is not None and setup.backbone.plain:
+            raise UserError(
+                f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+                where="--camera",
+                todo="leave it out: the file is the same for every view",
+            )
+        words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
+        words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]
+        name = f"{'_'.join(words)}.{exporter.suffix}"
+        if words == [CLOUD]:
+            path = out or folder / own_name(folder, name, state.step)
+        else:
+            path = out or folder / name
+            check_new(path)
+        with relisted(folder, *(() if out else (path.name, georef_of(path).name))):
+            return path, export_scene(setup, state, path, camera, exporter, coordinates)
+
+
+def _flat(setup: Setup, camera: str) -> str:
+    """The view's name as a part of a file name; that of no view as it is, to be refused later."""
+    return flat_names([view.name for view in setup.scene.views]).get(camera, "view")

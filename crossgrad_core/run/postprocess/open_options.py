@@ -1,0 +1,42 @@
+"""How a run that was trained is opened."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from crossgrad_core.run.load_run import opened
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+
+
+class Opens(Protocol):
+    """A way of opening a run."""
+
+    def open(self, folder: Path) -> tuple[Setup, TrainState]:
+        """The run's setup and its newest state."""
+        ...
+
+
+@dataclass(frozen=True)
+class How:
+    """How a run is opened.
+
+    Attributes:
+        device: Where tensors live; the run's own by default.
+        threads: CPU threads; all by default.
+        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+    """
+
+    device: str | None = None
+    threads: int | None = None
+    accept_scene: bool = False
+
+    def open(self, folder: Path) -> tuple[Setup, TrainState]:
+        """The run's setup and its newest state."""
+        given = {"device": self.device, "threads": self.threads}
+        machine = {name: value for name, value in given.items() if value is not None}
+        return opened(folder, machine, accept_scene=self.accept_scene)
+
+
+#: On the run's own device, with all threads and its own scene.
+AS_IT_IS = How()

@@ -1,0 +1,65 @@
+"""Where results of a run go that are made afterwards: nothing is replaced that is described."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.load_run import require_checkpoint
+from crossgrad_core.run.results.folder import clear_half_written
+from crossgrad_core.run.results.lock import RunInUseError, locked
+from crossgrad_core.run.results.scene_file import ACCEPTED
+from crossgrad_core.run.results.summary import summarised_step
+from crossgrad_core.training.setup import Setup
+
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
+    """Locks the run's folder, or says why it is only read; answers which."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder, doing))
+        except UserError as error:
+            found = f" ({error.found})" if error.found else ""
+            _LOG.warning("%s%s: results are shown, and none is written there", error.what, found)
+            yield False
+        else:
+            clear_half_written(folder)
+            yield True
+
+
+@contextmanager
+def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
+    """Locks the run's folder, unless what is written goes elsewhere."""
+    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    if out is not None:
+        yield
+        return
+    try:
+        with locked(folder, doing):
+            clear_half_written(folder)
+            yield
+    except RunInUseError as error:
+        raise UserError(
+            error.what, where=error.where, found=error.found, todo="name another place with --out"
+        ) from error
+
+
+def is_changed(setup: Setup) -> bool:
+    """Whether the scene is not that of the run: what summary.json describes is left alone."""
+    return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
+
+
+def own_name(folder: Path, name: str, step: int) -> str:
+    """A file name for results of a step, other than that of a file which describes another one.
+
+    The run may have gone on, and been killed, after summary.json and its files were written.
+    """
+    described = summarised_step(folder)
+    if described in {None, step}:
+        return name
+    path = Path(name)
+    return f"{path.stem}_step-{step:06d}{path.suffix}"

@@ -1,0 +1,136 @@
+"""Pictures and films of a run that was trained."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.evaluation.evaluation import evaluate as measured
+from crossgrad_core.run.camera_path import FRAMES, LADDER, camera_path
+from crossgrad_core.run.cross_capture import elsewhere
+from crossgrad_core.run.export import camera_renderer, plain_renderer, renderer
+from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
+from crossgrad_core.run.postprocess.output_paths import is_changed, writing
+from crossgrad_core.run.results.panel_layout import folder_of
+from crossgrad_core.run.results.panel_names import ending
+from crossgrad_core.run.results.panels import PanelWriter
+from crossgrad_core.run.results.sources import name_for
+from crossgrad_core.run.results.video import (
+    ENCODER,
+    drop_frames,
+    film_files,
+    write_film,
+    write_frames,
+)
+from crossgrad_core.system.check_writable import check_folder, check_new
+from crossgrad_core.system.checksums import relisted
+from crossgrad_core.system.files import clear_leftovers
+from crossgrad_core.wording import count, one_line
+
+
+def render(
+    folder: Path,
+    *,
+    split: str,
+    out: Path | None,
+    how: Opens = AS_IT_IS,
+    on: Path | None = None,
+) -> None:
+    """Draws photo | render | error of the views of a run, or of another capture of its place.
+
+    Args:
+        folder: The run's folder.
+        split: Which of its views: test, train or all.
+        out: Where the pictures go; by default into the run's folder.
+        how: How the run is opened.
+        on: The other capture, whose views are drawn instead; see `evaluated_on`.
+
+    Raises:
+        UserError: It is no run, it has no checkpoint, the split is empty, the named folder holds a
+            picture of that name, or it is training and none is named; see also `elsewhere`.
+    """
+    with writing(folder, out, "rendering"):
+        check_folder(out or folder)
+        setup, state = how.open(folder)
+        scene, draw, messages = setup.scene, renderer(setup, state), list[str]()
+        views = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}[split]
+        own = folder_of(folder, state.step) / ("accepted" if is_changed(setup) else "")
+        if on is not None:
+            there, draw = elsewhere(setup, on), plain_renderer(setup, state)
+            messages = there.messages()
+            views = there.views
+            if out is None:
+                own /= f"on_{name_for(folder, ending(there.name), on)}"
+        if not views:
+            raise UserError(
+                "there are no views to render",
+                where=f"--split {split}",
+                todo="choose another --split: train, test or all",
+            )
+        writer = PanelWriter.of(folder, state.step, views, len(views))
+        writer = replace(writer, folder=out or own)
+        if out is not None:
+            check_new(*(out / f"{file}.png" for file in writer.files.values()))
+        clear_leftovers(writer.folder, shared=True)
+        with relisted(folder, *(() if out else (_below(folder, own),))):
+            measured(views, draw, setup.metrics, on_view=writer.write)
+        print("\n".join([*messages, f"{count(len(views), 'panel')} in {one_line(writer.folder)}"]))  # noqa: T201
+
+
+def render_path(
+    folder: Path,
+    path: str,
+    *,
+    frames: int | None = None,
+    out: Path | None,
+    how: Opens = AS_IT_IS,
+) -> None:
+    """Draws what cameras along a path see, as pictures and, beside them, as a film.
+
+    Args:
+        folder: The run's folder.
+        path: See `camera_path`.
+        frames: How many a ladder has, `FRAMES` by default.
+        out: Where the pictures go; by default into the run's folder.
+        how: How the run is opened.
+
+    Raises:
+        UserError: See `camera_path`; or it is no run, it has no checkpoint, it is training and no
+            other folder is named, the named one holds a video or such frames, or there are frames
+            for a path from a file.
+    """
+    if frames is not None and path != LADDER:
+        raise UserError(
+            "--frames is the number of frames of a ladder; a camera path has its own",
+            where=f"--path {path}",
+            todo=f"leave out --frames, or draw --path {LADDER}",
+        )
+    with writing(folder, out, "rendering"):
+        check_folder(out or folder)
+        check_new(*(() if out is None else film_files(out)))
+        setup, state = how.open(folder)
+        along = camera_path(setup.scene, path, frames or FRAMES)
+        if out is not None:
+            check_new(*(out / f"{number:05d}.png" for number in range(len(along.cameras))))
+            clear_leftovers(out, shared=True)
+        draw, own = camera_renderer(setup, state), out is None
+        if out is None:
+            name = ending(along.name)
+            name = name if path == LADDER else name_for(folder, name, Path(path))
+            out = folder_of(folder, state.step) / f"path_{name}"
+        with relisted(folder, *((_below(folder, out),) if own else ())):
+            with torch.no_grad():
+                files = write_frames(map(draw, along.cameras), out)
+            if own:
+                drop_frames(out, len(files))
+            made = write_film(files, along.fps)
+            for film in film_files(out) if own else ():
+                if film != made:  # Of other frames.
+                    film.unlink(missing_ok=True)
+        told = f"film {made}" if made else f"no film: too many or too large without {ENCODER}"
+        print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
+
+
+def _below(folder: Path, place: Path) -> str:
+    return place.relative_to(folder).as_posix()

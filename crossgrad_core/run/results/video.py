@@ -1,0 +1,122 @@
+"""Frames as files, and as a film."""
+
+import io
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from torch import Tensor
+
+from crossgrad_core.contract.images import to_uint8
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
+from crossgrad_core.system.interrupts import HELPERS
+
+#: A program that writes films; where there is none, Pillow writes an animated picture.
+ENCODER: Final = "ffmpeg"
+_QUALITY: Final = 85
+#: Bytes of all frames of an animated picture, which are in memory at once.
+_LARGEST: Final = 1 << 29
+#: Pixels that a side of one may have.
+_LONGEST: Final = 16_383
+
+
+def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
+    """Writes `00000.png` and so on; answers with the files in their order.
+
+    Args:
+        images: Each [H, W, 3] float, need not be clamped.
+        folder: Made if need be.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    from PIL import Image
+
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for number, image in enumerate(images):
+        picture = io.BytesIO()
+        Image.fromarray(to_uint8(image).cpu().numpy()).save(picture, format="png")
+        files.append(folder / f"{number:05d}.png")
+        write_atomically(files[-1], picture.getvalue())
+    return files
+
+
+def drop_frames(folder: Path, count: int) -> None:
+    """Removes the frames from number `count` on, which a longer film left."""
+    number = count
+    while (frame := folder / f"{number:05d}.png").is_file():
+        frame.unlink()
+        number += 1
+
+
+def film_files(folder: Path) -> tuple[Path, Path]:
+    """The film in a folder of frames: as an encoder writes it, and as Pillow does."""
+    return folder / "film.mp4", folder / "film.webp"
+
+
+def write_film(frames: list[Path], fps: float) -> Path | None:
+    """Writes the frames as film.mp4 beside them where ffmpeg is installed, else as film.webp.
+
+    Frames that are too many or too large for an animated picture remain frames: None.
+
+    Args:
+        frames: PNG files named by their numbers from 0 on, in one folder.
+        fps: Frames per second.
+
+    Raises:
+        UserError: ffmpeg failed, or the disk is full.
+    """
+    encoder, (encoded, animated) = shutil.which(ENCODER), film_files(frames[0].parent)
+    if encoder is None:
+        return _animated(frames, animated, fps)
+    with atomic_file(encoded) as file:
+        _encode(encoder, frames, Path(file.name), fps)
+    return encoded
+
+
+def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
+    # The folder may hold more frames, of a longer film.
+    source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
+    count = ["-frames:v", str(len(frames))]
+    # Players want even sides and this pixel format.
+    shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+    command = [encoder, "-y", "-loglevel", "error", *source, *count, *shape, "-f", "mp4"]
+    process = subprocess.Popen(
+        [*command, str(target)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    HELPERS.add(process.pid)
+    try:
+        _, said = process.communicate()
+    finally:
+        HELPERS.discard(process.pid)
+    if process.returncode != 0:
+        raise UserError(
+            "the film could not be written",
+            where=frames[0].parent,
+            found=said.strip()[-300:],
+            todo="the frames are there",
+        )
+
+
+def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
+    from PIL import Image
+
+    with Image.open(frames[0]) as image:
+        size, longest = 3 * image.width * image.height, max(image.size)
+    if size * len(frames) > _LARGEST or longest > _LONGEST:
+        return None
+    images = []
+    for frame in frames:  # Pillow wants them all at once.
+        with Image.open(frame) as image:
+            images.append(image.copy())
+    with atomic_file(path) as file:
+        images[0].save(
+            file, format="webp", save_all=True, append_images=images[1:],
+            duration=round(1000 / fps), loop=0, quality=_QUALITY,
+        )  # fmt: skip
+    return path

@@ -1,0 +1,247 @@
+"""Settings of a new run that would change nothing are refused, with the reason and the way out.
+
+A run that goes on is not asked: what it has lived with so far must not keep it from going on.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.objections import set_for_nothing
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.defaults import BARE_START, GROUP_SAMPLER, PROGRESS
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import reasons_against, refuse
+from crossgrad_core.run.resolve import ALWAYS
+from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
+from crossgrad_core.training.averaging import lr_tail_of
+from crossgrad_core.training.floaters import cameras_that_tell
+from crossgrad_core.training.rates import axes_of
+from crossgrad_core.training.scale_clamp import learns_sizes
+from crossgrad_core.training.schedules import MOST_DEGREES
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.wording import listed, plural
+
+_SLOTS = ("grouping", *ALWAYS)
+_TIMES = ("densify_from", "densify_until", "densify_every", "min_refinements")
+
+
+def refuse_labels_for_nothing(setup: Setup) -> None:
+    """Asks the components again, now that it is known which labels the training views have.
+
+    Raises:
+        IncompatibleSelectionError: Some component looks for labels that no view has.
+    """
+    if setup.groups is None:
+        return
+    labels = tuple(dict.fromkeys(setup.groups))
+    selection = replace(setup.selection, labels=labels)
+    answers = setup.hook.crossgrad_validate_selection(selection=selection)
+    refuse(reasons_against(setup.config, selection, answers))
+
+
+def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
+    """Refuses what the user set and what does nothing in this run.
+
+    Args:
+        config: What the user set, before anything was decided.
+        setup: The assembled run.
+
+    Raises:
+        UserError: Some setting would change nothing.
+    """
+    found = [
+        *_of_components(config, setup),
+        *_of_density_control(config, setup),
+        *_of_resets(config, setup),
+        *_of_views(config, setup),
+        *_of_the_schedule(config, setup),
+        *_of_groups(config, setup),
+        *_of_exposure(config, setup),
+        *_of_the_split(config),
+        *_of_positions(config, setup),
+        *_of_sizes(config, setup),
+        *_of_the_start(config),
+        *_of_the_end(config, setup),
+    ]
+    if found:
+        raise UserError(
+            "settings that would do nothing",
+            where=listed(name for name, _ in found),
+            found="; ".join(f"{name}: {why}" for name, why in found),
+            todo="leave them out, or change what keeps them from doing something",
+        )
+
+
+def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    for slot in _SLOTS:
+        yield from _of_choice(slot, slot, getattr(config, slot), setup)
+    links = config.operators
+    for link in links:
+        # A link of a chain is set by its name.
+        place = "operator" if len(links) == 1 else f"operator.{link.name}"
+        yield from _of_choice("operator", place, link, setup)
+
+
+def _of_choice(
+    slot: str, place: str, choice: ComponentChoice | None, setup: Setup
+) -> Iterator[tuple[str, str]]:
+    if choice is None or not choice.options:
+        return
+    name = setup.selection.names[slot] if choice.name == AUTO else choice.name
+    # As the user set it: fitted to the scene, it may have lost what the scene does not need.
+    component = build(plural(slot), name, choice.options)
+    for option, why in set_for_nothing(component, setup.selection).items():
+        yield f"{place}.{option}", why
+
+
+def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    densifier, name = setup.densifier, setup.selection.names["densifier"]
+    for setting in _TIMES:
+        if getattr(config, setting) is not None and not densifier.edits:
+            yield setting, f"densifier {name} never edits"
+    if config.growth == "curve" and not densifier.edits:
+        yield "growth", f"densifier {name} never edits"
+    # A number bounds the start of points, too.
+    if not densifier.edits and config.max_gaussians == AUTO:
+        yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
+    elif not densifier.edits and config.max_gaussians and config.reading.init_file is not None:
+        yield "max_gaussians", f"densifier {name} never edits, and a PLY is taken as it is"
+
+
+def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.reset_every is not None and not setup.densifier.resets:
+        yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
+    # A run that follows the clock notes it once its length is known.
+    if not (config.seconds or config.planned_seconds):
+        yield from without_resets(config, setup)
+
+
+def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """Options of the densifier that do nothing because opacities are not reset, each with why."""
+    if config.densifier is None or setup.schedule.reset_every is not None:
+        return
+    densifier, given = setup.densifier, config.densifier.options
+    fields = type(densifier).model_fields
+    for option in sorted(densifier.reset_options & given.keys()):
+        if getattr(densifier, option) != fields[option].default:
+            yield f"densifier.{option}", "the run has no opacity resets; --set reset_every=N"
+
+
+def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """What depends on the views of a step."""
+    densifier, name = setup.densifier, setup.selection.names["densifier"]
+    one = setup.selection.views_per_step == 1
+    if config.densify_views != "all" and not (densifier.edits and densifier.observes):
+        yield "densify_views", f"densifier {name} gathers no statistics of views"
+    elif config.densify_views == "one" and one:
+        yield "densify_views", "a step has one view; ask for more --views"
+    if config.batch_rule != "none" and one:
+        yield "batch_rule", "a step has one view; ask for more --views"
+
+
+def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.reference is not None and config.schedule == "scaled":
+        yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
+    if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
+        yield "clock", "the length of the run is not in seconds; add --seconds"
+    stop, total = config.stop_after, setup.schedule.total
+    # A run within a budget may become longer.
+    if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
+        yield "stop_after", f"the run ends after step {total}"
+    if config.min_refinements and not setup.schedule.min_refinements:
+        why = "are published or have times that were set are not made to fit"
+        yield "min_refinements", f"edits that count steps, {why}"
+    yield from _of_harmonics(config, setup)
+
+
+def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if not any(block.rests for block in setup.trained_blocks):
+        why = f"backbone {setup.selection.names['backbone']} trains no SH bands above the first"
+        if (config.sh_every or 1) > 1:
+            yield "sh_every", why
+        if config.sh_start:
+            yield "sh_start", why
+    elif config.sh_start and setup.schedule.sh_from >= MOST_DEGREES:
+        yield "sh_start", "all harmonics are drawn from the first step on (sh_from, --init)"
+
+
+def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """A grouping that was named and is not read."""
+    selection = setup.selection
+    sampler, operator = selection.sampler, selection.operator
+    watched = any(choice.name != PROGRESS for choice in config.observers)
+    named = config.grouping is not None and config.grouping.name != AUTO
+    if not named or sampler.reads_groups or watched:
+        return
+    if sampler.own_labels:
+        yield "grouping", f"sampler {selection.names['sampler']} makes its own groups"
+    elif not operator.reads_labels():
+        yield (
+            "grouping",
+            f"sampler {selection.names['sampler']} draws from all views alike, and operator "
+            f"{selection.names['operator']} reads no labels; --sampler {GROUP_SAMPLER} "
+            "draws from groups, --set grouping=null leaves a file's out",
+        )
+
+
+def _of_exposure(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.exposure_from is not None and not setup.per_photo:
+        name = setup.selection.names["exposure"]
+        yield (
+            "exposure_from",
+            f"exposure {name} has no values of photos; --exposure NAME takes the one that wrote "
+            "the file",
+        )
+
+
+def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
+    reading = config.reading
+    if reading.test_every == SceneOptions.model_fields["test_every"].default:
+        return
+    if reading.split == "none":
+        yield "reading.test_every", "--split none holds no photo out"
+    lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
+    if reading.split == "auto" and lists:
+        yield "reading.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+
+
+def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
+    asked = config.start is not None and config.start.name != BARE_START
+    if asked and config.reading.init != "points":
+        yield "start", f"--init {config.reading.init} has points of its own; leave one of them out"
+    if config.reading.points is not None and config.reading.init != "points":
+        yield "reading.points", f"--init {config.reading.init} starts from other points"
+
+
+def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    """What is said about rates that fade and about floaters, where there can be none."""
+    fades = lr_tail_of(config) > 0.0
+    if config.lr_tail_factor != RunConfig.model_fields["lr_tail_factor"].default and not fades:
+        yield "lr_tail_factor", "no rate fades with --lr-tail 0, which --preset inria has by itself"
+    if config.lr_tail and all(block.lr.decays for block in setup.trained_blocks):
+        name = setup.selection.names["backbone"]
+        yield "lr_tail", f"backbone {name} has no constant rates"
+    if config.floaters == "remove":
+        if not setup.backbone.positions:
+            yield "floaters", f"backbone {setup.selection.names['backbone']} names no positions"
+        if not cameras_that_tell(setup.scene):
+            yield "floaters", "no photo observes enough points to say what around it is empty"
+
+
+def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.position_lr == "per-axis" and axes_of(setup) is None:
+        name = setup.selection.names["backbone"]
+        yield "position_lr", f"primitives of backbone {name} are no Gaussians with axes"
+
+
+def _of_sizes(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    if config.max_scale_ratio and not learns_sizes(setup):
+        name = setup.selection.names["backbone"]
+        yield "max_scale_ratio", f"backbone {name} has no Gaussians with axes that learn"
+
+
+def _is_there(scene: Path | None, name: str) -> bool:
+    return scene is not None and (scene / name).is_file()

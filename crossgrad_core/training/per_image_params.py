@@ -1,0 +1,214 @@
+"""Parameters per photo: kept as a state beside those of plugins, stepped by an Adam of their own.
+
+The state is a value like that of a plugin, so that snapshots, rewinding and checkpoints carry it.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.scene import View
+from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.checksums import warn_if_changed
+from crossgrad_core.training.adam.adam import adam_step
+from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.photo_file import read_values, write_values
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.wording import listed
+
+#: The name among the states of plugins.
+STATE = "photos"
+_VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
+
+#: Name -> leaf [...] of one photo.
+Leaves = dict[str, Tensor]
+
+
+def started(setup: Setup) -> PluginState | None:
+    """The state before the first step; None where nothing has a value per photo.
+
+    Raises:
+        UserError: A start is not one finite float32 row for each training photo.
+    """
+    parameters = setup.per_photo
+    if not parameters:
+        return None
+    starts = {name: each.first() for name, each in parameters.items()}
+    for name, start in starts.items():
+        _check(setup, f"starts parameter {name} with", start)
+    tensors = {}
+    for name, each in (known_starts(setup) or starts).items():
+        start = each.detach().to(setup.device).clone(memory_format=torch.contiguous_format)
+        tensors[f"{_VALUE}.{name}"] = start
+        tensors[f"{_FIRST}.{name}"] = torch.zeros_like(start)
+        tensors[f"{_SECOND}.{name}"] = torch.zeros_like(start)
+    tensors[_COUNT] = torch.zeros(len(setup.train_views), dtype=torch.int64)
+    return PluginState({"photos": [view.name for view in setup.train_views]}, tensors)
+
+
+def known_starts(setup: Setup) -> Mapping[str, Tensor]:
+    """The starts with the values of photos that the user has a file of; empty without one.
+
+    Photos that are not in it keep what they differ by from those that are, on average.
+
+    Raises:
+        UserError: Its values are of no training photo, or do not fit.
+    """
+    path = setup.config.exposure_from
+    if path is None:
+        return {}
+    starts = {name: each.first() for name, each in setup.per_photo.items()}
+    warn_if_changed(path)
+    known = read_values(path, starts)
+    names = [view.name for view in setup.train_views]
+    rows = [row for row, name in enumerate(names) if name in known]
+    if not rows:
+        raise UserError(
+            "the file has values of no training photo",
+            where=path,
+            expected=f"photos such as {names[0]}",
+            found=listed(list(known)[:3]),
+            todo="name the exposure.json of a run on this scene, or leave --exposure-from out",
+        )
+    merged = {}
+    for name, start in starts.items():
+        values = torch.stack([known[names[row]][name] for row in rows])
+        merged[name] = setup.exposure.shift(name, start, start[rows].mean(0), values.mean(0))
+        merged[name][rows] = values
+    return setup.exposure.project(merged)
+
+
+def check_photos_are(setup: Setup, state: TrainState) -> None:
+    """Refuses values of other photos than those that are trained on.
+
+    Raises:
+        UserError: They are.
+    """
+    held = state.states.get(STATE, EMPTY_STATE).values.get("photos", [])
+    names = [view.name for view in setup.train_views] if setup.per_photo else []
+    if held != names:
+        raise UserError(
+            "the checkpoint holds values of other photos than those that are trained on",
+            where=f"exposure {setup.selection.names['exposure']}",
+            todo="go on with the photos and the split of that run",
+        )
+
+
+def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
+    """Writes the values of all training photos, where there are any; says whether it did."""
+    values = _values(setup, state)
+    if values:
+        photos = [view.name for view in setup.train_views]
+        write_values(path, setup.selection.names["exposure"], photos, values)
+    return bool(values)
+
+
+def leaves_of(setup: Setup, state: TrainState, index: int) -> Leaves:
+    """Copies of a training photo's values that gather gradients."""
+    values = _values(setup, state)
+    return {name: each[index].detach().clone().requires_grad_() for name, each in values.items()}
+
+
+def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
+    """What the exposure makes of a render of any view, with the values as they are now."""
+    values = _values(setup, state)
+    row = setup.row_of.get(view.name)
+    if row is not None:
+        own: Mapping[str, Tensor] = {name: each[row] for name, each in values.items()}
+    else:
+        own = setup.exposure.predict_unseen(view, setup.scene, values) if values else {}
+    return setup.exposure.apply(image, own)
+
+
+def take_photo_step(
+    setup: Setup, state: TrainState, taken: Iterable[tuple[int, Leaves]], progress: float
+) -> None:
+    """One step of Adam for each photo of the step, then the projection of all.
+
+    A photo that was drawn twice takes one step with the sum of its gradients.
+
+    Args:
+        setup: The run.
+        state: Its state; gets new tensors.
+        taken: Position of each drawn view and its leaves after the backward passes.
+        progress: Share of the schedule that is over, for the learning rates.
+
+    Raises:
+        NonFiniteError: A gradient is NaN or infinite.
+        UserError: The projection does not give all values back.
+    """
+    if not setup.per_photo:
+        return
+    held = state.states[STATE]
+    tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
+    # A checkpoint has brought it to the GPU, which would be waited for in each step.
+    tensors[_COUNT] = tensors[_COUNT].cpu()
+    rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
+    for row, gradients in _summed(taken).items():
+        _check_gradients(setup, state, row, gradients)
+        part = partial(_row, tensors, row, gradients)
+        steps = dict.fromkeys(gradients, int(tensors[_COUNT][row]))
+        moments = AdamState(part(_FIRST), part(_SECOND), steps)
+        adam_step(part(_VALUE), gradients, moments, rates)
+        tensors[_COUNT][row] += 1
+    values = {name: tensors[f"{_VALUE}.{name}"] for name in setup.per_photo}
+    for name, value in setup.exposure.project(values).items():
+        _check(setup, f"projects parameter {name} to", value)
+        tensors[f"{_VALUE}.{name}"] = value.detach()
+    state.commit({STATE: PluginState(held.values, tensors)})
+
+
+def _values(setup: Setup, state: TrainState) -> dict[str, Tensor]:
+    held = state.states.get(STATE, EMPTY_STATE).tensors
+    return {name: held[f"{_VALUE}.{name}"] for name in setup.per_photo}
+
+
+def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]:
+    """Position of a photo -> gradients of its values, those of several draws added up."""
+    found: dict[int, dict[str, Tensor]] = {}
+    for row, leaves in taken:
+        gradients = found.setdefault(row, {})
+        for name, leaf in leaves.items():
+            if leaf.grad is not None:
+                gradients[name] = gradients[name] + leaf.grad if name in gradients else leaf.grad
+    return found
+
+
+def _row(
+    tensors: Mapping[str, Tensor], row: int, names: Iterable[str], kind: str
+) -> dict[str, Tensor]:
+    """One photo's rows of the tensors of a kind, to be changed in place."""
+    return {name: tensors[f"{kind}.{name}"][row] for name in names}
+
+
+def _check_gradients(
+    setup: Setup, state: TrainState, row: int, gradients: Mapping[str, Tensor]
+) -> None:
+    for name, gradient in gradients.items():
+        if not _is_finite(gradient):
+            view = setup.train_views[row].name
+            raise NonFiniteError(state.step, (view,), f"the gradient of the photo's {name}")
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    """Whether it is; on a GPU it is not waited for: the loss of the photo's next draw tells."""
+    return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
+
+
+def _check(setup: Setup, does: str, value: Tensor) -> None:
+    photos = len(setup.train_views)
+    right = value.ndim > 0 and value.shape[0] == photos and value.dtype == torch.float32
+    if right and _is_finite(value):
+        return
+    raise UserError(
+        f"exposure {setup.selection.names['exposure']} {does} what cannot be values of photos",
+        expected=f"finite float32 tensors of {photos} rows, one for each training photo",
+        found=f"{value.dtype} of shape {list(value.shape)}",
+        todo="choose another --exposure, or repair the plugin",
+    )

@@ -1,0 +1,312 @@
+"""From folders to runs: what is broken, unfinished or of another kind is sorted out."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from sys import float_info
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import BaseModel, Field, ValidationError
+
+from crossgrad_core.commands import (
+    RunConfig,
+    UserError,
+    check_unchanged,
+    find_runs,
+    read_results,
+    read_rows,
+)
+from crossgrad_plugins.compare.run import Run
+
+if TYPE_CHECKING:
+    from crossgrad_core.commands import RunResults
+
+#: The table of a sweep, beside the folder of its runs.
+_PLAN: Final = "runs.csv"
+_ID, _LABEL = "run", "configuration"
+_LENGTHS: Final = ("steps=", "max_views=", "seconds=")
+#: What a grid without arms calls its only one.
+_ONLY: Final = "run"
+_REPEAT: Final = "restore the file, or repeat the run: crossgrad run --config config.yaml"
+_OVERSIZED: Final = "a whole number that is too large"
+
+
+class _Seconds(BaseModel):
+    """The seconds of summary.json that are added up."""
+
+    phases: dict[str, Annotated[float, Field(strict=True, allow_inf_nan=False)]] | None = None
+
+
+class _Summary(BaseModel):
+    """The part of summary.json that a comparison takes for granted, of any version."""
+
+    status: str
+    scene: str
+    step: int
+    overall: dict[str, float | None] | None
+    regimes: dict[str, dict[str, float | None]]
+    notes: list[str] = []
+    definitions: dict[str, str] = {}
+    environment: dict[str, Any] = {}
+    seconds: _Seconds = _Seconds()
+
+
+@dataclass
+class RunRecord:
+    """The runs in the folders.
+
+    Attributes:
+        runs: The runs that finished.
+        failed: The runs that failed: they never reach a quality.
+        left_out: Folder -> why it is not compared.
+    """
+
+    runs: list[Run] = field(default_factory=list)
+    failed: list[Run] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
+    """Reads every run at or below the places, each folder once.
+
+    Args:
+        places: Folders of runs, or folders with runs below.
+        skip_broken: Leave out a run with a damaged file, instead of refusing to go on.
+
+    Raises:
+        UserError: A place holds no run, or a file of a run is damaged.
+    """
+    found = RunRecord()
+    folders = list(dict.fromkeys(folder for place in places for folder in _folders(place)))
+    names = _short_names(folders)
+    labels = {parent: _labels(parent) for parent in {folder.parent for folder in folders}}
+    for folder in dict.fromkeys(each for place in places for each in _headless(place)):
+        if not skip_broken:
+            raise UserError(
+                "results of a run without its config.yaml",
+                where=folder,
+                todo="restore the file, or move the folder away; --skip-broken leaves this run out "
+                "and compares the others",
+            )
+        found.left_out[str(folder)] = "has no config.yaml"
+    for folder in folders:
+        try:
+            results = read_results(folder)
+            for label in labels[folder.parent].get(folder.name, (None,)):
+                _sort_in(found, names[folder], results, label)
+        except UserError as error:
+            if not skip_broken:
+                raise _broken(error) from error
+            found.left_out[names[folder]] = f"{error.what}: {error.where}"
+    return found
+
+
+def check_places(places: Sequence[Path]) -> None:
+    """Refuses what is no folder, before anything is said of where results go.
+
+    Raises:
+        UserError: One is a file, or is not there.
+    """
+    for place in places:
+        if not place.is_dir():
+            raise _no_run(place)
+
+
+def _folders(place: Path) -> Iterator[Path]:
+    found = find_runs(place) if place.is_dir() else ()
+    if not found:
+        raise _no_run(place)
+    yield from (folder.resolve() for folder in found)
+
+
+def _no_run(place: Path) -> UserError:
+    there = "a file" if place.is_file() else "no such folder"
+    return UserError(
+        "no run to compare",
+        where=place,
+        expected="the folder of a run, or one with runs below it",
+        found="no config.yaml" if place.is_dir() else there,
+        todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
+    )
+
+
+def _headless(place: Path) -> Iterator[Path]:
+    """Folders with results of a run at or below a place whose config.yaml is gone."""
+    for path in sorted(place.rglob("summary.json")):
+        folder = path.parent
+        if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
+            yield folder.resolve()
+
+
+def _broken(error: UserError) -> UserError:
+    return UserError(
+        error.what,
+        where=error.where,
+        expected=error.expected,
+        found=error.found,
+        todo=f"{error.todo}; --skip-broken leaves this run out and compares the others",
+    )
+
+
+def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | None) -> None:
+    if results.summary is None:
+        found.left_out[name] = "has not ended: no summary.json"
+        return
+    _check_summary(results)
+    run = Run(name, results, results.summary, _config(results), label)
+    if run.status == "failed":
+        found.failed.append(run)
+        found.left_out[name] = f"failed: {' '.join(str(run.summary.get('error')).split())}"
+    elif run.status != "finished":
+        found.left_out[name] = "was stopped before its end"
+    elif not results.rows and not (run.summary.get("overall") or {}).get("views"):
+        found.left_out[name] = "was never evaluated: metrics.csv has no row"
+    else:
+        _check_whole(results)
+        found.runs.append(run)
+
+
+def _check_whole(results: "RunResults") -> None:
+    """Refuses a finished run of which a file is cut off or gone: readings would be of elsewhere.
+
+    Raises:
+        UserError: metrics.csv ends before the run did or has a number that is too large, held-out
+            views have no figures, or the marks of the scene cannot be read.
+    """
+    views = (results.scene_marks or {}).get("views") or {}  # Refuses what is no scene.json.
+    if not all(isinstance(view, Mapping) for view in views.values()):
+        raise UserError(
+            "unreadable scene.json",
+            where=results.folder / "scene.json",
+            expected="an object for each view, with what its photo is known by",
+            todo=_REPEAT,
+        )
+    if _oversized(list(results.rows)):
+        raise UserError(
+            "unreadable metrics.csv",
+            where=results.folder / "metrics.csv",
+            found=_OVERSIZED,
+            todo=_REPEAT,
+        )
+    summary = results.summary or {}
+    last = results.rows[-1].get("step") if results.rows else None
+    steps = summary.get("step")
+    if last != steps:
+        raise UserError(
+            "metrics.csv does not go to the end of the run",
+            where=results.folder / "metrics.csv",
+            expected=f"a last row of step {steps}, which summary.json is of",
+            found=f"step {last:.0f}" if last is not None else "no row with a step",
+            todo=_REPEAT,
+        )
+    if (summary.get("overall") or {}).get("views") and not results.views:
+        raise UserError(
+            "the figures of the held-out views are gone",
+            where=results.folder / "per_view.csv",
+            expected="a row of each",
+            found="no such file, or an empty one",
+            todo=f"crossgrad eval {results.folder} writes them again",
+        )
+
+
+def _check_summary(results: "RunResults") -> None:
+    found = _OVERSIZED if _oversized(results.summary) else ""
+    try:
+        _Summary.model_validate(results.summary)
+    except ValueError as error:
+        found = _in_words(error)
+    if found:
+        raise UserError(
+            "unreadable summary.json",
+            where=results.folder / "summary.json",
+            found=found,
+            todo=_REPEAT,
+        )
+
+
+def _oversized(content: object) -> bool:
+    """Whether a whole number in lists and objects is beyond those that can be reckoned with."""
+    rest = [content]
+    while rest:
+        each = rest.pop()
+        if isinstance(each, Mapping):
+            rest += each.values()
+        elif isinstance(each, list):
+            rest += each
+        elif isinstance(each, int) and abs(each) > float_info.max:
+            return True
+    return False
+
+
+def _in_words(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return " ".join(str(error).split())
+    problems = error.errors(include_url=False, include_context=False)
+    return "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in problems)
+
+
+def _config(results: "RunResults") -> dict[str, object]:
+    """The configuration with the names and the defaults of this version.
+
+    What a run had to say about a setting that is newer than its version is not known: such a one
+    is there with its default, or not at all where that is none.
+    """
+    try:
+        config = RunConfig.model_validate(results.config)
+        stated = config.model_dump(mode="json", exclude_unset=True)
+        return _without_nulls(config.model_dump(mode="json"), stated)
+    except ValueError as error:
+        raise UserError(
+            "unreadable configuration of a run",
+            where=results.folder / "config.yaml",
+            found=_in_words(error),
+            todo="restore the file, or read the run with the version that wrote it",
+        ) from error
+
+
+def _without_nulls(settings: Mapping[str, Any], besides: Mapping[str, Any]) -> dict[str, object]:
+    """The settings without those that are null, besides some, and likewise in inner ones."""
+    return {
+        name: _without_nulls(value, besides.get(name) or {}) if isinstance(value, dict) else value
+        for name, value in settings.items()
+        if value is not None or name in besides
+    }
+
+
+def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Name of a run's folder -> what its sweep calls it; none where no sweep wrote the folder.
+
+    A run that two configurations come to stands for both.
+    """
+    plan = folder.parent / _PLAN
+    if not plan.is_file():
+        return {}
+    todo = "remove it: the command of the sweep writes it again"
+    check_unchanged(plan.parent, [plan.name], todo)
+    header, *lines = read_rows(plan, "the table of the sweep", "restore it, or remove it") or [[]]
+    if not {_ID, _LABEL} <= set(header):
+        return {}
+    at, called = header.index(_ID), header.index(_LABEL)
+    found: dict[str, tuple[str, ...]] = {}
+    for line in lines:
+        if len(line) == len(header):
+            found[line[at]] = tuple(
+                dict.fromkeys((*found.get(line[at], ()), without_length(line[called])))
+            )
+    return found
+
+
+def without_length(label: str) -> str:
+    """A label without what makes no arm: the length, and the name of the only arm of a grid."""
+    parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
+    named = parts[1:] if parts[:1] == [_ONLY] else parts
+    return ", ".join(named or parts)
+
+
+def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
+    """The folders below the last one that they share."""
+    shared = 0
+    parts = [folder.parts for folder in folders]
+    while parts and all(len(p) > shared + 1 and p[shared] == parts[0][shared] for p in parts):
+        shared += 1
+    return {folder: "/".join(folder.parts[shared:]) for folder in folders}

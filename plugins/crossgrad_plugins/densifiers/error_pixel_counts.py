@@ -1,0 +1,211 @@
+"""Counts of the erroneous pixels that each primitive is blended in, over several views (FastGS)."""
+
+from abc import ABC
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from crossgrad_core.plugin import (
+    Densifier,
+    DensifyContext,
+    PluginState,
+    RenderedView,
+    View,
+    screen_statistics,
+    unit_range,
+)
+
+#: Sums per primitive and regime [P, R]: marked pixels, these times the view's loss, and renders
+#: that showed the primitive.
+MARKED, ERROR, VISITS = "marked", "error", "visits"
+#: How many views of each regime were rendered.
+DRAWN = "drawn"
+#: The power of the visits in the rank of a primitive: between a sum (0) and a mean (1).
+VISITS_POWER = 0.75
+
+
+@dataclass(frozen=True)
+class MultiViewScore:
+    """The importance of P primitives by several views, regime by regime.
+
+    Attributes:
+        marked: [P, R] erroneous pixels of the full photo, the mean over views.
+        error: [P, R] these times the view's loss, likewise.
+        rank: [P, R] what the primitives of a regime are ranked by.
+    """
+
+    marked: Tensor
+    error: Tensor
+    rank: Tensor
+
+    def above(self, threshold: float) -> Tensor:
+        """[P, R] bool, whole numbers of erroneous pixels above a threshold."""
+        return self.marked.floor() > threshold
+
+    def strength(self, grows: Tensor) -> Tensor:
+        """[P] minus the best place that a primitive has in any regime among those that grow [P, R].
+
+        The regimes take turns: the first of each, then the second of each ...
+        """
+        ranked = torch.where(grows, self.rank, -torch.inf)
+        order = ranked.argsort(dim=0, descending=True, stable=True)
+        places = torch.empty_like(self.rank)
+        numbers = torch.arange(len(order), device=order.device).to(places)
+        places.scatter_(0, order, numbers[:, None].expand_as(places))
+        return -torch.where(grows, places, torch.inf).amin(dim=1)
+
+    @property
+    def pruning_score(self) -> Tensor:
+        """[P] in [0, 1], the error from the least to the largest; 0 where all have the same."""
+        error = self.error.sum(dim=1)
+        if len(error) == 0:
+            return error
+        low, high = error.amin(), error.amax()
+        return torch.where(high > low, (error - low) / (high - low), 0.0)
+
+
+class CountsMarkedPixels(Densifier, ABC):
+    """A densifier that asks in how many erroneous pixels of several views a primitive is blended.
+
+    A pixel of a view is erroneous where its absolute difference from the photo, the mean over
+    channels, from the least to the largest of the view, is above `error_threshold`. Pixels are
+    those of the full photo, at whatever scale it is rendered.
+    """
+
+    count: Literal["render", "running"] = Field(
+        "render",
+        description="what counts: render some views at each edit, or running: the views that the "
+        "steps since the last edit have rendered",
+    )
+    views: int = Field(10, ge=1, description="training views rendered at each edit, at random")
+    share: float = Field(
+        0.25, gt=0, le=1, description="running: share of the steps whose views count"
+    )
+    regimes: bool = Field(
+        False, description="count by regime, and grow where the views of any regime ask for it"
+    )
+    error_threshold: float = Field(
+        0.1, ge=0, lt=1, description="error of a pixel above which it counts; share of the largest"
+    )
+    importance: float = Field(
+        5.0, ge=0, description="grow where more pixels of a view err on average, whole numbers"
+    )
+
+    def counted(self, context: DensifyContext, state: PluginState) -> PluginState:
+        """The counts with those that are due in this step."""
+        edits = context.schedule.densifies(context.step)
+        if self.count == "render":
+            return self.rendered(context) if edits else PluginState()
+        sums = self._sums(context, state)
+        if edits or context.rng.random() < self.share:
+            for record in context.views:
+                self._add(context, record, record.loss, sums)
+        return PluginState(per_primitive=sums)
+
+    @torch.no_grad()
+    def rendered(self, context: DensifyContext) -> PluginState:
+        """The counts of `views` training views, rendered as large as those of the step."""
+        last = context.views[-1] if context.views else None
+        scale, background = (last.scale, last.background) if last else (1.0, None)
+        columns = [self._column(context, view) for view in context.scene.train_views]
+        drawn = drawn_views(columns, self.views, context.rng)
+        sums = self._sums(context, PluginState())
+        for index in drawn:
+            view = context.render(index, scale, frozenset({"count"}), background)
+            self._add(context, view, float(view.loss), sums)
+        numbers = np.bincount([columns[index] for index in drawn], minlength=max(columns) + 1)
+        return PluginState({DRAWN: numbers.tolist()}, per_primitive=sums)
+
+    def importance_of(self, state: PluginState) -> MultiViewScore:
+        """What the counts of a state say.
+
+        A mean is over the views that were rendered for it; in the running variant over the renders
+        that showed the primitive.
+        """
+        marked, error, visits = (state.per_primitive[name] for name in (MARKED, ERROR, VISITS))
+        drawn = state.values.get(DRAWN)
+        per = (visits if drawn is None else torch.tensor(drawn).to(visits)).clamp(min=1.0)
+        rank = error / visits.clamp(min=1.0).pow(VISITS_POWER)
+        return MultiViewScore(marked / per, error / per, rank)
+
+    def idle_counting(self, *, renders: bool) -> dict[str, str]:
+        """Options of the counting that change nothing beside the others.
+
+        Args:
+            renders: Whether the running variant renders views, too.
+        """
+        if self.count == "render":
+            return {"share": "count render has views of its own; leave it out"}
+        why = "count running renders no views; leave it out"
+        return {} if renders else {"views": why}
+
+    def _sums(self, context: DensifyContext, state: PluginState) -> dict[str, Tensor]:
+        """Copies of the sums [P, R], zeros at first."""
+        blocks, have = context.backbone.blocks(), state.per_primitive
+        name = next(block.tensors[0] for block in blocks if block.per_primitive)
+        like = context.parameters[name].detach()
+        zeros = like.new_zeros(like.shape[0], len(self._regimes(context)))
+        return {each: have.get(each, zeros).clone() for each in (MARKED, ERROR, VISITS)}
+
+    def _regimes(self, context: DensifyContext) -> list[str]:
+        """The regimes that are told apart."""
+        names = {view.regime for view in context.scene.train_views} if self.regimes else {""}
+        return sorted(names)
+
+    def _column(self, context: DensifyContext, view: View) -> int:
+        return self._regimes(context).index(view.regime) if self.regimes else 0
+
+    def _add(
+        self, context: DensifyContext, view: RenderedView, loss: float, sums: dict[str, Tensor]
+    ) -> None:
+        """Adds the counts of a view to the sums, in place."""
+        if view.screen.count is None:
+            raise RuntimeError("the rasterizer was asked for a count and gave none")
+        column = self._column(context, view.view)
+        counts = view.screen.count(erroneous(view, self.error_threshold))
+        marked, shown = (torch.zeros_like(sums[MARKED][:, 0]) for _ in range(2))
+        screen_statistics.add(view, marked, screen_statistics.of_photo(view, counts))
+        screen_statistics.add(view, shown, screen_statistics.visible(view))
+        sums[MARKED][:, column] += marked
+        sums[ERROR][:, column] += marked * loss
+        sums[VISITS][:, column] += shown > 0
+
+
+def erroneous(view: RenderedView, threshold: float) -> Tensor:
+    """[H, W] bool, pixels whose error, from the view's least to its largest, is above a threshold.
+
+    The error is the absolute difference from the photo, the mean over channels. Pixels that are
+    masked out are not, nor is any where all have the same error.
+    """
+    photo = unit_range(view.photo, view.image.dtype)
+    red, green, blue = (view.image - photo).abs().unbind(-1)
+    error = (red + green + blue) / 3.0
+    least, most = error, error
+    if view.mask is not None:
+        least = torch.where(view.mask, error, torch.inf)
+        most = torch.where(view.mask, error, -torch.inf)
+    low, high = least.amin(), most.amax()
+    marked = (error - low) > threshold * (high - low)
+    return marked if view.mask is None else marked & view.mask
+
+
+def drawn_views(columns: Sequence[int], number: int, rng: np.random.Generator) -> list[int]:
+    """So many different views at random, of all groups as evenly as `number` goes, at least one.
+
+    Args:
+        columns: The group of each view, from 0 on.
+        number: How many views.
+        rng: Draws.
+    """
+    groups = max(columns) + 1
+    drawn = []
+    for group in range(groups):
+        members = np.flatnonzero(np.asarray(columns) == group)
+        wanted = max(1, number // groups + (group < number % groups))
+        drawn += rng.choice(members, min(wanted, len(members)), replace=False).tolist()
+    return drawn

@@ -1,0 +1,214 @@
+"""Models in their place on Earth by GPS, and models that only GPS joins."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_plugins.prepare.gravity import levelled
+from crossgrad_plugins.prepare.subprocess_wait import quiet
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Photos with GPS that a similarity needs.
+FEWEST: Final = 3
+#: Metres by which GPS may be wrong, from a good receiver to a phone between houses; the first at
+#: which most photos agree is taken.
+_ERRORS: Final = (3.0, 10.0, 30.0)
+_AGREEING: Final = 0.6
+#: Photos have to lie apart by so many times what GPS is off: across their main direction, or along
+#: it where they tell which way is up.
+_SPREAD: Final = 3.0
+#: Cameras that lie less across their line than this share of its length have no direction but it.
+_STRAIGHT: Final = 0.05
+#: So many photos of a line are compared with each other, at most.
+_ASKED: Final = 1_000
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A model on Earth.
+
+    Attributes:
+        similarity: From the model to metres east, north, up.
+        residuals: Name -> [3] metres that a camera lies from its GPS, of all photos with GPS.
+        agreeing: Names of those that the similarity was found from.
+    """
+
+    similarity: "pycolmap.Sim3d"
+    residuals: Mapping[str, NDArray[np.float64]]
+    agreeing: frozenset[str]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the agreeing residuals in metres."""
+        lengths = [float(np.linalg.norm(self.residuals[name])) for name in sorted(self.agreeing)]
+        return float(np.sqrt(np.mean(np.square(lengths))))
+
+
+def centers_of(model: "pycolmap.Reconstruction") -> dict[str, NDArray[np.float64]]:
+    """Name -> [3] centre of each camera of a model."""
+    images = (model.image(number) for number in model.reg_image_ids())
+    return {image.name: np.asarray(image.projection_center()) for image in images}
+
+
+def placement_of(
+    model: "pycolmap.Reconstruction",
+    positions: Mapping[str, NDArray[np.float64]],
+    tops: Mapping[str, NDArray[np.float64]],
+) -> tuple[Placement | None, str]:
+    """The place of a model, and why it has none where it has none.
+
+    Args:
+        model: The model.
+        positions: Name -> [3] metres east, north, up, of the photos with GPS.
+        tops: Name -> [3] camera axis towards the top of the photo, of all photos.
+    """
+    centers = centers_of(model)
+    names = sorted(centers.keys() & positions.keys())
+    if len(names) < FEWEST:
+        return None, f"{len(names)} of its photos have GPS, and {FEWEST} are needed"
+    here = np.array([centers[name] for name in names])
+    there = np.array([positions[name] for name in names])
+    found = _aligned(here, there) or _on_a_line(here, there)
+    if found is None:
+        return None, "GPS and poses do not agree: no similarity brings most photos within 30 m"
+    similarity, agrees = found
+    agreeing = frozenset(name for name, good in zip(names, agrees, strict=True) if good)
+    residuals = dict(zip(names, _moved(similarity, here) - there, strict=True))
+    placement = Placement(similarity, residuals, agreeing)
+    middle, (along, across), direction = _line(_moved(similarity, here[agrees]))
+    if across >= _SPREAD * placement.rms:
+        return placement, ""
+    if along < _SPREAD * placement.rms:
+        return None, (
+            f"GPS is not good enough: its photos lie {along:.1f} m apart, and GPS is "
+            f"{placement.rms:.1f} m off"
+        )
+    upright = levelled(model, similarity, (middle, direction), tops)
+    if upright is None:
+        return None, "GPS lies on a line, and the photos do not tell which way is up beside it"
+    residuals = dict(zip(names, _moved(upright, here) - there, strict=True))
+    return Placement(upright, residuals, agreeing), ""
+
+
+def _moved(similarity: "pycolmap.Sim3d", points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 3]."""
+    matrix = similarity.matrix()
+    return np.asarray(points @ matrix[:, :3].T + matrix[:, 3])
+
+
+def _line(
+    points: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], tuple[float, float], NDArray[np.float64]]:
+    """Middle [3] of points [N, 3], how far they lie along and across their line, its direction.
+
+    Distances are root mean squares.
+    """
+    middle = points.mean(0)
+    _, sizes, axes = np.linalg.svd(points - middle, full_matrices=False)
+    along, across = (float(size) / len(points) ** 0.5 for size in sizes[:2])
+    return middle, (along, across), axes[0]
+
+
+def _aligned(
+    here: NDArray[np.float64], there: NDArray[np.float64]
+) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
+    """The similarity between points [N, 3] that most agree with, and which do."""
+    import pycolmap
+
+    options = pycolmap.RANSACOptions()
+    options.random_seed = 0
+    for error in _ERRORS:
+        options.max_error = error
+        with quiet():
+            found: Any = pycolmap.estimate_sim3d_robust(here, there, options)
+        if not found:
+            continue
+        agrees = np.asarray(found["inlier_mask"], dtype=np.bool_)
+        if agrees.sum() < max(FEWEST, _AGREEING * len(here)):
+            continue
+        refined = pycolmap.estimate_sim3d(here[agrees], there[agrees])
+        return (refined or found["tgt_from_src"]), agrees
+    return None
+
+
+def _on_a_line(
+    here: NDArray[np.float64], there: NDArray[np.float64]
+) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
+    """A similarity of points [N, 3] on a line, with any roll about it, and which agree with it.
+
+    Its scale and direction are the medians of those of all pairs (Theil and Sen); of many photos,
+    of those of some all along it.
+    """
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    middle, (along, across), direction = _line(here)
+    if across > _STRAIGHT * along:
+        return None
+    places = (here - middle) @ direction
+    asked = np.linspace(0, len(places) - 1, min(len(places), _ASKED)).astype(np.int64)
+    first, second = (asked[rows] for rows in np.triu_indices(len(asked), 1))
+    gaps = places[first] - places[second]
+    apart = np.abs(gaps) > _STRAIGHT * along
+    slopes = (there[first] - there[second])[apart] / gaps[apart, None]
+    slope = np.median(slopes, axis=0)
+    scale = float(np.linalg.norm(slope))
+    start = np.median(there - places[:, None] * slope, axis=0)
+    if scale == 0.0:
+        return None
+    turn = Rotation.align_vectors(slope[None] / scale, direction[None])[0].as_matrix()
+    similarity = pycolmap.Sim3d(np.column_stack([scale * turn, start - scale * turn @ middle]))
+    off = np.linalg.norm(_moved(similarity, here) - there, axis=1)
+    for error in _ERRORS:
+        if (off <= error).sum() >= max(FEWEST, _AGREEING * len(off)):
+            return similarity, off <= error
+    return None
+
+
+def merged(
+    model: "pycolmap.Reconstruction", others: "Sequence[pycolmap.Reconstruction]"
+) -> "pycolmap.Reconstruction":
+    """A model with the photos and points of others that lie in the same frame.
+
+    Photos that it has already are not added again. Other models have calibrated their cameras by
+    themselves, so these come as cameras of their own.
+    """
+    import pycolmap
+
+    whole = pycolmap.Reconstruction(model)
+    with quiet():
+        for other in others:
+            _add(whole, other)
+    return whole
+
+
+def _add(whole: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> None:
+    import pycolmap
+
+    known = set(whole.reg_image_ids())
+    new = [number for number in other.reg_image_ids() if number not in known]
+    cameras: dict[int, int] = {}
+    for number in new:
+        image = other.image(number)
+        if image.camera_id not in cameras:
+            camera = pycolmap.Camera(other.camera(image.camera_id).todict())
+            camera.camera_id = max(whole.cameras, default=0) + 1
+            whole.add_camera_with_trivial_rig(camera)
+            cameras[image.camera_id] = camera.camera_id
+        copy = pycolmap.Image(
+            name=image.name,
+            keypoints=np.array([point.xy for point in image.points2D]).reshape(-1, 2),
+            camera_id=cameras[image.camera_id],
+            image_id=number,
+        )
+        whole.add_image_with_trivial_frame(copy, image.cam_from_world())
+    added = set(new)
+    for point in other.points3D.values():
+        seen = [element for element in point.track.elements if element.image_id in added]
+        if len(seen) > 1:
+            whole.add_point3D(point.xyz, pycolmap.Track(seen), point.color)

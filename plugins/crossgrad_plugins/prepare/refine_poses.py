@@ -1,0 +1,297 @@
+"""Photos that mapping left out, or put where most of their pairs disagree, placed by their pairs.
+
+Mapping adds a photo by the points of the model that it shows, in the place that most of them speak
+for at that time, and does not look back. A photo that shares much with two others, but little that
+a third one shows, has few such points; and of walls and pavements that repeat the wrong ones may
+come first. So doubtful photos are placed once more, by all their pairs (by_pairs.py); pairs that
+contradict the poses are laid aside, points are made anew, and mapping goes on from there.
+"""
+
+import logging
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from crossgrad_core.commands import check_folder
+from crossgrad_plugins.prepare.pose_from_pairs import Pairs, Support, best_place, support
+from crossgrad_plugins.prepare.scene_integrity import write_model
+from crossgrad_plugins.prepare.subprocess_wait import JOURNAL
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: How often all doubtful photos are looked at, at most.
+_ROUNDS: Final = 5
+#: A photo is doubtful where less than this share of its matches agrees with its place; another
+#: place has to have so many times as many agreeing matches.
+_DOUBTFUL, _BETTER = 0.6, 1.3
+#: Least and most focal length in photo sizes, and most lens distortion: COLMAP's own limits.
+_POSSIBLE: Final = (0.1, 10.0, 1.0)
+_LOG = logging.getLogger(__name__)
+
+Models: TypeAlias = "list[pycolmap.Reconstruction]"
+#: Makes points anew for the model in a folder, by a database, and goes on mapping from there.
+Adjust: TypeAlias = "Callable[[Path, Path], pycolmap.Reconstruction]"
+Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
+
+
+@dataclass(frozen=True)
+class Look:
+    """The places of doubtful photos by their pairs.
+
+    Attributes:
+        better: Photo -> a pose that more speaks for than for its own, or that it has none yet.
+        settled: Photos with a pose for which there is no better one.
+        agreeing: Matches that agree with the poses of the model, over all photos.
+    """
+
+    better: Poses
+    settled: frozenset[int]
+    agreeing: int
+
+
+def looked_again(
+    models: Models,
+    database: Path,
+    scratch: Path,
+    adjust: Adjust,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> tuple[Models, frozenset[int]]:
+    """The models, photos of the largest one placed once more where their pairs ask for it.
+
+    Args:
+        models: Of mapping; photos of smaller ones go over to the largest where more speaks for it.
+        database: COLMAP's database with the verified matches.
+        scratch: An empty folder.
+        adjust: Goes on mapping.
+        cancelled: Whether nobody waits for the answer any more; asked at every photo.
+
+    Returns:
+        The models, the largest one as it was when most matches agreed with its poses, and photos
+        of it for which no better place is known, though pairs speak against theirs.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    if not models:
+        return [], frozenset()
+    import pycolmap
+
+    main, *others = sorted(models, key=lambda model: -model.num_reg_images())
+    again = _Again(database, scratch / "pairs.db", main, others, cancelled)
+    look, moved = again.look(main), frozenset[int]()
+    best, seen, gone = main, look, moved
+    for number in range(_ROUNDS):
+        if not look.better or cancelled():
+            break
+        changed = pycolmap.Reconstruction(main)
+        again.move(changed, look)
+        moved |= look.better.keys()
+        place = scratch / str(number)
+        place.mkdir()
+        write_model(changed, place)
+        try:
+            main = adjust(again.copy, place)
+        except (RuntimeError, ValueError) as error:
+            _LOG.warning("doubtful photos stay where they are: pycolmap failed: %s", error)
+            break
+        _leave_out_impossible(main)
+        look = again.look(main)
+        # What speaks for a photo alone need not hold for all that were moved with it.
+        if look.agreeing >= seen.agreeing:
+            best, seen, gone = main, look, moved
+    here = set(best.reg_image_ids())
+    for model in others:
+        for photo in (here & gone).intersection(model.reg_image_ids()):
+            model.deregister_frame(model.image(photo).frame_id)
+    return [best, *others], seen.settled & here
+
+
+class _Again:
+    """Looks at a model, and moves what is better elsewhere.
+
+    Args:
+        database: COLMAP's database; only read.
+        copy: A copy of it, made when it is needed, in which pairs are laid aside.
+        main: The largest model.
+        others: The other models.
+        cancelled: Whether nobody waits for the answer any more.
+    """
+
+    def __init__(
+        self,
+        database: Path,
+        copy: Path,
+        main: "pycolmap.Reconstruction",
+        others: Models,
+        cancelled: Callable[[], bool],
+    ) -> None:
+        self._database, self.copy, self._others = database, copy, others
+        self._cancelled = cancelled
+        with _opened(database) as opened:
+            self._cameras = _best_known([main, *others], opened)
+        self._aside: frozenset[tuple[int, int]] = frozenset()
+
+    def look(self, model: "pycolmap.Reconstruction") -> Look:
+        """What pairs say of the photos that are doubtful in a model, or not in it."""
+        with _opened(self._database) as database:
+            return self._look(model, self._pairs(model, database), self._elsewhere(database))
+
+    def _pairs(self, model: "pycolmap.Reconstruction", database: "pycolmap.Database") -> Pairs:
+        return Pairs({**self._cameras, **_cameras_of(model)}, database)
+
+    def _look(
+        self,
+        model: "pycolmap.Reconstruction",
+        pairs: Pairs,
+        elsewhere: Mapping[int, Support],
+    ) -> Look:
+        poses = poses_of(model)
+        better, settled, agreeing = {}, set[int](), 0
+        for photo in sorted(pairs.partners):
+            if self._cancelled():
+                break
+            sights = pairs.sights(photo, poses)
+            here = support(sights, poses[photo]) if photo in poses else Support()
+            agreeing += here.matches
+            matches = sum(len(sight.features) for sight in sights)
+            if photo in poses and here.matches >= _DOUBTFUL * matches:
+                continue
+            there = elsewhere.get(photo, Support())
+            now = here if photo in poses else there
+            found, pose = best_place(model, sights)
+            if pose is not None and found.enough and found.matches >= _BETTER * now.matches:
+                better[photo] = pose
+            elif photo in poses and here.enough and there <= here:
+                settled.add(photo)
+        return Look(better, frozenset(settled), agreeing)
+
+    def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
+        """What speaks for the poses in the other models, by their own cameras."""
+        found = {}
+        for model in self._others:
+            pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
+            for photo, pose in poses.items():
+                found[photo] = support(pairs.sights(photo, poses), pose)
+        return found
+
+    def move(self, model: "pycolmap.Reconstruction", look: Look) -> None:
+        """Places photos, and lays pairs aside that contradict the poses; those that did are back.
+
+        A photo that few pairs agree with when the others have moved, too, is left out.
+        """
+        if not self.copy.exists():
+            # On a full disk SQLite ends the process.
+            check_folder(self.copy.parent, self._database.stat().st_size + JOURNAL)
+            shutil.copyfile(self._database, self.copy)
+        with _opened(self._database) as database, _opened(self.copy) as copied:
+            for photo, pose in look.better.items():
+                _place(model, database, self._cameras, photo, pose)
+            pairs, poses = self._pairs(model, database), poses_of(model)
+            for photo in look.better:
+                if not support(pairs.sights(photo, poses), poses[photo]).enough:
+                    model.deregister_frame(model.image(photo).frame_id)
+            against = pairs.contradicting(poses_of(model))
+            # Mapping does not know of photos without a pair.
+            for photo in pairs.without(against) & poses_of(model).keys():
+                model.deregister_frame(model.image(photo).frame_id)
+            for one, two in sorted(self._aside ^ against):
+                geometry = database.read_two_view_geometry(one, two)
+                if (one, two) in against:
+                    geometry.inlier_matches = np.zeros((0, 2), dtype=np.uint32)
+                copied.update_two_view_geometry(one, two, geometry)
+            self._aside = against
+
+
+@contextmanager
+def _opened(path: Path) -> "Iterator[pycolmap.Database]":
+    import pycolmap
+
+    database = pycolmap.Database.open(path)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def poses_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Rigid3d]":
+    """Photo -> its pose, world to camera."""
+    return {photo: model.image(photo).cam_from_world() for photo in model.reg_image_ids()}
+
+
+def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]":
+    """The cameras of photos with poses, which mapping has refined."""
+    numbers = {model.image(photo).camera_id for photo in model.reg_image_ids()}
+    return {number: model.camera(number) for number in numbers}
+
+
+def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pycolmap.Camera]":
+    """Every camera as the first of the models has refined it, else with a better guess.
+
+    A focal length that nothing is known of is a guess from the size of the photos. What mapping
+    made of the same guess for other cameras corrects it: places by a wrong one are far off, and
+    adjusting all together does not always come back from there.
+    """
+    known: dict[int, pycolmap.Camera] = {}
+    for model in models:
+        known = {**_cameras_of(model), **known}
+    guessed = [
+        camera for camera in database.read_all_cameras() if not camera.has_prior_focal_length
+    ]
+    ratios = [
+        known[camera.camera_id].mean_focal_length() / camera.mean_focal_length()
+        for camera in guessed
+        if camera.camera_id in known
+    ]
+    for camera in guessed:
+        if ratios and camera.camera_id not in known:
+            for place in camera.focal_length_idxs():
+                camera.params[place] *= float(np.median(ratios))
+            known[camera.camera_id] = camera
+    return known
+
+
+def _leave_out_impossible(model: "pycolmap.Reconstruction") -> None:
+    """Takes photos out whose camera no lens has; their matches may agree all the same."""
+    for photo in list(model.reg_image_ids()):
+        image = model.image(photo)
+        if model.camera(image.camera_id).has_bogus_params(*_POSSIBLE):
+            model.deregister_frame(image.frame_id)
+
+
+def _place(
+    model: "pycolmap.Reconstruction",
+    database: "pycolmap.Database",
+    cameras: "Mapping[int, pycolmap.Camera]",
+    photo: int,
+    pose: "pycolmap.Rigid3d",
+) -> None:
+    """Gives a photo a pose in a model, which need not have it, or its camera, yet."""
+    import pycolmap
+
+    image = database.read_image(photo)
+    number = image.frame_id
+    known = cameras.get(image.camera_id)
+    if known and model.exists_camera(image.camera_id) and image.camera_id not in _cameras_of(model):
+        model.camera(image.camera_id).params = list(known.params)
+    if photo not in model.images:
+        frame = database.read_frame(number)
+        if not model.exists_camera(image.camera_id):
+            model.add_camera(known or database.read_camera(image.camera_id))
+        if not model.exists_rig(frame.rig_id):
+            model.add_rig(database.read_rig(frame.rig_id))
+        if not model.exists_frame(number):
+            model.add_frame(frame)
+        points = np.asarray(database.read_keypoints(photo)[:, :2], dtype=np.float64)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in points])
+        model.add_image(image)
+    frame = model.frame(number)
+    if frame.has_pose():
+        model.deregister_frame(number)
+    frame.set_cam_from_world(image.camera_id, pose)
+    model.register_frame(number)

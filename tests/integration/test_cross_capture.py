@@ -1,0 +1,196 @@
+"""A run on the views of another capture of its place."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+from support.commands import ended
+from support.scenes import write_tiny_scene
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.run import app
+from crossgrad_core.run import cross_capture as elsewhere_module
+from crossgrad_core.run.cross_capture import _alike
+from crossgrad_core.run.postprocess import evaluate, render
+from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
+
+PLACE = {"scale": 7.0, "offset": (40.0, -20.0, 3.0)}
+
+
+def without(scene, folder, gone):
+    """The scene without some of its photos, whose cameras have another extent."""
+    guard_pycolmap()
+    import pycolmap
+
+    shutil.copytree(scene, folder)
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for image in list(model.images.values()):
+        if gone(image.name):
+            model.deregister_frame(image.frame_id)
+            (folder / "images" / image.name).unlink()
+    model.write_binary(folder / "sparse" / "0")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "place"
+    return write_tiny_scene(folder, views=9, folders=("street", "aerial"), **PLACE)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A run that has seen the far photos alone."""
+    root = tmp_path_factory.mktemp("run")
+    far = without(scene, root / "far", lambda name: name.startswith("street"))
+    settings = {"scene": str(far), "out": str(root / "run"), "steps": 20, "threads": 1}
+    assert app.run(settings, verbosity=-1) == 0
+    return root / "run"
+
+
+def per_view(path):
+    with path.open() as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures(
+    trained, scene, capsys
+):
+    result, there = evaluate.evaluated_on(trained, scene)
+    assert there.trained == 7 and len(result.views) == 11
+    assert set(result.regimes) == {"street", "aerial"}
+    rows, own = per_view(trained / "per_view_on_place.csv"), per_view(trained / "per_view.csv")
+    assert len(rows) == 11 and set(own) == {name for name in rows if "aerial" in name}
+    for name, row in own.items():
+        # Their cameras took two local frames to get here: a rounded pixel may differ.
+        assert float(rows[name]["psnr"]) == pytest.approx(float(row["psnr"]), abs=0.02)
+    evaluate.evaluate(trained, on=scene)
+    printed = capsys.readouterr().out
+    assert "street" in printed and "left out: 7 of its views" in printed
+
+
+def test_a_file_is_drawn_there_as_the_model_is(trained, scene, capsys):
+    model, _ = evaluate.evaluated_on(trained, scene)
+    before = sorted(trained.rglob("*"))
+    file, gaussians, there = evaluate.evaluated_file(trained, trained / "point_cloud.ply", on=scene)
+    assert gaussians > 0 and there is not None and there.trained == 7
+    for mine, other in zip(file.views, model.views, strict=True):
+        assert mine.name == other.name
+        # The model is vanilla on black: the file holds all of it, rounded to float32.
+        assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
+    evaluate.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
+    printed = capsys.readouterr().out
+    assert "drawn on black" in printed and "left out: 7 of its views" in printed
+    assert sorted(trained.rglob("*")) == before
+
+
+def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
+    render.render(trained, split="test", out=None, on=scene)
+    (folder,) = (trained / "renders").glob("*/on_place")
+    assert len(list(folder.glob("*.png"))) == 11
+    render.render(trained, split="test", out=tmp_path / "own", on=scene)
+    assert len(list((tmp_path / "own").iterdir())) == 11
+
+
+def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
+    folder = tmp_path / "ladder"
+    render.render_path(trained, "ladder", frames=3, out=folder)
+    assert len(list(folder.glob("*.png"))) == 3
+    (film,) = folder.glob("film.*")
+    assert f"3 frames in {folder}, film {film}" in capsys.readouterr().out
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(UserError, match="the file exists"):
+        render.render_path(trained, "ladder", frames=2, out=folder)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    # In the run's own folder a film takes the place of the one before.
+    for frames in (3, 2):
+        render.render_path(trained, "ladder", frames=frames, out=None)
+    assert len(list((trained / "renders").glob("*/path_ladder/film.*"))) == 1
+    with pytest.raises(UserError, match="frames of a ladder"):
+        render.render_path(trained, "path.json", frames=2, out=None)
+
+
+@pytest.mark.parametrize(
+    ("options", "idle", "other"),
+    [
+        (("--on", "scene", "--path", "ladder"), "--on", "--path"),
+        (("--split", "train", "--path", "ladder"), "--split", "--path"),
+        (("--split", "test", "--on", "scene"), "--split", "--on"),
+        (("--frames", "9"), "--frames", "--path ladder"),
+        (("--frames", "100001", "--path", "ladder"), "--frames", "100000"),
+        (("--frames", "9", "--on", "scene"), "--frames", "--path ladder"),
+        (("--frames", "9", "--path", "tour.json"), "--frames", "ladder"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(trained, options, idle, other, capsys):
+    before = sorted(trained.rglob("*"))
+    assert ended("render", trained, *options) == 2
+    said = capsys.readouterr().err
+    assert idle in said and other in said and "Traceback" not in said
+    assert sorted(trained.rglob("*")) == before
+
+
+def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
+    before = sorted(trained.rglob("*"))
+    # Without a second photo there are no points left: none are needed.
+    only = without(scene, tmp_path / "only", lambda name: name != "aerial/0001.png")
+    with pytest.raises(UserError, match="trained on all views"):
+        evaluate.evaluate(trained, on=only)
+    away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
+    far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
+    with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
+        evaluate.evaluate(trained, on=far_away)
+    with pytest.raises(UserError):
+        evaluate.evaluate(trained, on=tmp_path / "nothing")
+    assert sorted(trained.rglob("*")) == before
+    assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
+
+
+def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
+    table = trained / "per_view_on_place.csv"
+    evaluate.evaluated_on(trained, scene)
+    before = table.read_text()
+    (tmp_path / "other").mkdir()
+    fewer = without(scene, tmp_path / "other" / "place", lambda name: name == "street/0001.png")
+    for _ in range(2):
+        evaluate.evaluated_on(trained, fewer)
+        assert table.read_text() == before
+        assert len(per_view(trained / "per_view_on_place-2.csv")) < len(per_view(table))
+    assert not (trained / "per_view_on_place-3.csv").exists()
+
+
+def test_a_scene_that_two_readers_take_is_read_as_the_run_s_own(trained, scene, tmp_path):
+    both = shutil.copytree(scene, tmp_path / "place")
+    (both / "transforms.json").write_text('{"frames": []}')
+    result, _ = evaluate.evaluated_on(trained, both)
+    assert len(result.views) == 11
+
+
+def surface(seed, count):
+    """Points of a wavy sheet in a box of about one unit, another one for each seed."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    flat = rng.uniform(-1, 1, (count, 2))
+    waves = 0.3 * np.sin(3 * flat[:, 0] + seed) * np.cos(4 * flat[:, 1])
+    return np.column_stack([flat, waves]) @ turn.T
+
+
+def test_captures_of_one_place_are_told_from_those_of_another():
+    whole = surface(1, 6000)
+    own, other = whole[:4000], whole[4000:]
+    # Another capture shows a part of it, from nearby or with much around.
+    assert _alike(own, other)
+    assert _alike(own, other[other[:, 0] > 0.2])
+    assert _alike(own, np.concatenate([other, 3 * surface(5, 500)]))
+    assert not any(_alike(own, surface(seed, 2000)) for seed in range(2, 8))
+    # Of a few points nothing can be told.
+    assert _alike(own, surface(2, 20))
+
+
+def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
+    monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
+    evaluate.evaluate(trained, on=scene)
+    assert "is it the same place" in capsys.readouterr().out
+    render.render(trained, split="test", out=None, on=scene)
+    assert "is it the same place" in capsys.readouterr().out

@@ -1,0 +1,321 @@
+"""Rates that fade at the end of a run, and the average of its last parameters."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.blocks import LearningRate
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import Edit, Rows
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import entries
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.export import renderer
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import step as stepping
+from crossgrad_core.training.averaging import STATE, eval_parameters, tail_lr_factor, update_average
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import Snapshot, TrainState
+
+CONSTANT, DECAYING = LearningRate(0.05), LearningRate(1.0, 0.01)
+STEPS = 10
+BACKBONES = sorted(n for n, e in entries("backbones").items() if e.distribution == "crossgrad")
+#: On a scene of forty points the published cells of anchors would hold nothing.
+OPTIONS = {"scaffold": {"voxel_size": 1e-5}, "octree": {}}
+
+
+def setup_of(backbone="vanilla", densifier="none", **settings):
+    choice = {"name": backbone, **OPTIONS.get(backbone, {})}
+    given = {
+        "steps": STEPS,
+        "backbone": ComponentChoice.model_validate(choice),
+        "densifier": ComponentChoice(name=densifier),
+        **settings,
+    }
+    return assemble(RunConfig(**given), sample_scene(), "none")
+
+
+def trained(setup, steps=STEPS, state=None):
+    """The state after some steps, and the parameters after each of them."""
+    state = state or first_state(setup)
+    seen = []
+    while state.step < steps:
+        timed_step(setup, state)
+        seen.append({n: t.detach().clone() for n, t in state.parameters.items()})
+    return state, seen
+
+
+def same(one, two):
+    return one.keys() == two.keys() and all(torch.equal(one[n], two[n]) for n in one)
+
+
+@pytest.mark.parametrize(
+    ("share", "step", "left"),
+    [
+        (0.0, 1000, 1.0),
+        (0.2, 800, 1.0),
+        (0.2, 900, 0.1),
+        (0.2, 950, 0.01**0.75),
+        (0.2, 1000, 0.01),
+        (1.0, 500, 0.1),
+        (1.0, 1, 0.01**0.001),
+        (1e-17, 999, 1.0),
+        (1e-17, 1000, 1.0),
+        (1e-9, 999, 1.0),
+        (1e-9, 1000, 0.01),
+    ],
+)
+def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left):
+    config = RunConfig(lr_tail=share)
+    assert tail_lr_factor(config, CONSTANT, step, 1000) == pytest.approx(left, rel=1e-12)
+    assert tail_lr_factor(config, DECAYING, step, 1000) == 1.0
+    assert tail_lr_factor(config, LearningRate(0.3, 0.3), step, 1000) == pytest.approx(
+        left, rel=1e-12
+    )
+
+
+def test_what_is_left_of_a_rate_is_an_option():
+    config = RunConfig(lr_tail=0.5, lr_tail_factor=0.25)
+    assert tail_lr_factor(config, CONSTANT, 100, 100) == 0.25
+    assert tail_lr_factor(config, CONSTANT, 75, 100) == 0.5
+
+
+def recorded(setup):
+    """The state after a run, the parameters after each step, and the rates of each."""
+    rates, real = [], stepping.adam_step
+
+    def adam_step(params, grads, state, lrs, *more, **named):
+        rates.append(dict(lrs))
+        real(params, grads, state, lrs, *more, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stepping, "adam_step", adam_step)
+        return *trained(setup), rates
+
+
+@pytest.fixture(scope="module", params=BACKBONES)
+def runs(request):
+    """Runs of a backbone: as published, averaged, and with both; the last one also in two parts."""
+    setups = {
+        "plain": setup_of(request.param, lr_tail=0.0),
+        "averaged": setup_of(request.param, average=0.4, lr_tail=0.0),
+        "both": setup_of(request.param, average=0.5, lr_tail=0.5),
+    }
+    found = {name: recorded(setup) for name, setup in setups.items()}
+    half, _ = trained(setups["both"], steps=7)
+    again = from_checkpoint(setups["both"], to_checkpoint(half))
+    return SimpleNamespace(setups=setups, again=trained(setups["both"], state=again)[0], **found)
+
+
+def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(runs):
+    blocks = runs.setups["plain"].trained_blocks
+    of = {name: block.lr for block in blocks for name in block.tensors}
+    published, fading = runs.plain[2], runs.both[2]
+    assert len(published) == len(fading) == STEPS
+    for step, (plain, faster) in enumerate(zip(published, fading, strict=True), start=1):
+        for name, rate in of.items():
+            left = 1.0 if rate.decays else 0.01 ** max(0.0, (step - 5) / 5)
+            assert faster[name] == pytest.approx(plain[name] * left, rel=1e-12)
+            if step <= STEPS / 2:
+                assert faster[name] == plain[name]
+    constant = [name for name, rate in of.items() if not rate.decays]
+    assert constant and all(published[0][n] == published[-1][n] for n in constant)
+
+
+def test_the_average_is_that_of_the_last_steps_and_changes_no_training(runs):
+    (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
+    assert same(plain.parameters, state.parameters)
+    assert STATE not in plain.states
+    assert state.states[STATE].values["count"] == 4
+    found = eval_parameters(state)
+    assert found.keys() == state.parameters.keys()
+    averaged = {n for block in runs.setups["averaged"].trained_blocks for n in block.tensors}
+    for name, tensor in found.items():
+        if name in averaged:
+            expected = torch.stack([each[name].double() for each in seen[-4:]]).mean(dim=0)
+            assert torch.allclose(tensor.double(), expected, rtol=1e-6, atol=1e-7)
+        else:
+            assert tensor is state.parameters[name]
+
+
+def test_what_is_drawn_is_the_average(runs):
+    setup, state = runs.setups["averaged"], runs.averaged[0]
+    view = sample_scene().test_views[0]
+    raw = TrainState(state.parameters, state.adam, state.rngs, step=state.step)
+    mean = TrainState(eval_parameters(state), state.adam, state.rngs, step=state.step)
+    with torch.no_grad():
+        drawn, expected, other = (renderer(setup, s)(view) for s in (state, mean, raw))
+    assert torch.equal(drawn, expected) and not torch.equal(drawn, other)
+
+
+def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
+    whole = runs.both[0]
+    assert same(whole.parameters, runs.again.parameters)
+    assert whole.states[STATE].values == runs.again.states[STATE].values == {"count": 5}
+    assert same(whole.states[STATE].tensors, runs.again.states[STATE].tensors)
+
+
+def test_a_snapshot_keeps_the_average_of_its_moment():
+    setup = setup_of(average=1.0)
+    state, _ = trained(setup, steps=4)
+    before = {name: tensor.clone() for name, tensor in eval_parameters(state).items()}
+    snapshot = Snapshot.of(state)
+    trained(setup, steps=8, state=state)
+    snapshot.hand_over(state)
+    assert state.step == 4 and same(eval_parameters(state), before)
+
+
+def fake(total, share, states=None):
+    """A run of one tensor, to count the steps of an average."""
+    block = SimpleNamespace(tensors=("x",))
+    setup = SimpleNamespace(
+        config=RunConfig(average=share),
+        schedule=SimpleNamespace(total=total),
+        trained_blocks=(block,),
+    )
+    state = SimpleNamespace(step=0, parameters={"x": torch.zeros(1)}, states=states or {})
+    state.commit = state.states.update
+    return setup, state
+
+
+@pytest.mark.parametrize(
+    ("total", "share", "count"),
+    [
+        (10, 0.9, 9),
+        (400, 0.1, 40),
+        (400, 0.25, 100),
+        (1000, 1.0, 100),
+        (1001, 0.1, 51),
+        (1490, 0.1, 75),
+        (30_000, 0.1, 100),
+        (30_000, 0.5, 100),
+    ],
+)
+def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, share, count):
+    setup, state = fake(total, share)
+    taken = []
+    for step in range(1, total + 1):
+        state.step, before = step, state.states.get(STATE)
+        update_average(setup, state)
+        if state.states.get(STATE) is not before:
+            taken.append(step)
+    assert len(taken) == state.states[STATE].values["count"] == count
+    assert taken[-1] == total and taken[0] > (1 - share) * total
+    assert len(set(np.diff(taken))) == 1
+
+
+def test_no_length_and_share_has_more_than_a_hundred():
+    for total in (99, 100, 1000, 1490, 2001):
+        for share in np.linspace(0.01, 1.0, 12):
+            window = sum(step > (1.0 - share) * total for step in range(1, total + 1))
+            setup, state = fake(total, float(share))
+            state.commit = lambda _: taken.append(state.step)  # noqa: B023 - called in this turn
+            taken = []
+            for state.step in range(1, total + 1):
+                update_average(setup, state)
+            assert min(window, 50) <= len(taken) <= 100
+
+
+def test_sums_of_many_states_lose_nothing():
+    setup, state = fake(10_000, 1.0)
+    for step in range(1, 10_001):
+        state.step = step
+        state.parameters = {"x": torch.tensor([1.0 + 1e-3 * np.sin(step / 100)])}
+        update_average(setup, state)
+    steps = np.arange(100, 10_001, 100)
+    expected = np.mean(1.0 + 1e-3 * np.sin(steps / 100))
+    assert float(eval_parameters(state)["x"]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
+    setup, state = fake(100, 0.1)
+    for state.step in range(1, 96):
+        update_average(setup, state)
+    assert state.states[STATE].values["count"] == 5
+    longer, _ = fake(200, 0.1)
+    state.step = 96
+    update_average(longer, state)
+    assert STATE not in state.states
+
+
+@pytest.mark.parametrize(
+    ("edit", "count"),
+    [
+        (lambda p: Edit(source=torch.arange(len(p["means"]) - 1)), 3),
+        (lambda p: Edit(source=torch.arange(len(p["means"])).flip(0)), 3),
+        (lambda p: Edit(values={"opacities": Rows(p["opacities"].detach() - 1.0)}), 3),
+        (lambda p: Edit(), 6),
+        (lambda p: Edit(counts={"held_back": 2}), 6),
+    ],
+    ids=["fewer", "other-order", "reset", "nothing", "a-count"],
+)
+def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeypatch):
+    """Of ten steps the last six are averaged, and the edit comes in the eighth."""
+    setup = setup_of(average=0.6)
+
+    def densify(self, context, state):
+        answer = edit(context.parameters) if context.step == 8 else Edit()
+        return answer, PluginState()
+
+    monkeypatch.setattr(type(setup.densifier), "densify", densify)
+    state, seen = trained(setup)
+    assert state.states[STATE].values["count"] == count
+    expected = torch.stack([each["opacities"] for each in seen[-count:]]).mean(dim=0)
+    assert torch.allclose(eval_parameters(state)["opacities"], expected, atol=1e-6)
+
+
+def test_noise_after_every_step_does_not_keep_the_average_from_growing():
+    setup = setup_of(densifier="mcmc", densify_until=2, average=0.5)
+    state, _ = trained(setup)
+    assert state.states[STATE].values["count"] == 5
+
+
+def test_the_published_rule_has_neither():
+    config = resolved(setup_of(preset="inria")).model_dump()
+    assert (config["lr_tail"], config["average"]) == (0.0, 0.0)
+    asked = resolved(setup_of(preset="inria", lr_tail=0.2, average=0.1))
+    assert (asked.lr_tail, asked.average) == (0.2, 0.1)
+
+
+def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
+    names = ("lr_features_final", "lr_scales_final", "lr_cov_final")
+    config = RunConfig(
+        steps=10, backbone=ComponentChoice(name="scaffold", **dict.fromkeys(names, 1e-5))
+    )
+    setup = assemble(config, sample_scene(), "none")
+    written = resolved(setup)
+    assert written.lr_tail == 0.0
+    again = RunConfig.model_validate(written.model_dump() | {"reader": {"name": "auto"}})
+    assert resolved(assemble(again, sample_scene(), "none")).lr_tail == 0.0
+
+
+def test_a_run_says_what_it_does_at_its_end():
+    none = setup_of(lr_tail=0.0)
+    assert not [note for note in none.notes if "learning-rate tail" in note]
+    assert resolved(setup_of()).lr_tail == 0.25
+    notes = [n for n in setup_of(lr_tail=0.25, average=0.1).notes if "learning-rate tail" in n]
+    assert "fade to 0.01 of their value over the last 25% of the steps" in notes[0]
+    assert "last 10% of the steps are averaged" in notes[1]
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        PluginState({"count": 2}, {"means": torch.zeros(1, 3)}),
+        PluginState({"count": 2}, {"gone": torch.zeros(1)}),
+        PluginState({"count": 0}, {}),
+        PluginState({}, {}),
+    ],
+)
+def test_an_average_of_something_else_is_refused(spoiled):
+    setup = setup_of(average=0.5)
+    state, _ = trained(setup, steps=2)
+    state.commit({STATE: spoiled})
+    with pytest.raises(UserError, match="does not fit the run"):
+        from_checkpoint(setup, to_checkpoint(state))

@@ -1,0 +1,378 @@
+"""The budget of density control, and the curve that leads to it, for whatever grows."""
+
+import sys
+from dataclasses import replace
+from fractions import Fraction
+from math import floor
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.pace import ViewsPerStepSpec
+from crossgrad_core.contract.schedule import Counting, Schedule
+from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.topology import NO_EDIT
+from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
+from crossgrad_core.run.checkpoint.folders import Keep
+from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.resolve import resolved
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training import growth_budget, rates
+from crossgrad_core.training.growth_budget import bound_of, curve, usual_budget
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.schedules import growth_of
+from crossgrad_core.training.start import first_state, thinned, told_of_start
+
+#: Densifiers that want more than any curve gives them, and their backbones.
+GREEDY = {
+    "adc": {
+        "grad_threshold": 1e-12,
+        "prune_opacity": 0,
+        "split_scale": 100,
+        "division": "drawn",
+    },
+    "absgrad": {"grad_threshold": 1e-12, "abs_threshold": 1e-12, "prune_opacity": 0},
+    "pixel": {"grad_threshold": 1e-12, "prune_opacity": 0},
+    "dc4gs": {"split_threshold": 1e-12, "grad_threshold": 1e-12, "prune_opacity": 0},
+    "revising": {"growth_budget": 1, "error_threshold": 1e-9, "prune_opacity": 0},
+    "mcmc": {"growth": 1, "noise": 0, "dead_opacity": 1e-9},
+    "anchor": {"success_threshold": 0, "coarsest": 1, "grad_threshold": 1e-12, "prune_opacity": 0},
+    "octree": {"success_threshold": 0, "grad_threshold": 1e-12, "prune_opacity": 0},
+}
+BACKBONES = {
+    "anchor": {"name": "scaffold", "voxel_size": 1e-5},
+    "octree": {"name": "octree", "middle_cell": 1e-5},
+}
+EDITS = 4
+
+
+def setup_of(densifier, **settings):
+    """A run of 4 edits, after steps 2, 4, 6 and 8."""
+    config = RunConfig(
+        start={"name": "sfm"},
+        steps=10, events="steps", densify_from=1, densify_until=9, densify_every=2,
+        densifier=ComponentChoice(name=densifier, **GREEDY[densifier]),
+        backbone=ComponentChoice(**BACKBONES.get(densifier, {"name": "vanilla"})), **settings,
+    )  # fmt: skip
+    return assemble(config, sample_scene(), "none")
+
+
+def counts_of(setup, steps=9):
+    state = first_state(setup)
+    return [state.primitives(setup), *(timed_step(setup, state).primitives for _ in range(steps))]
+
+
+numbers = st.integers(0, 10**7)
+
+
+@given(start=numbers, budget=numbers, events=st.integers(1, 500), share=st.floats(0, 1))
+def test_the_curve_is_the_published_one(start, budget, events, share):
+    event = round(share * events)
+    a = Fraction(budget - start - 2 * events, events**2)
+    assert curve(event, events, start, budget) == floor(a * event**2 + 2 * event + start)
+    assert curve(0, events, start, budget) == start
+    assert curve(events, events, start, budget) == budget
+
+
+@pytest.mark.parametrize("name", GREEDY)
+def test_every_method_that_grows_follows_the_curve(name):
+    free = counts_of(setup_of(name))
+    start = free[0]
+    budget = start + (free[2] - start) // 2  # Less than the first edit alone would add.
+    assert budget > start + EDITS
+    found = counts_of(setup_of(name, max_gaussians=budget, growth="curve"))
+    for edit in range(1, EDITS + 1):
+        assert found[2 * edit] == curve(edit, EDITS, start, budget)
+        assert found[2 * edit - 1] == found[2 * edit - 2]
+    assert found[-1] == budget
+    at_once = counts_of(setup_of(name, max_gaussians=budget, growth="free"))
+    assert at_once[2] == budget
+
+
+def test_the_strongest_come_first():
+    """What the curve leaves out is what the method itself would have taken last."""
+    found = {}
+    for growth in ("free", "curve"):
+        setup = setup_of("adc", max_gaussians=60, growth=growth)
+        state = first_state(setup)
+        for _ in range(2):
+            timed_step(setup, state)
+        found[growth] = state.parameters["means"][40:].detach()
+    some, many = found["curve"], found["free"]
+    assert 0 < len(some) < len(many)
+    assert {tuple(row) for row in some.tolist()} <= {tuple(row) for row in many.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("settings", "led"),
+    [
+        ({}, True),
+        ({"growth": "free"}, False),
+        ({"max_gaussians": 60}, False),
+        ({"growth": "curve", "max_gaussians": 60}, True),
+        ({"preset": "inria"}, False),
+        ({"steps": 30_000, "growth": "curve"}, False),
+        ({"densifier": {"name": "mcmc"}}, False),
+    ],
+)
+def test_densifiers_hear_whether_a_short_run_leads_growth(settings, led, monkeypatch):
+    config = RunConfig.model_validate({"steps": 2_000, **settings})
+    setup = assemble(config, sample_scene(), "none")
+    heard = []
+
+    def densify(_, context, state):
+        heard.append(context.led)
+        return NO_EDIT, state
+
+    monkeypatch.setattr(type(setup.densifier), "densify", densify)
+    timed_step(setup, first_state(setup))
+    assert heard == [led]
+
+
+def test_what_was_pruned_may_be_added_again():
+    setup = setup_of("adc", max_gaussians=80, growth="curve")
+    state = first_state(setup)
+    for _ in range(3):
+        timed_step(setup, state)
+    few = {name: tensor[:10] for name, tensor in state.parameters.items()}
+    state.parameters = {n: t.detach().clone().requires_grad_() for n, t in few.items()}
+    state.adam = first_state(setup).adam
+    state.states = {**state.states, "densifier": PluginState()}
+    assert timed_step(setup, state).primitives == 20  # All are cloned: far from the curve.
+
+
+@pytest.mark.parametrize(
+    ("settings", "growth", "bound"),
+    [
+        ({}, "curve", "auto"),
+        ({"max_gaussians": "auto"}, "curve", "auto"),
+        ({"max_gaussians": 60}, "free", 60),
+        ({"growth": "free"}, "free", None),
+        ({"growth": "free", "max_gaussians": "auto"}, "free", "auto"),
+        ({"growth": "curve", "max_gaussians": 60}, "curve", 60),
+        ({"events": "steps"}, "free", None),
+        ({"events": "steps", "growth": "curve"}, "curve", "auto"),
+        ({"preset": "inria"}, "free", None),
+        ({"schedule": "absolute"}, "free", None),
+        ({"densifier": {"name": "none"}}, "free", None),
+        ({"densifier": {"name": "mcmc"}}, "free", None),
+        ({"backbone": {"name": "scaffold"}}, "free", None),
+        ({"backbone": {"name": "pixel"}}, "curve", "auto"),
+    ],
+)
+def test_what_growth_a_run_has(settings, growth, bound):
+    """And the resolved configuration asks for the same, in so many words."""
+    config = RunConfig.model_validate({"steps": 2_000, **settings})
+    setup = assemble(config, sample_scene(), "none")
+    assert (growth_of(setup), bound_of(setup)) == (growth, bound)
+    written = resolved(setup)
+    assert (written.growth, written.max_gaussians) == (growth, bound)
+    led = growth == "curve" and setup.schedule.counting.unit == "views"
+    assert setup.schedule.min_refinements == (6 if led else 0)
+    assert any("follows a curve" in note for note in setup.notes) == (
+        growth == "curve" and "growth" not in settings
+    )
+
+
+@pytest.mark.parametrize("growth", ["free", "curve"])
+@pytest.mark.parametrize("name", GREEDY)
+def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
+    whole = first_state(setup_of(name)).primitives(setup_of(name))
+    bound = whole - 10
+    setup = setup_of(name, max_gaussians=bound, growth=growth)
+    found = counts_of(setup)
+    # Of anchors the number follows that of points only about.
+    about = 0 if name not in BACKBONES else 3
+    assert found[0] == pytest.approx(2 * bound / 3, abs=0.5 + about)
+    assert found[-1] == bound == max(found)
+    (told,) = told_of_start(setup, first_state(setup))
+    assert f"{found[0]:,} primitives instead of {whole:,}" in told
+    for enough in (whole, whole + 1, "auto", None):
+        state = first_state(setup := setup_of(name, max_gaussians=enough))
+        assert state.primitives(setup) == whole and told_of_start(setup, state) == ()
+
+
+def test_a_start_that_is_taken_as_it_is_is_told_where_it_is_above_the_bound():
+    state = first_state(setup_of("adc"))
+    (told,) = told_of_start(setup_of("adc", max_gaussians=30), state)
+    assert "more than --max-gaussians 30: a PLY is taken as it is" in told
+
+
+@pytest.mark.parametrize(
+    "settings", [{"steps": 4}, {"steps": 2_000, "densifier": {"name": "none"}}]
+)
+def test_without_density_control_all_of_the_bound_is_there_at_once(settings):
+    config = RunConfig(start={"name": "sfm"}, max_gaussians=9, **settings)
+    setup = assemble(config, sample_scene(), "none")
+    assert first_state(setup).primitives(setup) == 9
+
+
+def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
+    def means(seed):
+        config = RunConfig(seed=seed, steps=4, max_gaussians=300, reading={"init": "random"})
+        return first_state(assemble(config, sample_scene(), "none")).parameters["means"]
+
+    assert len(means(0)) == 300 and torch.equal(means(0), means(0))
+    assert not torch.equal(means(0), means(1))
+
+
+def test_random_points_know_nothing_of_the_rows_of_sfm_points():
+    """A scene with more SfM points than random ones: views know them by large rows."""
+    scene = sample_scene()
+    rows = np.arange(30_000) % len(scene.points)
+    views = tuple(replace(view, seen=np.array([29_999])) for view in scene.views)
+    scene = replace(
+        scene, views=views, points=scene.points[rows], point_colors=scene.point_colors[rows]
+    )
+    config = RunConfig(steps=4, max_gaussians=300, reading={"init": "random"})
+    setup = assemble(config, scene, "none")
+    assert first_state(setup).primitives(setup) == 300
+
+
+def test_a_bound_is_kept_where_many_points_make_one_anchor():
+    scene = sample_scene()
+    spread = np.random.default_rng(0).uniform(-1, 1, (4_000, 3))
+    colors = np.zeros((4_000, 3), dtype=np.uint8)
+    scene = replace(scene, points=spread, point_colors=colors)
+    scene = replace(scene, views=tuple(replace(v, seen=np.arange(9)) for v in scene.views))
+    wide = {"name": "scaffold", "voxel_size": 0.4}
+    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide)
+    whole = first_state(setup := assemble(config, scene, "none")).primitives(setup)
+    assert whole < 400  # Ten points and more in each.
+    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide, max_gaussians=whole // 2)
+    setup = assemble(config, scene, "none")
+    assert 0 < first_state(setup).primitives(setup) <= whole // 2
+
+
+def test_points_that_a_start_added_are_kept_where_they_fit():
+    scene = sample_scene()
+    count = len(scene.points)
+    sizes = np.full(count, np.nan)
+    sizes[[3, count - 1]] = 0.5
+    scene = replace(scene, point_sizes=sizes, point_opacities=sizes)
+    for wanted, kept in ((5, 2), (2, None)):
+        few = thinned(scene, wanted / count, np.random.default_rng(0))
+        assert len(few.points) == len(few.point_colors) == len(few.point_sizes) == wanted
+        if kept is not None:
+            assert int(np.isfinite(few.point_sizes).sum()) == kept
+        for view, before in zip(few.views, scene.views, strict=True):
+            there = {tuple(each) for each in scene.points[before.seen]}
+            mine = {tuple(each) for each in few.points[view.seen]}
+            assert mine == there & {tuple(each) for each in few.points}
+    assert len(thinned(scene, 1e-9, np.random.default_rng(0)).points) == 1
+
+
+@pytest.mark.parametrize("growth", ["free", "curve"])
+def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
+    monkeypatch.setattr(growth_budget, "SHORT_BUDGET", 50)
+    found = counts_of(setup_of("adc", max_gaussians="auto", growth=growth))
+    assert found[-1] == 50 == max(found)
+    assert (found[2] == 50) == (growth == "free")
+
+
+def test_budgets_by_length():
+    assert [usual_budget(20_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
+    assert usual_budget(20_000, 10_000) == 150_000
+    starts = (0, 5_000, 7_000, 15_000, 16_000, 30_000, 31_000)
+    budgets = [usual_budget(start, 0) for start in starts]
+    assert budgets == [10_000, 10_000, 14_000, 30_000, 30_000, 30_000, 31_000]
+    assert usual_budget(90_000, 1_000) == 93_103
+    assert usual_budget(90_000, 10_000) == 450_000
+    assert usual_budget(5_000, 29_999) > 10**9
+    # Photos of up to 400 x 300 pixels have the same; a scene with few points has no time for more.
+    assert usual_budget(90_000, 1_000, 119_000) == usual_budget(90_000, 1_000, 120_000) == 93_103
+    assert usual_budget(90_000, 1_000, 480_000) == pytest.approx(90_000 * 30 / 29 * 4**0.4, abs=1)
+    assert usual_budget(20_000, 1_000, 480_000) == pytest.approx(30_000 * 30 / 29 * 4**0.4, abs=1)
+    assert usual_budget(14_000, 1_000, 480_000) == usual_budget(14_000, 1_000)
+    # In longer runs less, by the logarithm of the length.
+    finer = [usual_budget(90_000, n, 480_000) / usual_budget(90_000, n) for n in (9_487, 29_999)]
+    assert finer == [pytest.approx(4**0.2, rel=1e-4), pytest.approx(1.0, rel=1e-4)]
+    # And more in a hurry, where large photos count as those that were measured.
+    hurried = [usual_budget(90_000, 1_000, n, hurried=True) for n in (119_000, 240_000, 480_000)]
+    assert hurried == pytest.approx([n * 90_000 * 30 / 29 for n in (1, 2**0.9, 4**0.9)], abs=1)
+    twelve = [usual_budget(90_000, 1_000, 12_000_000, hurried=each) for each in (False, True)]
+    assert twelve[1] == pytest.approx(twelve[0] * 2, abs=2)
+    lengths = range(1_000, 30_001, 500)
+    for hurried in (False, True):
+        budgets = [usual_budget(30_000, length, 480_000, hurried=hurried) for length in lengths]
+        assert budgets == sorted(set(budgets))
+        assert budgets[-1] == sys.maxsize
+
+
+@pytest.mark.parametrize(("settings", "more"), [({}, 2), ({"beta2": 0.999}, 1)])
+def test_a_run_that_shows_photos_a_few_times_has_more_of_large_ones(settings, more, monkeypatch):
+    monkeypatch.setattr(growth_budget, "SHORT_BUDGET", 50)
+    setup = setup_of("adc", growth="curve", max_gaussians="auto", **settings)
+    monkeypatch.setattr(growth_budget, "PIXELS", setup.scene.train_pixels / 4)
+    monkeypatch.setattr(growth_budget, "HURRIED_PIXELS", setup.scene.train_pixels)
+    monkeypatch.setattr(growth_budget, "FINER", 0.0)
+    assert growth_budget.most_after(setup, setup.schedule, 10, 0) == 50 * more
+    monkeypatch.setattr(rates, "HURRY", 0)
+    assert growth_budget.most_after(setup, setup.schedule, 10, 0) == 50
+
+
+@pytest.mark.parametrize("longer", [700, 3_000, 5_000])
+def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
+    """The edits that are left share what is left, however many they have become."""
+    counting = Counting("views", ViewsPerStepSpec((1,)), 50, min_refinements=6)
+    first = Schedule.for_run(2_000, counting=counting)
+    turn = first.step_of(first.next_edit(first.densify_from + first.densify_every))
+    wanted = Schedule.for_run(longer, counting=counting)
+    schedule, present, reached = first, 1_000, []
+    config = RunConfig(growth="curve", max_gaussians=9_000)
+    state = SimpleNamespace(states={}, step=0, primitives=lambda _: present)
+    for step in range(1, max(longer, 2_000) + 1):
+        if step == turn + 1:
+            schedule = first.with_length(wanted, turn)
+        state.step = step
+        if step <= schedule.total and schedule.densifies(step):
+            densifier = SimpleNamespace(budgeted=True)
+            setup = SimpleNamespace(config=config, schedule=schedule, densifier=densifier)
+            present = max(present, growth_budget._most(setup, state))
+            reached.append(present)
+    assert len(reached) >= 3
+    assert reached == sorted(reached) and reached[-1] == 9_000
+    assert reached[0] < 3_000
+
+
+def test_a_resumed_run_knows_where_it_started(tmp_path):
+    setup = setup_of("adc", max_gaussians=75, growth="curve")
+    whole = counts_of(setup)
+    state = first_state(setup)
+    for _ in range(3):
+        timed_step(setup, state)
+    save(tmp_path, to_checkpoint(state), Keep(every=None))
+    state = from_checkpoint(setup, load(latest(tmp_path)))
+    assert [timed_step(setup, state).primitives for _ in range(6)] == whole[4:]
+
+
+def test_a_run_without_a_budget_keeps_nothing_of_it():
+    state = first_state(setup := setup_of("adc", max_gaussians=60))
+    for _ in range(3):
+        timed_step(setup, state)
+    assert growth_budget.STATE not in state.states
+
+
+@pytest.mark.parametrize(("text", "value"), [("auto", "auto"), ("5000", 5000), (None, None)])
+def test_budgets_as_written(text, value):
+    assert RunConfig(max_gaussians=text).max_gaussians == value
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
+def test_budgets_that_are_none(text):
+    with pytest.raises(ValidationError):
+        RunConfig(max_gaussians=text)
+
+
+def test_room_is_none_between_edits():
+    setup = setup_of("adc")
+    schedule = replace(setup.schedule, densify_until=2)
+    state = SimpleNamespace(step=5)
+    assert growth_budget.max_new_gaussians(SimpleNamespace(schedule=schedule), state, None) == 0
