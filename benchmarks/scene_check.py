@@ -31,6 +31,7 @@ from crossgrad_core.commands import (
     take_steps,
 )
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.export import renderer
@@ -77,7 +78,14 @@ def base(path: Path, size: int) -> Model:
 
 
 def trained_psnr(scene: Scene, path: Path, steps: int) -> float:
-    """The held-out PSNR after a short training."""
+    """The held-out PSNR after a short training; 0 if training refuses the scene."""
+    try:
+        return _psnr(scene, path, steps)
+    except UserError:
+        return 0.0
+
+
+def _psnr(scene: Scene, path: Path, steps: int) -> float:
     config = configured(
         {
             "scene": path,
