@@ -61,23 +61,19 @@ if TYPE_CHECKING:
     from crossgrad_core.config import ComponentChoice, RunConfig
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
-    from crossgrad_core.run.assemble import DEFAULT_STEPS, accepts, assemble
+    from crossgrad_core.run.assemble import accepts, assemble
+    from crossgrad_core.run.decisions import DEFAULT_STEPS, edits_of, facts_of, table_of
     from crossgrad_core.run.load_run import opened as open_run
     from crossgrad_core.run.results.panel_layout import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
-    from crossgrad_core.run.usual_densifier import usual_densifier
-    from crossgrad_core.run.usual_resolution import counts_as_short
-    from crossgrad_core.run.usual_views import views_per_step_spec_of
+    from crossgrad_core.run.usual_views import views_per_step_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
-    from crossgrad_core.training.dropout import photos_per_point, usual_dropout
+    from crossgrad_core.training.dropout import photos_per_point
     from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-    from crossgrad_core.training.growth_budget import usual_budget
     from crossgrad_core.training.model import model_of
     from crossgrad_core.training.probe_gradients import view_gradients
-    from crossgrad_core.training.rates import shows_few_times
-    from crossgrad_core.training.schedules import counting_of
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
     from crossgrad_core.training.state import TrainState
@@ -123,14 +119,14 @@ __all__ = [
     "configured",
     "controls_of",
     "count",
-    "counting_of",
-    "counts_as_short",
     "did_you_mean",
     "disk_errors",
     "disk_full",
     "drop_checksums",
+    "edits_of",
     "entries",
     "exit_code",
+    "facts_of",
     "find_runs",
     "fingerprint",
     "finish",
@@ -162,22 +158,19 @@ __all__ = [
     "resume_hint",
     "sentences",
     "showable",
-    "shows_few_times",
     "signal_names",
     "singular",
     "strays",
     "summary",
     "summary_of",
     "table_bytes",
+    "table_of",
     "take_steps",
     "tell",
     "text_bytes",
     "unmet_requirement",
-    "usual_budget",
-    "usual_densifier",
-    "usual_dropout",
     "view_gradients",
-    "views_per_step_spec_of",
+    "views_per_step_of",
     "with_article",
     "with_steps",
     "write_atomically",
@@ -193,7 +186,7 @@ FAILED: Final = 1
 #: What is imported when it is asked for -> where it is, with another name where it has one there.
 _LATE: Final = {
     "ComponentChoice": "config",
-    "DEFAULT_STEPS": "run.assemble",
+    "DEFAULT_STEPS": "run.decisions",
     "NonFiniteError": "training.failure",
     "RunConfig": "config",
     "RunResults": "run.results.reading",
@@ -203,8 +196,8 @@ _LATE: Final = {
     "accepts": "run.assemble",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
-    "counting_of": "training.schedules",
-    "counts_as_short": "run.usual_resolution",
+    "edits_of": "run.decisions",
+    "facts_of": "run.decisions",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",
     "layered": "run.settings",
@@ -216,12 +209,9 @@ _LATE: Final = {
     "read_panel": "run.results.panel_layout",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
-    "shows_few_times": "training.rates",
-    "usual_budget": "training.growth_budget",
-    "usual_densifier": "run.usual_densifier",
-    "usual_dropout": "training.dropout",
-    "views_per_step_spec_of": "run.usual_views",
+    "table_of": "run.decisions",
     "view_gradients": "training.probe_gradients",
+    "views_per_step_of": "run.usual_views",
 }
 
 
@@ -248,7 +238,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
-    from crossgrad_core.run.migration import marked
+    from crossgrad_core.run.file_version import marked
 
     write_mapping(path, marked(settings))
 

@@ -4,7 +4,15 @@ from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    PositiveInt,
+    field_validator,
+    model_validator,
+)
 
 from crossgrad_core import defaults
 from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS, TRAINING, Flag
@@ -49,7 +57,7 @@ class ComponentChoice(BaseModel):
 class RunConfig(BaseModel):
     """Everything that determines a run.
 
-    `None` means "decided at the start of the run": `run` writes the decision into config.yaml.
+    `None` leaves a setting to the recipe, whose decision is written to config.yaml.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -96,8 +104,7 @@ class RunConfig(BaseModel):
     )
     exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS, common=True)] = Field(
         None,
-        description="What cameras do to light between render and photo. "
-        f"Default: {defaults.EXPOSURE}.",
+        description="What cameras do to light between render and photo. Default: auto.",
     )
     exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
         None,
@@ -153,6 +160,9 @@ class RunConfig(BaseModel):
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (), description="(step, steps in all from there on) of a run that followed the clock"
     )
+    revised: tuple[dict[str, float | str], ...] = Field(
+        (), description="the settings that changed with each of these"
+    )
     planned_seconds: float | None = Field(
         None, gt=0, description="the seconds that a run with a time budget was given"
     )
@@ -185,11 +195,10 @@ class RunConfig(BaseModel):
     min_refinements: int | None = Field(
         None,
         ge=0,
-        description="edits that any run has, warm-up and interval giving way. Default: 6 where "
-        "growth follows a curve, from 600 views on, else none",
+        description="edits that any run has, for which warm-up and interval are shortened",
     )
     reset_every: int | None = Field(
-        None, ge=1, description="interval of opacity resets, counted in --events"
+        None, ge=0, description="interval of opacity resets, counted in --events; 0 for no resets"
     )
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
@@ -203,8 +212,8 @@ class RunConfig(BaseModel):
         description="most that a standard deviation may be of the distance to the nearest training "
         "camera that has a Gaussian at its side; 0 for no bound",
     )
-    sh_every: int | None = Field(
-        None, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
+    sh_every: int = Field(
+        1, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
     )
     densify_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(
@@ -218,15 +227,19 @@ class RunConfig(BaseModel):
         gt=0,
         description="Multiplies all learning rates of the backbone. Default: auto.",
     )
-    beta1: float | None = Field(
-        None, ge=0, lt=1, description="decay of Adam's first moment; less in shorter runs"
-    )
+    beta1: float | None = Field(None, ge=0, lt=1, description="decay of Adam's first moment")
     beta2: float | None = Field(
         None,
         ge=0.9,
         lt=1,
-        description="decay of Adam's second moment; where it is given, rates are those of runs "
-        "that show photos often",
+        description="decay of Adam's second moment; if it is set, rates are those of runs that "
+        "show photos often",
+    )
+    hurried_rates: bool | None = Field(
+        None, description="blocks learn at the rates for runs that show each photo a few times"
+    )
+    step_order: Literal["optimize-first", "densify-first"] | None = Field(
+        None, description="optimizer before density control, or after it as published"
     )
     position_lr: Annotated[
         Literal["extent", "per-axis"] | None, Flag("extent|per-axis", TRAINING)
@@ -240,14 +253,12 @@ class RunConfig(BaseModel):
         description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "
         "over as many views as with one. Default: none.",
     )
-    preset: Annotated[Literal["fast", "inria"], Flag("fast|inria", CONFIGURATION, common=True)] = (
-        Field(
-            "fast",
-            description="Training rules: fast, what was measured to be best at equal time, or "
-            "inria (order of a step, 3-sigma footprint and near plane of the original code). "
-            "Default: fast.",
-        )
+    recipe: Annotated[ComponentChoice, Flag("NAME", CONFIGURATION, common=True)] = Field(
+        ComponentChoice(name=defaults.RECIPE),
+        description="Decides all settings that are not set; `crossgrad recipes` lists them. "
+        f"Default: {defaults.RECIPE}.",
     )
+    decided: dict[str, str] = Field({}, description="what the recipe decided -> why")
     plan: Annotated[
         Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION, common=True)
     ] = Field(
@@ -268,8 +279,8 @@ class RunConfig(BaseModel):
         "Default: auto.",
     )
     lr_tail_factor: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
-    average: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
-        None,
+    average: Annotated[float, Flag("SHARE", TRAINING)] = Field(
+        0.0,
         ge=0,
         le=1,
         description="Evaluate and export the average of the parameters of the last share of the "
@@ -301,11 +312,11 @@ class RunConfig(BaseModel):
         description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
     )
     max_gaussians: Annotated[
-        PositiveInt | Literal["auto"] | None, Flag("N|auto", TRAINING, common=True)
+        NonNegativeInt | Literal["auto"] | None, Flag("N|auto", TRAINING, common=True)
     ] = Field(
         None,
-        description="At most so many primitives; auto: as suits the length of the run. "
-        "Default: auto; what fits into memory where growth is free.",
+        description="At most N primitives, 0 for no bound; auto: as suits the length of the run. "
+        "Default: auto.",
     )
     growth: Annotated[Literal["free", "curve"] | None, Flag("free|curve", TRAINING)] = Field(
         None,
@@ -346,12 +357,6 @@ class RunConfig(BaseModel):
         if isinstance(loss, Mapping):
             rest["loss"] = {"ssim_weight": data["ssim_weight"], **loss}
         return rest
-
-    @field_validator("preset", mode="before")
-    @classmethod
-    def _preset(cls, value: object) -> object:
-        """`fast` was called `default` when it had no other name."""
-        return "fast" if value == "default" else value
 
     @field_validator("operator", mode="before")
     @classmethod

@@ -10,32 +10,24 @@ BACKBONE: Final = "vanilla"
 SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
-EXPOSURE: Final = "auto"
-#: The exposure of published runs: photos are compared as they are.
-NO_EXPOSURE: Final = "none"
-START: Final = "filled"
 #: The start of published runs, and of those that begin with points of their own: it adds nothing.
 BARE_START: Final = "sfm"
 #: The start that has points for a scene without any: a hint.
 START_ALONE: Final = "triangulated"
 RESOLUTION: Final = "full"
-#: The resolution of short runs on a CPU.
-SHORT_RESOLUTION: Final = "interlaced"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
-#: What runs of 0.1 measure: their configurations did not say it.
-METRICS_OF_0_1: Final = "psnr+ssim+ssim-skimage+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
-#: What stands in for it in short runs of many photos on a CPU.
-SHORT_DENSIFIER: Final = "absgrad"
 #: The reader that says what is missing in a folder that no reader accepts.
 READER: Final = "colmap"
 #: The reader of `--prepare`, which finds the cameras of a folder of photos.
 PREPARING_READER: Final = "photos-alone"
 #: The operator that runs the links of `--operator a+b`.
 CHAIN: Final = "chain"
+#: The recipe that decides what the user does not set.
+RECIPE: Final = "auto"
 #: The planner of `--plan`.
 PLANNER: Final = "scene"
 #: The observer that every run has.

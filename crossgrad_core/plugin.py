@@ -34,6 +34,7 @@ from crossgrad_core.contract.contexts import (
     ViewRecord,
     ViewSample,
 )
+from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter, Rounding
 from crossgrad_core.contract.exposure import Exposure, Fitted, PerPhoto
@@ -67,6 +68,7 @@ from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.poses import footprint_of, radial_distances, without_rounding
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
+from crossgrad_core.contract.recipe import Facts, Recipe, with_rows
 from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Camera, Photo, Pinhole, Scene, View, centers_of
@@ -76,6 +78,7 @@ from crossgrad_core.contract.schedule import (
     SHORTEST_ANCHOR_INTERVAL,
     Phase,
     Schedule,
+    Unit,
     shortness,
 )
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
@@ -85,6 +88,7 @@ from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.evaluation.metrics import psnr
+from crossgrad_core.recipe.lines import full_lines, short_lines
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.registry.entries import name_of as component_name
@@ -122,6 +126,7 @@ __all__ = [
     "Camera",
     "Compared",
     "Component",
+    "Decision",
     "Densifier",
     "DensifyContext",
     "DensifyResult",
@@ -129,6 +134,7 @@ __all__ = [
     "EvaluationReport",
     "Exporter",
     "Exposure",
+    "Facts",
     "Field",
     "Figure",
     "Fitted",
@@ -162,6 +168,7 @@ __all__ = [
     "Quantity",
     "Rasterizer",
     "Reader",
+    "Recipe",
     "Regrouping",
     "RegularizeContext",
     "RegularizeResult",
@@ -190,6 +197,7 @@ __all__ = [
     "Start",
     "StepContext",
     "StepRecord",
+    "Unit",
     "Unplaced",
     "UserError",
     "View",
@@ -209,6 +217,7 @@ __all__ = [
     "evaluation_line",
     "figures",
     "footprint_of",
+    "full_lines",
     "hookimpl",
     "installed_plugins",
     "is_file",
@@ -228,6 +237,7 @@ __all__ = [
     "read_vertices",
     "screen_statistics",
     "set_for_nothing",
+    "short_lines",
     "shortness",
     "showable",
     "shows_bar",
@@ -236,5 +246,6 @@ __all__ = [
     "transformed",
     "unit_range",
     "vertex_properties",
+    "with_rows",
     "without_rounding",
 ]

@@ -77,6 +77,23 @@ class Backbone(Component):
         """The blocks that get gradients."""
         return tuple(block for block in self.blocks() if not block.frozen)
 
+    @property
+    def gaussian_tensors(self) -> tuple[str, str, str] | None:
+        """The tensors of positions, scales and rotations of Gaussians that steps update whole.
+
+        None if primitives are no such Gaussians, or if rows may be updated late.
+        """
+        names = self.positions, *self.axes
+        late = not set(self.passthrough.values()).isdisjoint(names)
+        return names if self.axes and all(names) and not late else None
+
+    @property
+    def learns_scales(self) -> bool:
+        """Whether Gaussians with axes learn their scales, so that these can be bounded."""
+        names = self.gaussian_tensors
+        learning = (block for block in self.trained_blocks() if block.lr.initial > 0.0)
+        return names is not None and any(names[1] in block.tensors for block in learning)
+
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
         """This backbone with options that the scene does not need left out, and what was left out.
 

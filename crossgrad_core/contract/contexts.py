@@ -12,6 +12,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.adam_state import AdamRule, AdamState
 from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
+from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
 from crossgrad_core.contract.gradients import Gradients, SeparateGradients
 from crossgrad_core.contract.scene import Camera, Scene, View
@@ -325,7 +326,6 @@ class DensifyContext(StepContext):
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
         may_grow: [P] bool, the primitives that may grow; None where all may.
-        led: Whether growth follows the curve to a budget, in a run shorter than the published ones.
         render: Renders a training view of the densifier's choice: on the training clock, and
             counted among the rendered views.
     """
@@ -339,7 +339,6 @@ class DensifyContext(StepContext):
     render: RenderOnRequest = field(default=no_renders, kw_only=True)
     share: float = field(default=1.0, kw_only=True)
     may_grow: Tensor | None = field(default=None, kw_only=True)
-    led: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,6 +421,7 @@ class RunInfo:
         schedule: The schedule.
         blocks: The blocks of the backbone.
         notes: What was chosen or left out, and why.
+        decisions: The table of decided settings.
     """
 
     folder: Path | None
@@ -430,6 +430,7 @@ class RunInfo:
     schedule: Schedule
     blocks: tuple[Block, ...]
     notes: tuple[str, ...]
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,6 @@ SHORTEST_RUN_WITH_RESET = 10_000
 #: Where edits are counted in views, an interval is a pass over the training photos as far as that
 #: leaves room for so many edits.
 USUAL_EDITS = 6
-#: Growth along a curve has so many edits in runs of so many views or more; below, what it adds has
-#: no time to settle and can cost 1 dB (docs/schedules.md).
-SHORTEST_RUN_WITH_EDITS = 600
 #: A run that is to have edits however short it is has no shorter interval than this: what fewer
 #: views say of gradients makes nearly everything grow.
 LEAST_INTERVAL = 8
@@ -54,7 +51,6 @@ class Counting:
             published one.
         min_refinements: Edits of density control that any run makes at least, however short: a
             short run shortens warm-up and interval for it. Used if the schedule counts views.
-        edits_from: They are asked for from this length on.
     """
 
     unit: Unit = "steps"
@@ -62,7 +58,6 @@ class Counting:
     photos: int = 1
     reference: int | None = None
     min_refinements: int = 0
-    edits_from: int = 0
 
 
 IN_STEPS = Counting()
@@ -143,8 +138,7 @@ class Schedule:
             counting=counting,
             pace=pace,
         )
-        long = counting.unit == "views" and length >= counting.edits_from
-        if long and not schedule.published:
+        if counting.unit == "views" and not schedule.published:
             schedule = replace(schedule, min_refinements=counting.min_refinements)
         return schedule.with_edits(until=length // 2)
 

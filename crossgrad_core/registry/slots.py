@@ -20,6 +20,7 @@ GROUPS: Final[dict[str, str]] = {
         "exporters",
         "metrics",
         "observers",
+        "recipes",
     )
 }
 #: Slots that a run fills with any number of components.

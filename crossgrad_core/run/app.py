@@ -10,13 +10,16 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
-from crossgrad_core.config import RunConfig
+from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
+from crossgrad_core.recipe.lines import short_lines
+from crossgrad_core.recipe.table import open_again
 from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.run.apply_plan import seconds_of
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
+from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.eta import Forecast
 from crossgrad_core.run.failure_report import reason_of
 from crossgrad_core.run.finish import Ending, RunLoop, exit_messages, resume_line
@@ -61,8 +64,6 @@ from crossgrad_core.system.interrupts import exit_code, resume_hint
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.per_image_params import known_starts
-from crossgrad_core.training.rates import note_on_axes, note_on_plan
-from crossgrad_core.training.scale_clamp import note_on_sizes
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
@@ -181,6 +182,8 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
             setup = _within(setup, config.seconds)
     setup, remark_seconds = _with_remarks(setup)
     state = first_state(setup)
+    if setup.config.max_gaussians == AUTO:
+        setup = redecided(setup, setup.schedule.total, state.primitives(setup))
     setup = replace(setup, notes=(*setup.notes, *told_of_start(setup, state)))
     state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
@@ -209,7 +212,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     setup, load_seconds = set_up(config, way.verbosity)
     check_clock(config)
     refuse_labels_for_nothing(setup)
-    refuse_settings_for_nothing(config, setup)
+    refuse_settings_for_nothing(open_again(config), setup)
     known_starts(setup)
     check_largest_draw(setup)
     return setup, load_seconds + seconds_of(setup.plan) + _decoded(setup, way)
@@ -266,14 +269,12 @@ def _within(setup: Setup, seconds: float) -> Setup:
     update = {"steps": steps, "seconds": None, "max_views": None, "revisions": ()}
     given = {"planned_seconds": seconds, "planned_views": setup.config.max_views}
     config = setup.config.model_copy(update={**update, **given})
-    schedule = schedule_of(config, setup.densifier, steps, setup.schedule.counting)
-    setup = replace(setup, config=config, schedule=schedule, pixel_share=share)
+    setup = redecided(replace(setup, config=config, pixel_share=share), steps)
+    schedule = schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
+    setup = replace(setup, schedule=schedule)
     idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
     told = (
         note,
-        *note_on_plan(setup),
-        *note_on_axes(setup),
-        *note_on_sizes(setup),
         *notes_on_length(setup),
         *idle,
     )
@@ -410,7 +411,7 @@ def _decoded(setup: Setup, way: Way) -> float:
 
 def _print_dry_run(setup: Setup) -> None:
     print(as_yaml(resolved(setup)), end="")  # noqa: T201
-    for note in setup.notes:
+    for note in (*short_lines(setup.decisions), *setup.notes):
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
     print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201

@@ -14,9 +14,11 @@ from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.schedule import Counting
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.recipe.table import is_complete
 from crossgrad_core.registry.entries import (
     build,
     entries,
@@ -28,27 +30,21 @@ from crossgrad_core.registry.entries import (
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.apply_plan import notes_of, planned
+from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.noop_operator import idle_note
 from crossgrad_core.run.select import select
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.self_check.check import checked
-from crossgrad_core.training.averaging import notes_on as at_the_end
-from crossgrad_core.training.dropout import with_dropout
 from crossgrad_core.training.modes import mode_note
-from crossgrad_core.training.rates import note_on_axes
-from crossgrad_core.training.rates import notes_on as of_rates
 from crossgrad_core.training.relabel import labels_of
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.scale_clamp import note_on_sizes
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
-from crossgrad_core.training.schedules import counting_of, notes_on_length, schedule_of
+from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
 _LOG = logging.getLogger(__name__)
-#: Length of a run that asks for neither steps nor seconds (3DGS).
-DEFAULT_STEPS = 30_000
 
 
 def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
@@ -128,7 +124,8 @@ def check_names(config: RunConfig) -> None:
     single = (slot for slot in GROUPS if slot not in {"operators", *LISTS})
     named += [(slot, getattr(config, singular(slot))) for slot in single]
     for slot, choice in named:
-        if choice is not None and choice.name != AUTO:
+        unread = slot == "recipes" and is_complete(config)
+        if choice is not None and choice.name != AUTO and not unread:
             refuse_other_version(find(slot, choice.name))
 
 
@@ -149,7 +146,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     if config.plan != "off":
         config, plan = planned(config, scene)
         scene = replace(scene, notes=(*scene.notes, *notes_of(plan)))
-    config = _with_first_degree(config)
+    config, decisions, decide = with_decisions(_with_first_degree(config), scene)
     selection, notes = select(config, scene, reader)
     observers = {
         choice.name: build(Observer, choice.name, choice.options) for choice in config.observers
@@ -159,13 +156,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     answers = manager.hook.crossgrad_validate_selection(selection=selection)
     refuse(reasons_against(config, selection, answers))
     groups = _groups(config, scene, selection, notes)
-    config = with_dropout(_with_steps(config, selection.views), scene, notes)
-    counting = counting_of(
-        config,
-        selection.views,
-        len(scene.train_views),
-        budgeted=selection.densifier.budgeted,
-    )
+    config = _with_steps(config, selection.views)
+    photos = len(scene.train_views)
+    counting = Counting(views=selection.views, photos=photos, reference=config.reference)
     steps = config.steps or DEFAULT_STEPS
     setup = Setup(
         config=config,
@@ -179,21 +172,17 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         notes=tuple(notes),
         scaled_photos=_photos(config),
         plan=plan,
+        decisions=decisions,
+        decide=decide,
     )
     # The length of a run within a budget is not known yet.
-    timed = (
-        (*note_on_axes(setup), *note_on_sizes(setup), *notes_on_length(setup))
-        if config.seconds is None
-        else ()
-    )
+    timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [each.name for each in config.operators]
     added = (
         *from_elsewhere({**named, "metrics": [*selection.metrics], "observers": [*observers]}),
         *_linear_note(setup),
         *idle_note(setup),
-        *at_the_end(config),
-        *of_rates(setup),
         *timed,
     )
     return replace(setup, notes=(*setup.notes, *added))

@@ -27,6 +27,7 @@ _LOOSE: Final = frozenset(
         "clock",
         "device",
         "eval_every",
+        "decided",
         "eval_from",
         "exporter",
         "exposure_from",
@@ -39,6 +40,7 @@ _LOOSE: Final = frozenset(
         "planned_seconds",
         "planned_views",
         "reading",
+        "revised",
         "revisions",
         "save_every",
         "scene",
@@ -63,7 +65,9 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     data = config.model_dump(mode="json", exclude=loose)
     del data[_DRAWN]["name"]  # What draws on this machine; how it does is another matter.
     # What `opening` reads where a run that began with the usual ones has written none.
-    data |= {"sh_from": config.sh_from or 0, "sh_every": config.sh_every or 1}
+    data |= {
+        "sh_from": config.sh_from or 0,
+    }
     flat: dict[str, Json] = {"crossgrad": VERSION}
     for key, value in data.items():
         inner = value.items() if isinstance(value, dict) else ()
@@ -129,7 +133,7 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     known = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
     # Another rasterizer has other options, and a length that follows the clock is none of these.
-    either = {_DRAWN, "steps", "revisions"}
+    either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
     if changed:

@@ -23,7 +23,7 @@ from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length
 from crossgrad_core.training.clock import PhaseTimer
 from crossgrad_core.training.edits import keep
-from crossgrad_core.training.floaters import removes_floaters, rows_without_floaters, told_of
+from crossgrad_core.training.floaters import rows_without_floaters, told_of
 from crossgrad_core.training.loop import evaluates_after, train
 from crossgrad_core.training.rollback import RollbackGuard
 from crossgrad_core.training.setup import Setup
@@ -80,8 +80,8 @@ class RunLoop:
         Part by part: none that fails costs another, and the ending says which did.
         """
         self._attempt("", lambda: self._train(length))
-        config, densifier = self.setup.config, self.setup.densifier
-        if self.ending.status == "finished" and removes_floaters(config, densifier):
+        removes = self.setup.numbers.floaters == "remove"
+        if self.ending.status == "finished" and removes:
             self._attempt("floaters are left", self._remove_floaters)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
@@ -208,6 +208,7 @@ class RunLoop:
             schedule=setup.schedule,
             blocks=setup.blocks,
             notes=setup.notes,
+            decisions=setup.decisions,
         )
 
 

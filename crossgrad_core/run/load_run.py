@@ -256,7 +256,6 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     stored.pop("stop_after", None)
     # What a run began with is written down; where it is not, it was that of the first versions.
     stored["sh_from"] = stored.get("sh_from") or 0
-    stored["sh_every"] = stored.get("sh_every") or 1
     try:
         config = parsed({**stored, **settings})
     except UserError as error:

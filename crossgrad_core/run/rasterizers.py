@@ -10,6 +10,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Response
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
+from crossgrad_core.recipe.table import is_complete, recipe_of
 from crossgrad_core.registry.entries import entries, find, load, quick_answer
 from crossgrad_core.wording import in_one_line, listed
 
@@ -24,7 +25,7 @@ class Wanted:
         device: Torch device type.
         response: The backbone's pixel response.
         outputs: Optional outputs that the densifier needs.
-        options: Options that a preset sets.
+        options: Options that the user or the recipe sets.
     """
 
     device: str
@@ -45,11 +46,12 @@ class Wanted:
 
 def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densifier) -> Wanted:
     """Return what a run asks of its rasterizer on a device type."""
+    of_recipe = frozenset() if is_complete(config) else recipe_of(config).rasterizer_options
     return Wanted(
         device=device,
         response=backbone.response,
         outputs=densifier.needs,
-        options=frozenset({"footprint"} if config.preset == "inria" else ()),
+        options=of_recipe | config.rasterizer.options.keys(),
     )
 
 

@@ -6,10 +6,6 @@ from typing import Any
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import PROGRESS
-from crossgrad_core.training.averaging import average_of, lr_tail_of
-from crossgrad_core.training.floaters import removes_floaters
-from crossgrad_core.training.growth_budget import bound_of
-from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 
 #: Slots that every run fills with one component.
@@ -50,13 +46,7 @@ def resolved(setup: Setup) -> RunConfig:
             "out": None,
             "views_per_step": selection.views.setting,
             "steps": None if config.seconds else config.steps or setup.schedule.total,
-            "events": setup.schedule.counting.unit,
-            "sh_every": setup.schedule.sh_every,
-            "lr_tail": _lr_tail(config, setup),
-            "average": average_of(config),
-            "floaters": "remove" if removes_floaters(config, setup.densifier) else "keep",
-            "growth": growth_of(setup),
-            "max_gaussians": bound_of(setup),
+            "sh_from": setup.schedule.sh_from,
         }
     )
 
@@ -64,12 +54,6 @@ def resolved(setup: Setup) -> RunConfig:
 def _located(path: Path | None) -> Path | None:
     """The whole path of what is there; any other path is one within the scene."""
     return path.resolve() if path is not None and path.exists() else path
-
-
-def _lr_tail(config: RunConfig, setup: Setup) -> float:
-    """The share over which rates fade; 0, and no more may be asked for, where all decay."""
-    fading = any(not block.lr.decays for block in setup.trained_blocks)
-    return lr_tail_of(config) if fading else 0.0
 
 
 def _choice(name: str, component: Component) -> ComponentChoice:

@@ -1,7 +1,7 @@
 """The components of a run: those it names and the usual ones, fitted to its scene."""
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.backbone import Backbone
@@ -13,7 +13,6 @@ from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
@@ -21,24 +20,15 @@ from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
-from crossgrad_core.defaults import (
-    BARE_START,
-    EXPOSURE,
-    METRICS,
-    NO_EXPOSURE,
-    START,
-    START_ALONE,
-)
+from crossgrad_core.defaults import METRICS, START_ALONE
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import build, load
+from crossgrad_core.registry.entries import build
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.rasterizers import choose_rasterizer, demands
 from crossgrad_core.run.results.metrics_csv import columns_for
-from crossgrad_core.run.usual_densifier import usual_densifier
-from crossgrad_core.run.usual_resolution import usual_resolution
-from crossgrad_core.run.usual_views import operator_of, usual_views
+from crossgrad_core.run.usual_views import operator_of, views_per_step_of
 from crossgrad_core.scene.point_cloud import CLOUDS
-from crossgrad_core.wording import listed, singular
+from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
@@ -50,7 +40,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    start, start_name = _named_or(_usual_start(config), Start, config.start)
+    start = _chosen(Start, config.start)
     _require_points(config, scene, start)
     _require_shown_points(config, scene, start)
     device = choose_device(config.device)
@@ -61,37 +51,27 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     fitting = backbone.fitted_to(scene)
     backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
     notes += left_out
-    views = config.view_plan or ViewsPerStepSpec((usual_views(config, sampler, operator, notes),))
-    usual = usual_densifier(config, views, backbone, len(scene.train_views))
-    densifier, densifier_name = _named_or(usual, Densifier, config.densifier)
-    of_backbone = backbone.default_densifier
-    if usual != of_backbone and (config.densifier is None or config.densifier.name == AUTO):
-        notes.append(
-            f"densifier {usual}, as in short runs of many photos (--densifier {of_backbone}: that "
-            "of the backbone)"
-        )
+    views, _ = views_per_step_of(config)
+    densifier = _chosen(Densifier, config.densifier)
     wanted = demands(config, device.type, backbone, densifier)
     rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
     notes += choosing
-    options = _rasterizer_options(config, scene, rasterizer_name)
-    rasterizer = build(Rasterizer, rasterizer_name, options)
-    usual = usual_resolution(config, views, backbone, densifier, device.type)
-    resolution, resolution_name = _named_or(usual, Resolution, config.resolution)
+    rasterizer = build(Rasterizer, rasterizer_name, config.rasterizer.options)
+    resolution = _chosen(Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
-    exposure_choice = config.exposure or ComponentChoice(name=_usual_exposure(config))
-    exposure = _built(Exposure, exposure_choice)
+    exposure = _chosen(Exposure, config.exposure)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
     notes += fitted.notes
     names = {
         "backbone": config.backbone.name,
         "sampler": config.sampler.name,
         "operator": operator_name,
-        "densifier": densifier_name,
+        "densifier": _name(config.densifier),
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
-        "exposure": fitted.name or exposure_choice.name,
-        "start": start_name,
-        "resolution": resolution_name,
+        "exposure": fitted.name or _name(config.exposure),
+        "start": _name(config.start),
+        "resolution": _name(config.resolution),
         "exporter": config.exporter.name,
         "reader": reader,
     }
@@ -118,17 +98,6 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         view_plan=views,
     )
     return selection, notes
-
-
-def _usual_start(config: RunConfig) -> str:
-    """The start of a run that names none."""
-    bare = config.preset == "inria" or config.reading.init != "points"
-    return BARE_START if bare else START
-
-
-def _usual_exposure(config: RunConfig) -> str:
-    """The exposure of a run that names none."""
-    return NO_EXPOSURE if config.preset == "inria" else EXPOSURE
 
 
 def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
@@ -167,27 +136,14 @@ def _built(slot: type[C], choice: ComponentChoice) -> C:
     return build(slot, choice.name, choice.options)
 
 
-def _named_or(usual: str, slot: type[C], choice: ComponentChoice | None) -> tuple[C, str]:
-    """The component that is named, else the usual one with the options that are given; its name.
+def _chosen(slot: type[C], choice: ComponentChoice | None) -> C:
+    """The component that the user or the recipe chose."""
+    return build(slot, _name(choice), {} if choice is None else choice.options)
 
-    Raises:
-        UserError: An option is wrong; where the component was not named, it says how to name one.
-    """
-    if choice is not None and choice.name != AUTO:
-        return _built(slot, choice), choice.name
-    try:
-        return _built(slot, _or_default(choice, usual)), usual
-    except UserError as error:
-        todo = (
-            f"{usual} is what this run takes by itself: --{singular(slot.slot)} NAME takes another"
-        )
-        raise UserError(
-            error.what,
-            where=error.where,
-            expected=error.expected,
-            found=error.found,
-            todo=f"{error.todo}; {todo}",
-        ) from error
+
+def _name(choice: ComponentChoice | None) -> str:
+    """The name of a component; a recipe has filled in what was open."""
+    return AUTO if choice is None else choice.name
 
 
 def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:
@@ -235,22 +191,6 @@ def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
     if choice is None:
         return ComponentChoice(name=name)
     return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
-
-
-def _rasterizer_options(config: RunConfig, scene: Scene, name: str) -> dict[str, Any]:
-    options = dict(config.rasterizer.options)
-    if config.preset == "inria":
-        if "footprint" not in load("rasterizers", name).model_fields:
-            raise UserError(
-                f"rasterizer {name} does not have the footprint of the original code",
-                where="--preset inria",
-                expected="a rasterizer with the option footprint",
-                todo="leave --rasterizer out: auto takes one that has it; or leave the preset out",
-            )
-        options.setdefault("footprint", "3-sigma")
-        # The published near plane is 0.2 units of the input frame.
-        options.setdefault("near", 0.2 * scene.similarity.scale)
-    return options
 
 
 def _grouping_choice(

@@ -201,6 +201,7 @@ class Session:
             config=setup.config.model_dump(mode="json"),
             environment={**environment(str(setup.device)), **machine},
             notes=setup.notes,
+            decisions=setup.decisions,
             check=setup.scene.check,
             plan=read_plan(self.folder),
             error=error,

@@ -14,9 +14,10 @@ from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.contract.component import Component
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
+from crossgrad_core.recipe.table import without_decided
 from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.registry.slots import GROUPS, LISTS
-from crossgrad_core.run.migration import migrated
+from crossgrad_core.run.file_version import unmarked
 from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, plural, singular, with_article
@@ -31,10 +32,12 @@ CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
 LENGTHS: Final = tuple(
     (name,)
     for name in (
-        *("steps", "max_views", "seconds", "revisions"),
+        *("steps", "max_views", "seconds", "revisions", "revised"),
         *("planned_seconds", "planned_views"),
     )
 )
+#: Other settings that a recipe decides by, for which it is asked anew.
+_DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
 #: Settings that hold settings.
 GROUPS_OF_SETTINGS: Final = ("reading",)
 _FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
@@ -133,11 +136,26 @@ def _overlaid(
         timed = bool(had & {("seconds",), ("planned_seconds",)}) and ("seconds",) not in lengths
         gone = had | ({("stop_after",)} if had else set()) | ({("clock",)} if timed else set())
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
+    settings = _opened(settings, [*chosen, *(path for path, _ in assigned)])
     # Names first: choosing another component drops the options of the one it replaces.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
             _assign(settings, path, value)
     return settings
+
+
+def _opened(settings: Settings, paths: Sequence[tuple[str, ...]]) -> Settings:
+    """The settings of a file, of which those that a recipe decided are open where they must be.
+
+    They are decided anew if something changes that says how long or what the run is.
+    """
+    opened = dict(settings)
+    if {path[0] for path in paths} & {*_DECIDING, *(name for (name,) in LENGTHS)}:
+        without_decided(opened)
+    elif decided := opened.get("decided"):
+        names = {".".join(path) for path in paths}
+        opened["decided"] = {name: why for name, why in decided.items() if name not in names}
+    return opened
 
 
 def _named_by_default(settings: Settings) -> Settings:
@@ -154,7 +172,7 @@ def _with_default_name(key: str, value: object) -> object:
 
 def _of_file(path: Path) -> Settings:
     """The settings of a file, of whatever version."""
-    return migrated(_normalized(read_mapping(path, *_FILE)), path)
+    return unmarked(_normalized(read_mapping(path, *_FILE)), path)
 
 
 def _normalized(settings: Settings) -> Settings:

@@ -16,10 +16,8 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
-from crossgrad_core.training.averaging import lr_tail_of
 from crossgrad_core.training.floaters import cameras_that_tell
 from crossgrad_core.training.rates import axes_of
-from crossgrad_core.training.scale_clamp import learns_sizes
 from crossgrad_core.training.schedules import MOST_DEGREES
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed, plural
@@ -112,7 +110,7 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if config.reset_every is not None and not setup.densifier.resets:
+    if config.reset_every and not setup.densifier.resets:
         yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
     # A run that follows the clock notes it once its length is known.
     if not (config.seconds or config.planned_seconds):
@@ -160,7 +158,7 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
 def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if not any(block.rests for block in setup.trained_blocks):
         why = f"backbone {setup.selection.names['backbone']} trains no SH bands above the first"
-        if (config.sh_every or 1) > 1:
+        if config.sh_every > 1:
             yield "sh_every", why
         if config.sh_start:
             yield "sh_start", why
@@ -218,9 +216,9 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     """What is said about rates that fade and about floaters, where there can be none."""
-    fades = lr_tail_of(config) > 0.0
+    fades = setup.numbers.lr_tail > 0.0
     if config.lr_tail_factor != RunConfig.model_fields["lr_tail_factor"].default and not fades:
-        yield "lr_tail_factor", "no rate fades with --lr-tail 0, which --preset inria has by itself"
+        yield "lr_tail_factor", "no rate fades with --lr-tail 0"
     if config.lr_tail and all(block.lr.decays for block in setup.trained_blocks):
         name = setup.selection.names["backbone"]
         yield "lr_tail", f"backbone {name} has no constant rates"
@@ -238,7 +236,7 @@ def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_sizes(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if config.max_scale_ratio and not learns_sizes(setup):
+    if config.max_scale_ratio and not setup.backbone.learns_scales:
         name = setup.selection.names["backbone"]
         yield "max_scale_ratio", f"backbone {name} has no Gaussians with axes that learn"
 

@@ -1,4 +1,4 @@
-"""The operator of a run, and its views per step where the user names no number."""
+"""The operator of a run, and its views per step if the user sets no number."""
 
 from typing import Final
 
@@ -21,36 +21,25 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
     return operator, "+".join(link.name for link in links)
 
 
-def usual_views(config: RunConfig, sampler: Sampler, operator: Operator, notes: list[str]) -> int:
-    """K where the user names none: the sampler's, or the least that leaves no operator idle.
+def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
+    """Return K over a run, and why it is not the usual one of the sampler; empty if it is.
 
-    Args:
-        config: The configuration.
-        sampler: Its sampler.
-        operator: Its operator.
-        notes: Gets a line where K is not the sampler's.
+    If no K is set, it is the sampler's, or the least one that leaves no operator idle.
     """
+    if config.view_plan is not None:
+        return config.view_plan, ""
+    sampler = build(Sampler, config.sampler.name, config.sampler.options)
+    operator, _ = operator_of(config)
     usual = sampler.usual_views
     of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
     both = [k for k in of_sampler if operator.views.admits(k)]
     # Who names no operator expects no more than a sum of one gradient.
     named = config.operator != RunConfig.model_fields["operator"].default
+    found, why = usual, ""
     if usual not in both:
-        found, why = next(iter(both), 0), f"the operator needs {operator.views}"
+        # If no K suits both, the objections say so.
+        found, why = next(iter(both), usual), f"the operator needs {operator.views}"
     elif named and operator.wants_more(usual):
         found = next((k for k in both if not operator.wants_more(k)), usual)
-        why = "with fewer views an operator that you named does nothing"
-    else:
-        found, why = usual, ""
-    if found and found != usual:
-        notes.append(f"K = {found}: {why}")
-    # Where no K suits both, the objections say so.
-    return found or usual
-
-
-def views_per_step_spec_of(config: RunConfig) -> ViewsPerStepSpec:
-    """K over a run of that configuration, as it will be assembled."""
-    if config.view_plan is not None:
-        return config.view_plan
-    sampler = build(Sampler, config.sampler.name, config.sampler.options)
-    return ViewsPerStepSpec((usual_views(config, sampler, operator_of(config)[0], []),))
+        why = "with fewer views the operator does nothing"
+    return ViewsPerStepSpec((found,)), why if found != usual else ""

@@ -48,6 +48,7 @@ from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.select import select
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
 from crossgrad_core.testing.backbones import created
@@ -253,6 +254,7 @@ def _require_gradients(step: int, aggregated: AggregateResult) -> None:
 def questions_are_answered_in_kind(make: Make[Observer]) -> None:
     """Objections, weights, loss terms and edits can be used; parameters change by edits only."""
     config = RunConfig(scene="sample", device="cpu")
+    config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), reader="sample")
     run = DensifierRun.of(build(Densifier, NO_DENSIFIER, {}))
     kept = {name: tensor.detach().clone() for name, tensor in run.parameters.items()}

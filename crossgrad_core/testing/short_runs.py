@@ -12,6 +12,7 @@ from crossgrad_core.contract.observer import Observer
 from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble, reasons_against
+from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.select import select
 from crossgrad_core.testing.contract import require
 from crossgrad_core.testing.fixtures import sample_scene
@@ -52,6 +53,7 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     A combination is refused if a component objects (`crossgrad_validate_selection`), or if what
     its components declare does not fit: numbers of views, tensors, statistics, devices.
     """
+    config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")
     # What the manager would gather; registering with it would take most of the time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]

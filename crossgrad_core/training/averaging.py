@@ -9,16 +9,11 @@ from typing import Final
 
 from torch import Tensor
 
-from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate, Parameters
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-
-#: Shares of a run that names none; the published rule is 0.
-FINAL_DECAY: Final = 0.25
-AVERAGE: Final = 0.0
 
 #: The name among the states of plugins.
 STATE: Final = "average"
@@ -30,53 +25,21 @@ SAMPLES: Final = 100
 _DIGITS: Final = 6
 
 
-def lr_tail_of(config: RunConfig) -> float:
-    """The share of the run over which constant rates fade."""
-    return _share(config, config.lr_tail, FINAL_DECAY)
-
-
-def average_of(config: RunConfig) -> float:
-    """The share of the run whose parameters are averaged."""
-    return _share(config, config.average, AVERAGE)
-
-
-def _share(config: RunConfig, given: float | None, usual: float) -> float:
-    if given is not None:
-        return given
-    return 0.0 if config.preset == "inria" else usual
-
-
-def tail_lr_factor(config: RunConfig, rate: LearningRate, step: int, total: int) -> float:
-    """What a rate is multiplied by in a step of `total`: from 1 log-linearly to `lr_tail_factor`.
+def tail_lr_factor(setup: Setup, rate: LearningRate, step: int) -> float:
+    """What a rate is multiplied by in a step: from 1 log-linearly to `lr_tail_factor`.
 
     Rates that decay by themselves do so as published.
     """
-    step, start = min(step, total), (1.0 - lr_tail_of(config)) * total
+    total = setup.schedule.total
+    step, start = min(step, total), (1.0 - setup.numbers.lr_tail) * total
     if rate.decays or step <= start:
         return 1.0
-    return float(config.lr_tail_factor ** ((step - start) / (total - start)))
-
-
-def notes_on(config: RunConfig) -> tuple[str, ...]:
-    """What is done at the end of the run."""
-    decay, average = lr_tail_of(config), average_of(config)
-    notes = []
-    if decay > 0.0:
-        notes.append(
-            f"learning-rate tail: constant rates fade to {config.lr_tail_factor:g} of their value "
-            f"over the last {decay:.0%} of the steps"
-        )
-    if average > 0.0:
-        notes.append(
-            f"learning-rate tail: the parameters of the last {average:.0%} of the steps are "
-            "averaged; evaluations and the exported file show the average"
-        )
-    return tuple(notes)
+    return float(setup.config.lr_tail_factor ** ((step - start) / (total - start)))
 
 
 def update_average(setup: Setup, state: TrainState) -> None:
     """Adds the parameters after a complete step to the average, where they are due."""
-    share = average_of(setup.config)
+    share = setup.config.average
     if share == 0.0:
         return
     total = setup.schedule.total

@@ -192,7 +192,9 @@ class Timed:
         if abs(total - setup.schedule.total) <= TOLERANCE * (setup.schedule.total - state.step):
             return setup
         revisions = (*setup.config.revisions, (state.step, total))
-        config = setup.config.model_copy(update={"revisions": revisions})
+        revised = (*setup.config.revised, dict(setup.following(total, crowd.start)))
+        update = {"revisions": revisions, "revised": revised}
+        config = setup.config.model_copy(update=update)
         return _told(setup, with_length(replace(setup, config=config), state.step, total))
 
     def _look(self, state: TrainState) -> None:
@@ -215,6 +217,9 @@ def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
 
 def with_length(setup: Setup, step: int, total: int) -> Setup:
     """The setup of a run that has reached `step` and is to have `total` steps in all."""
+    changed = zip(setup.config.revisions, setup.config.revised, strict=False)
+    settings = {done: settings for (done, _), settings in changed}.get(step, {})
+    setup = replace(setup, revised={**setup.revised, **settings})
     wanted = schedule_for(setup, total)
     setup.hook.crossgrad_length_changed(step=step, total=total)
     schedule = setup.schedule.with_length(wanted, step)

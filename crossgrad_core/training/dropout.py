@@ -11,45 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
-#: The share of runs that name none, where at most so many training photos show a point.
-DROPOUT: Final = 0.3
-FEW_PHOTOS: Final = 5
 #: The random stream of what is left out.
 STREAM: Final = "dropout"
 #: Points that are looked at, spread over all.
 _POINTS: Final = 1000
-
-
-def with_dropout(config: RunConfig, scene: Scene, notes: list[str]) -> RunConfig:
-    """The configuration with the share that each training view is drawn without.
-
-    Args:
-        config: The configuration.
-        scene: Its scene.
-        notes: Gets a line where that was decided here and is not 0.
-    """
-    if config.dropout is not None:
-        return config
-    photos = 0.0 if config.preset == "inria" else photos_per_point(scene)
-    share = usual_dropout(photos)
-    if share:
-        notes.append(
-            f"dropout: a point lies in {photos:g} of {len(scene.train)} training photos (median), "
-            f"each of which is drawn without {share:.0%} of the Gaussians (--dropout 0: with all)"
-        )
-    return config.model_copy(update={"dropout": share})
-
-
-def usual_dropout(photos: float) -> float:
-    """The share where a point lies in so many training photos; 0: not known."""
-    return DROPOUT if 0.0 < photos <= FEW_PHOTOS else 0.0
 
 
 def photos_per_point(scene: Scene) -> float:
@@ -64,7 +35,7 @@ def photos_per_point(scene: Scene) -> float:
 
 def dropped(setup: Setup, state: TrainState, gaussians: Gaussians) -> Gaussians:
     """What a training view is drawn from: the others are as much more opaque for it."""
-    share = setup.config.dropout
+    share = setup.numbers.dropout
     if not share:
         return gaussians
     draws = _draws(state.rngs[STREAM], len(gaussians), gaussians.opacities.device)

@@ -5,7 +5,7 @@ from statistics import fmean
 
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.training.growth_budget import most_after, started_with
-from crossgrad_core.training.schedules import growth_of, schedule_of
+from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
@@ -39,12 +39,14 @@ class PrimitiveCounts:
 
 def cost_of_run(setup: Setup, crowd: PrimitiveCounts, steps: int) -> float:
     """Expected cost of a run of so many steps, in units of a view of full size at its start."""
+    setup = setup.at_length(steps, crowd.start)
     schedule = schedule_for(setup, steps)
     return views_of(setup, schedule, 0, steps) * growth_ahead(setup, crowd, schedule, 0)
 
 
 def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> float:
     """Expected cost of the `left` steps after `step`, in units of a view of full size now."""
+    setup = setup.at_length(step + left, crowd.start)
     schedule = setup.schedule.with_length(schedule_for(setup, step + left), step)
     views = views_of(setup, schedule, step, step + left)
     return views * growth_ahead(setup, crowd, schedule, step)
@@ -52,7 +54,7 @@ def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> fl
 
 def schedule_for(setup: Setup, steps: int) -> Schedule:
     """The schedule that the run would have, were it so long from its start."""
-    return schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
+    return schedule_of(setup.in_force, setup.densifier, steps, setup.schedule.counting)
 
 
 def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
@@ -68,7 +70,7 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
-    if ahead and growth_of(setup) == "curve":
+    if ahead and setup.numbers.growth == "curve":
         # A budget that no run fills, as that of nearly the published length, bounds nothing.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead

@@ -12,8 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.training.averaging import eval_parameters
@@ -27,13 +25,6 @@ EMPTY: Final = 0.3
 NEAREST: Final = 1.0
 #: Cameras that observe fewer points say nothing about what is empty.
 FEWEST_SEEN: Final = 8
-
-
-def removes_floaters(config: RunConfig, densifier: Densifier) -> bool:
-    """Whether a run removes them: by default where the set of primitives may change at all."""
-    if config.floaters is not None:
-        return config.floaters == "remove"
-    return config.preset != "inria" and densifier.edits
 
 
 def told_of(count: int) -> str:

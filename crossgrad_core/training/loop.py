@@ -11,7 +11,6 @@ from crossgrad_core.training.clock import PhaseTimer
 from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
 from crossgrad_core.training.model import model_of
 from crossgrad_core.training.rollback import RollbackGuard, is_whole
-from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import take_step
@@ -160,7 +159,7 @@ def _rewind(
 
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
-    if held_back > 0 and growth_of(setup) == "free":
+    if held_back > 0 and setup.numbers.growth == "free":
         setup.hook.crossgrad_log(
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"

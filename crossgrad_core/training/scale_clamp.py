@@ -6,7 +6,6 @@ camera sees that has it at its side, or behind it, whether or not a training pho
 ours.
 """
 
-from collections.abc import Iterator
 from math import log
 from typing import Final
 
@@ -17,12 +16,9 @@ from torch import Tensor
 
 from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.training.rates import gaussians_of, is_short
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
-#: Largest standard deviation, of the distance to the nearest camera that has it at its side.
-BOUND: Final = 0.5
 #: Sizes are looked at once in so many steps.
 EVERY: Final = 50
 #: Scene extents. Smaller Gaussians stay, which most are, and hardly one of them is above the bound.
@@ -31,42 +27,11 @@ LEAST: Final = 0.01
 _AT_ONCE: Final = 2**20
 
 
-def max_scale_ratio_of(setup: Setup) -> float:
-    """The bound of a run; 0 where sizes have none.
-
-    By default runs have none that are as long as the published ones or have their rules. Sizes that
-    are not trained stay as they are.
-    """
-    config = setup.config
-    if not learns_sizes(setup):
-        return 0.0
-    if config.max_scale_ratio is not None:
-        return config.max_scale_ratio
-    return BOUND if is_short(config, setup.schedule) else 0.0
-
-
-def learns_sizes(setup: Setup) -> bool:
-    """Whether there are sizes to bound: primitives are Gaussians with axes that learn."""
-    names = gaussians_of(setup)
-    learning = (block for block in setup.trained_blocks if block.lr.initial > 0.0)
-    return names is not None and names[1] in {name for each in learning for name in each.tensors}
-
-
-def note_on_sizes(setup: Setup) -> Iterator[str]:
-    """That sizes are bounded, where the run did not ask for it."""
-    if setup.config.max_scale_ratio is None and (bound := max_scale_ratio_of(setup)):
-        yield (
-            f"standard deviations are at most {bound:g} of the distance to the nearest training "
-            "camera that has a Gaussian at its side (--set max_scale_ratio=0: no bound, as "
-            "published)"
-        )
-
-
 def clamp_scales(setup: Setup, state: TrainState) -> None:
     """Shortens axes that are too long, in place, in the steps in which sizes are looked at."""
     if state.step % EVERY:
         return
-    names, bound = gaussians_of(setup), max_scale_ratio_of(setup)
+    names, bound = setup.backbone.gaussian_tensors, setup.numbers.max_scale_ratio
     if names is None or not bound:
         return
     positions, scales, _ = (state.tensors[each].detach() for each in names)

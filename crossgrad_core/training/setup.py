@@ -1,8 +1,9 @@
 """The parts of a run once its configuration is resolved; training changes nothing here."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import pluggy
 import torch
@@ -10,6 +11,7 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Block
+from crossgrad_core.contract.decision import FOLLOWING, Decide, Decision, Length, repeats
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exposure import Exposure, PerPhoto
 from crossgrad_core.contract.loss import Loss
@@ -22,6 +24,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.state import Json
 from crossgrad_core.scene.photos_ahead import PhotosAhead
+from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.operator_scale import OperatorScale
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 
@@ -43,6 +46,9 @@ class Setup:
         scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
         photos_ahead: The threads that decode photos beside the steps.
         plan: What a planner decided and why, as plain data; None where nothing was.
+        decisions: The table of decided settings.
+        decide: Makes the table for another length; a run that repeats another one decides nothing.
+        revised: The settings that the clock has changed with the length of the run.
         pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
     """
 
@@ -58,7 +64,34 @@ class Setup:
     scaled_photos: ScaledPhotos | DevicePhotos
     photos_ahead: PhotosAhead = field(default_factory=PhotosAhead)
     plan: Mapping[str, Json] | None = None
+    decisions: tuple[Decision, ...] = ()
+    decide: Decide = repeats
+    revised: Mapping[str, Any] = field(default_factory=dict)
     pixel_share: float = 0.6
+
+    @cached_property
+    def in_force(self) -> RunConfig:
+        """The configuration with the settings that the clock has changed."""
+        return self.config.model_copy(update=dict(self.revised))
+
+    @cached_property
+    def numbers(self) -> Numbers:
+        """The decided settings."""
+        return Numbers.of(self.in_force)
+
+    def following(self, steps: int, start: int | None) -> dict[str, Any]:
+        """The settings that follow the length of the run, if it has so many steps in all.
+
+        Args:
+            steps: Steps of the run.
+            start: Primitives at the start; None before they are counted.
+        """
+        rows = self.decide(Length(self.config.steps or steps, steps, start))
+        return {row.setting: row.value for row in rows if row.setting in FOLLOWING}
+
+    def at_length(self, steps: int, start: int | None) -> "Setup":
+        """The run with the settings that it has in another length."""
+        return replace(self, revised={**self.revised, **self.following(steps, start)})
 
     @property
     def backbone(self) -> Backbone:
@@ -174,11 +207,6 @@ class Setup:
         rest = self.schedule.rests(step)
         blocks = (block for block in self.trained_blocks if block.rests and rest)
         return frozenset(name for block in blocks for name in block.tensors)
-
-    @cached_property
-    def densify_first(self) -> bool:
-        """Whether density control comes before the optimizer (the published order)."""
-        return self.config.preset == "inria"
 
     @cached_property
     def regularizes(self) -> bool:

@@ -21,13 +21,11 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.system.checksums import warn_if_changed
 from crossgrad_core.training import per_image_params
-from crossgrad_core.training.growth_budget import bound_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.morton_order import ordered
 from crossgrad_core.training.photos_ahead import decoded_meanwhile
 from crossgrad_core.training.rates import axes_of, check_axes
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.scale_clamp import max_scale_ratio_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.warmup import compiling_beside
@@ -57,7 +55,7 @@ def first_state(setup: Setup) -> TrainState:
     }
     prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
     parameters = _made(setup, prepared, "prepare")
-    if axes_of(setup) or max_scale_ratio_of(setup):
+    if axes_of(setup) or setup.numbers.max_scale_ratio:
         check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = per_image_params.started(setup)
@@ -87,8 +85,8 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
         return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
     begun = with_random_points(scene, rng) if reading.init == "random" else _begun(setup)
     parameters = _made(setup, setup.backbone.create(begun, rng), "create")
-    present, bound = primitives_of(setup.blocks, parameters), bound_of(setup)
-    if bound is None or bound == AUTO or present <= bound:
+    present, bound = primitives_of(setup.blocks, parameters), setup.numbers.max_gaussians
+    if not bound or bound == AUTO or present <= bound:
         return parameters, None
     grows = setup.densifier.edits and setup.schedule.grows
     wanted = (BEGINNING if grows else 1.0) * bound
@@ -189,7 +187,7 @@ def told_of_start(setup: Setup, state: TrainState) -> tuple[str, ...]:
     kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:
         present = state.primitives(setup)
-        if not isinstance(most, int) or present <= most:
+        if not isinstance(most, int) or not most or present <= most:
             return ()
         return (
             f"start: {present:,} primitives, more than --max-gaussians {most:,}: a PLY is taken "

@@ -42,7 +42,6 @@ from crossgrad_core.training.relabel import groups_of, regroup_if_due
 from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.scale_clamp import clamp_scales
-from crossgrad_core.training.schedules import is_led
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.view_target import context_fields
@@ -206,12 +205,12 @@ def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
 def _finish(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> Mapping[str, int]:
-    """Optimizer, density control and `after_step` in the order of the preset.
+    """Optimizer, density control and `after_step` in the order of the run.
 
     `gradients` is emptied once they are spent.
     """
     state.touched = True
-    if not setup.densify_first:
+    if setup.numbers.step_order == "optimize-first":
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
@@ -284,7 +283,6 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         share=len(rendered.observed) / len(rendered.records),
         means_lr=means_rate_at(setup, state.step),
         room=max_new_gaussians(setup, state, rendered),
-        led=is_led(setup.config, setup.densifier, setup.schedule),
         render=RenderCallback(setup, state, counted=True),
     )
     answer = call_seam(setup.hook.crossgrad_densify, context, DensifyResult)

@@ -23,12 +23,11 @@ from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.training.budget import with_length
-from crossgrad_core.training.growth_budget import bound_of, most_after
+from crossgrad_core.training.growth_budget import most_after
 from crossgrad_core.training.rates import axes_of, rates_at, rule_at
-from crossgrad_core.training.scale_clamp import max_scale_ratio_of
-from crossgrad_core.training.schedules import growth_of
 from crossgrad_core.training.setup import Setup
 
 PATH = Path(__file__).parents[1] / "integration" / "data" / "decided.json"
@@ -53,7 +52,7 @@ PHOTOS = ((12, 400 * 300), (99, 640 * 400), (100, 640 * 400), (300, 800 * 600))
 #: Settings on top, one of them in each combination.
 EXTRAS: tuple[Mapping[str, Any], ...] = (
     {},
-    {"preset": "inria"},
+    {"recipe": {"name": "published"}},
     {"schedule": "absolute"},
     {"schedule": "absolute", "reference": 7_000},
     {"batch_rule": "sqrt"},
@@ -149,16 +148,16 @@ def decided(settings: Mapping[str, Any]) -> Mapping[str, Any]:
         return {"refused": error.what}
     if planned is not None:
         timed = replace(setup, config=setup.config.model_copy(update={"steps": planned}))
-        setup = with_length(timed, 0, planned)
+        setup = with_length(redecided(timed, planned), 0, planned)
     return {
         "settings": json.loads(resolved(setup).model_dump_json(include=set(DECIDED))),
         "schedule": _schedule(setup),
         "rates": {step: rates_at(setup, step) for step in _steps(setup)},
         "adam": {step: repr(rule_at(setup, step)) for step in _steps(setup)},
         "axes": axes_of(setup),
-        "max_scale_ratio": max_scale_ratio_of(setup),
-        "growth": growth_of(setup),
-        "bound": bound_of(setup),
+        "max_scale_ratio": setup.numbers.max_scale_ratio,
+        "growth": setup.numbers.growth,
+        "bound": setup.numbers.max_gaussians,
         "budget": _budget(setup),
         "pixels": setup.selection.resolution.pixels(setup.schedule, setup.schedule.total),
     }
@@ -181,7 +180,7 @@ def _schedule(setup: Setup) -> Mapping[str, Any]:
 
 def _budget(setup: Setup) -> list[int] | None:
     steps = setup.schedule.edit_steps()
-    if not steps or (growth_of(setup) == "free" and bound_of(setup) != "auto"):
+    if not steps or (setup.numbers.growth == "free" and setup.numbers.max_gaussians != "auto"):
         return None
     shown = (steps[0], steps[len(steps) // 2], steps[-1])
     return [most_after(setup, setup.schedule, step, start) for start in STARTS for step in shown]

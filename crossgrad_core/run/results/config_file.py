@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.migration import NOTES, marked, migrated
+from crossgrad_core.run.file_version import NOTES, marked, unmarked
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 from crossgrad_core.wording import listed
@@ -47,7 +47,7 @@ def read_config(folder: Path) -> dict[str, Any]:
             found=f"no {listed(gone)}",
             todo="restore the file from a copy; the results beside it are as they were",
         )
-    return migrated(content, path)
+    return unmarked(content, path)
 
 
 def read_notes(folder: Path) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from typing import Any, Final, cast
 
 from crossgrad_core.contract.state import Json
 from crossgrad_core.run.changeable_settings import CHANGEABLE
-from crossgrad_core.run.migration import NOTES
+from crossgrad_core.run.file_version import NOTES
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.run.results.plan_file import FILE as PLAN

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
 from crossgrad_core.contract.markers import hookimpl
+from crossgrad_core.recipe.lines import full_lines
 from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
@@ -61,7 +62,7 @@ class RunLog:
         self._pace = Pace(run.schedule.total)
         self._interval = max(1, self._pace.total // PROGRESS_LINES)
         self.write(f"{self._clock():%Y-%m-%d}, scene {run.scene.name}, {self._pace.total} steps")
-        for note in run.notes:
+        for note in (*full_lines(run.decisions), *run.notes):
             self.write(note)
 
     @hookimpl

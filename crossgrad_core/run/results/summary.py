@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult
@@ -42,6 +43,7 @@ class Summary:
         environment: Machine and versions.
         ply: What is in the PLY; None where none was written.
         notes: What was chosen or left out, and why.
+        decisions: The table of decided settings.
         check: Figures of the check of the scene against itself; None without one.
         plan: What a planner decided and on what evidence; None where nothing was.
         error: Why the run failed; None otherwise.
@@ -57,6 +59,7 @@ class Summary:
     environment: "Mapping[str, Json]"
     ply: "Mapping[str, Json] | None" = None
     notes: Sequence[str] = ()
+    decisions: Sequence[Decision] = ()
     check: "Mapping[str, Json] | None" = None
     plan: "Mapping[str, Json] | None" = None
     error: str | None = None
@@ -123,6 +126,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "seconds": {name: each for name, each in asdict(summary.seconds).items() if name != "cpu"},
         "seed": summary.config.get("seed"),
         "notes": list(summary.notes),
+        "decisions": [asdict(row) for row in summary.decisions],
         "scene_check": None if summary.check is None else dict(summary.check),
         "plan": None if summary.plan is None else dict(summary.plan),
         "definitions": _definitions(figures),

@@ -30,11 +30,10 @@ class AxisSplit(CloneSplit):
     Those side by side show what the parent showed, and differ from the first step on.
     """
 
-    division: Literal["drawn", "axis"] | None = Field(
-        None,
+    division: Literal["drawn", "axis"] = Field(
+        "drawn",
         description="what grows becomes: drawn, a clone if it is small, else two drawn from it, as "
-        "published; axis, two side by side on its longest axis; none: axis where growth follows "
-        "the curve in a run shorter than the published ones",
+        "published; axis, two side by side on its longest axis",
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
@@ -48,13 +47,9 @@ class AxisSplit(CloneSplit):
         """Whether `split_scale` says more than what is cloned: by which statistic what grows."""
         return False
 
-    def _sides(self, context: DensifyContext) -> bool:
-        """Whether children lie side by side."""
-        return context.led if self.division is None else self.division == "axis"
-
     @override
     def divided(self, context: DensifyContext, growth: Growth) -> Growth:
-        if not self._sides(context):
+        if self.division != "axis":
             return growth
         grown = growth.clone | growth.split
         return replace(growth, clone=torch.zeros_like(grown), split=grown)
@@ -63,7 +58,7 @@ class AxisSplit(CloneSplit):
     def grown_values(
         self, context: DensifyContext, state: PluginState, plan: Plan
     ) -> dict[str, Rows]:
-        if not self._sides(context):
+        if self.division != "axis":
             return super().grown_values(context, state, plan)
         rows = plan.child.nonzero().squeeze(1)
         # The first children of all parents come before the second ones.

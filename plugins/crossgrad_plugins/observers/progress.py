@@ -15,9 +15,11 @@ from crossgrad_core.plugin import (
     controls_of,
     evaluation_line,
     figures,
+    full_lines,
     hookimpl,
     length_lines,
     progress_line,
+    short_lines,
     showable,
     shows_bar,
 )
@@ -64,7 +66,8 @@ class Progress(Observer):
         self._say(f"{run.scene.name}: {train} training views, {test} held out")
         if run.folder is not None:
             self._say(f"results in {run.folder}")
-        for note in run.notes:
+        told = full_lines if self.level == "verbose" else short_lines
+        for note in (*told(run.decisions), *run.notes):
             self._say(f"- {note}")
 
     @hookimpl

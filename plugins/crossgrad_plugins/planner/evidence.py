@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
-from crossgrad_core.commands import ComponentChoice, RunConfig, views_per_step_spec_of
+from crossgrad_core.commands import ComponentChoice, RunConfig, views_per_step_of
 from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewsPerStepSpec, build_component
 from crossgrad_plugins.planner.modes import Modes, modes_of
 
@@ -70,7 +70,12 @@ class Evidence:
     @cached_property
     def view_plan(self) -> ViewsPerStepSpec:
         """How many views the steps have, without decisions on it."""
-        return views_per_step_spec_of(self.config)
+        return views_per_step_of(self.config)[0]
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the run has the recipe that the rules of the planner were measured with."""
+        return self.config.recipe.name == "auto"
 
     @cached_property
     def backbone(self) -> Backbone:

@@ -17,7 +17,7 @@ ONE_SCALE: Final = 2.0
 def exposure(evidence: Evidence) -> Decision:
     """Whether photos get an exposure each."""
     part, config = "exposure", evidence.config
-    if evidence.is_given("exposure", "exposure_from") or config.preset == "inria":
+    if evidence.is_given("exposure", "exposure_from") or not evidence.is_measured:
         chosen = config.exposure.name if config.exposure else "as a run has it"
         return given(part, chosen, "--exposure NAME")
     from crossgrad_plugins.exposures.tracks.gains import (

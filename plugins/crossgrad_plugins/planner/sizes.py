@@ -5,14 +5,12 @@ from typing import Final
 
 from crossgrad_core.commands import (
     DEFAULT_STEPS,
-    counting_of,
+    RunConfig,
+    edits_of,
     photos_per_point,
-    shows_few_times,
-    usual_budget,
-    usual_densifier,
-    usual_dropout,
+    table_of,
 )
-from crossgrad_core.plugin import Densifier, Resolution, Schedule, build_component
+from crossgrad_core.plugin import Resolution, build_component
 from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.groups import views_of_steps
@@ -27,8 +25,6 @@ _FLAT: Final = "docs/plan.md, four scenes"
 #: Views of each training photo after which more of them stop to pay, and of all together at least.
 PASSES: Final = 100
 FEWEST_VIEWS: Final = 1_000
-#: A budget of more primitives is none.
-_NO_BOUND: Final = 2**31
 
 
 def resolution(evidence: Evidence) -> Decision:
@@ -81,10 +77,9 @@ def count(evidence: Evidence) -> Decision:
     if steps is None:
         return plain.found(f"{points:,} points; the length follows the clock")
     views = views_of_steps(evidence).paced(steps).views(steps)
-    pixels, photos = evidence.scene.train_pixels, len(evidence.scene.train_views)
-    hurried = shows_few_times(config, views, photos)
-    budget = usual_budget(points, views, pixels, hurried=hurried)
-    shown = "no bound" if budget > _NO_BOUND else f"up to {budget:,}"
+    pixels = evidence.scene.train_pixels
+    budget = table_of(_with_length(evidence), evidence.scene, points)["max_gaussians"].value
+    shown = f"up to {budget:,}" if budget else "no bound"
     return plain.found(
         f"{points:,} points, {views:,} views, photos of {pixels / 1e6:.2f} MP: {shown}",
         figures={"points": points, "views": views, "pixels": pixels},
@@ -116,7 +111,7 @@ def length(evidence: Evidence) -> Decision:
         _FLAT,
         _EXACTLY,
     )
-    if config.preset == "inria" or config.schedule == "absolute":
+    if not evidence.is_measured or config.schedule == "absolute":
         return plain.found("a published schedule, which a shorter run would cut")
     if not photos:
         return plain.found("no training photos")
@@ -144,11 +139,7 @@ def densifier(evidence: Evidence) -> Decision:
         return plain.found("the length follows the clock, and edits follow the length")
     if evidence.is_given(*_EDITS):
         return plain.found("edits are as you set them")
-    edits = _edits(evidence, steps, budgeted=True)
-    if edits != _edits(evidence, steps, budgeted=False):
-        # Not before: what a run has no use for is not imported.
-        control = build_component(Densifier, usual, {})
-        edits = _edits(evidence, steps, budgeted=control.budgeted)
+    edits = edits_of(_with_length(evidence), evidence.scene)
     shown = plain.found(f"{edits} edits in {steps:,} steps", decided=True, figures={"edits": edits})
     if edits:
         return shown
@@ -158,9 +149,13 @@ def densifier(evidence: Evidence) -> Decision:
 
 def _usual_densifier(evidence: Evidence) -> str:
     """That of a run that names none and has the length decided on."""
-    config = evidence.config.model_copy(update=dict(length(evidence).settings))
-    photos = len(evidence.scene.train_views)
-    return usual_densifier(config, views_of_steps(evidence), evidence.backbone, photos)
+    row = table_of(_with_length(evidence), evidence.scene).get("densifier")
+    return evidence.backbone.default_densifier if row is None else str(row.value)
+
+
+def _with_length(evidence: Evidence) -> RunConfig:
+    """The configuration with the decision on the length."""
+    return evidence.config.model_copy(update=dict(length(evidence).settings))
 
 
 def _steps(evidence: Evidence) -> int | None:
@@ -177,11 +172,11 @@ def _steps(evidence: Evidence) -> int | None:
 def dropout(evidence: Evidence) -> Decision:
     """Whether training views are drawn without a share of the Gaussians."""
     part, config = "dropout", evidence.config
-    if evidence.is_given("dropout") or config.preset == "inria":
+    if evidence.is_given("dropout"):
         return given(part, config.dropout or "none", "--dropout SHARE")
     rule = "some where a point lies in at most 5 photos; where more show it, no gain was measured"
     photos = photos_per_point(evidence.scene)
-    share = usual_dropout(photos)
+    share = table_of(evidence.config, evidence.scene)["dropout"].value
     choice = f"{share:g}" if share else "none"
     plain = Decision(part, choice, "default", "", rule, _FEW, "--dropout SHARE")
     if not photos:
@@ -189,13 +184,6 @@ def dropout(evidence: Evidence) -> Decision:
     shown = f"a point lies in {photos:g} of {len(evidence.scene.train_views)} photos (median)"
     saved = NOTHING if share else "a random number for each Gaussian of a view"
     return plain.found(shown, decided=True, saved=saved, figures={"photos_of_a_point": photos})
-
-
-def _edits(evidence: Evidence, steps: int, *, budgeted: bool) -> int:
-    """The edits of a run, whose density control is led by a budget or not."""
-    photos = len(evidence.scene.train_views)
-    counting = counting_of(evidence.config, views_of_steps(evidence), photos, budgeted=budgeted)
-    return Schedule.for_run(steps, evidence.config.schedule, counting).edits()
 
 
 #: Settings that only make sense with density control.

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from crossgrad_core.commands import ComponentChoice, counts_as_short
+from crossgrad_core.commands import ComponentChoice, facts_of
 from crossgrad_core.plugin import REFERENCE, Grouping, Json, Scene, build_component
 from crossgrad_plugins.groupings.split import FAR
 from crossgrad_plugins.planner.decision import Decision, given
@@ -63,9 +63,9 @@ def turns(evidence: Evidence) -> Decision:
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
     plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
-    if evidence.config.preset == "inria" or evidence.is_given("operator", "views_per_step"):
-        return plain.found("measured with our rules and single views only")
-    if not _is_short(evidence):
+    if not evidence.is_measured or evidence.is_given("operator", "views_per_step"):
+        return plain.found("measured with recipe auto and single views only")
+    if not _in_short_run(evidence):
         return plain.found("measured in shorter runs only")
     if not evidence.modes.two:
         return plain.found("no two modes", decided=evidence.modes.one)
@@ -95,9 +95,9 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     )
 
 
-def _is_short(evidence: Evidence) -> bool:
-    """Whether the run counts as short, with the length that a plan of all parts gives it."""
+def _in_short_run(evidence: Evidence) -> bool:
+    """Whether the run is short, with the length that a plan of all parts gives it."""
     config = evidence.config
     if config.plan == "auto" and config.steps is config.seconds is config.max_views is None:
         config = config.model_copy(update={"max_views": most_views(evidence)})
-    return counts_as_short(config, evidence.view_plan)
+    return facts_of(config, evidence.scene).short

@@ -1,0 +1,134 @@
+"""The table of decided settings: made by a recipe, applied to a configuration, written down."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.component import answered
+from crossgrad_core.contract.decision import Decision
+from crossgrad_core.contract.recipe import Facts, Recipe
+from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.validation import as_user_error
+from crossgrad_core.wording import listed
+
+#: Settings that training and assembly read and that have no default: a recipe decides each.
+DECIDED: Final = (
+    *("views_per_step", "densifier", "start", "exposure", "resolution", "dropout", "floaters"),
+    *("events", "growth", "max_gaussians", "min_refinements", "reset_every", "sh_start"),
+    *("position_lr", "max_scale_ratio", "rate_factor", "hurried_rates", "beta1", "beta2"),
+    *("lr_tail", "step_order"),
+)
+
+
+def recipe_of(config: RunConfig) -> Recipe:
+    """Return the recipe of a run."""
+    return build(Recipe, config.recipe.name, config.recipe.options)
+
+
+def is_given(config: RunConfig, setting: str) -> bool:
+    """Return True if a setting, or an option of a component, has a value already."""
+    name, _, option = setting.partition(".")
+    value = getattr(config, name, None)
+    if option:
+        return isinstance(value, ComponentChoice) and option in value.options
+    chosen = value.name if isinstance(value, ComponentChoice) else value
+    return name in config.model_fields_set and chosen is not None and chosen != AUTO
+
+
+def given_settings(config: RunConfig) -> dict[str, Any]:
+    """Return the settings that have a value already; `max_gaussians` may be `auto`."""
+    names = (name for name in config.model_fields_set if is_given(config, name))
+    given = {name: getattr(config, name) for name in names}
+    return given | {"max_gaussians": config.max_gaussians}
+
+
+def is_complete(config: RunConfig) -> bool:
+    """Return True if no recipe is needed: the run repeats one that wrote all decisions down."""
+    return all(is_given(config, name) for name in DECIDED)
+
+
+def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
+    """Return the rows of the recipe for the settings that are open.
+
+    Raises:
+        UserError: The recipe does not decide a setting that a run needs.
+    """
+    recipe = recipe_of(config)
+    rows = answered(recipe.decide(facts), list, recipe, "decide")
+    table = {row.setting: row for row in rows if not is_given(config, row.setting)}
+    missing = [name for name in DECIDED if name not in table and not is_given(config, name)]
+    if missing:
+        raise UserError(
+            f"recipe {config.recipe.name} does not decide every setting",
+            where=f"{type(recipe).__module__}:{type(recipe).__qualname__}.decide",
+            expected=f"a row for each of {listed(DECIDED)}",
+            found=f"no row for {listed(missing)}",
+            todo="repair the plugin, or set the value: "
+            + listed(f"--set {n}=..." for n in missing),
+        )
+    return tuple(table.values())
+
+
+def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
+    """Return the configuration with decided values and their reasons.
+
+    Raises:
+        UserError: A recipe names a setting that does not exist, or gives it a wrong value.
+    """
+    update: dict[str, Any] = config.model_dump(exclude_unset=True)
+    for row in sorted(rows, key=lambda row: "." in row.setting):
+        name, _, option = row.setting.partition(".")
+        held = update.get(name)
+        if option:
+            update[name] = {"name": AUTO, **(held or {}), option: row.value}
+        elif isinstance(held, dict) and isinstance(row.value, str):
+            update[name] = {**held, "name": row.value}
+        else:
+            update[name] = _long_form(name, row.value)
+    update["decided"] = {**config.decided, **{row.setting: row.because for row in rows}}
+    try:
+        return RunConfig.model_validate(update)
+    except ValidationError as error:
+        subject = f"recipe {config.recipe.name}"
+        todo = "repair the plugin, or choose another --recipe"
+        raise as_user_error(error, RunConfig, subject=subject, todo=todo) from error
+
+
+def _long_form(name: str, value: object) -> object:
+    """Return the name of a component as a choice of it."""
+    component = name in {"densifier", "start", "exposure", "resolution", "grouping"}
+    return {"name": value} if component and isinstance(value, str) else value
+
+
+def open_again(config: RunConfig) -> RunConfig:
+    """Return the configuration as the user set it: decided settings are open again."""
+    update: dict[str, Any] = config.model_dump(exclude_unset=True)
+    without_decided(update)
+    return RunConfig.model_validate(update)
+
+
+def without_decided(settings: dict[str, Any]) -> None:
+    """Remove decided values, and what says that they were decided, from plain settings."""
+    decided = settings.pop("decided", None) or {}
+    for setting in decided:
+        name, _, option = str(setting).partition(".")
+        if not option:
+            settings.pop(name, None)
+        elif isinstance(settings.get(name), dict):
+            settings[name] = {k: v for k, v in settings[name].items() if k != option}
+
+
+def rows_of(config: RunConfig) -> tuple[Decision, ...]:
+    """Return the decisions that a configuration has written down; their evidence is not."""
+    return tuple(Decision(name, _value(config, name), why) for name, why in config.decided.items())
+
+
+def _value(config: RunConfig, setting: str) -> object:
+    name, _, option = setting.partition(".")
+    value = getattr(config, name)
+    if isinstance(value, ComponentChoice):
+        return value.options.get(option) if option else value.name
+    return value

@@ -1,0 +1,131 @@
+"""The facts that a recipe decides from, and the one call that makes the table of decisions."""
+
+from dataclasses import fields, replace
+from typing import cast
+
+from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.component import pair
+from crossgrad_core.contract.decision import Decide, Decision, Length, repeats
+from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.recipe import Facts
+from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.schedule import Counting
+from crossgrad_core.recipe.table import applied, decide, given_settings, is_complete, rows_of
+from crossgrad_core.registry.entries import build, load
+from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.usual_device import with_device
+from crossgrad_core.run.usual_views import views_per_step_of
+from crossgrad_core.training.dropout import photos_per_point
+from crossgrad_core.training.numbers import Numbers
+from crossgrad_core.training.schedules import schedule_of
+from crossgrad_core.training.setup import Setup
+
+#: Length of a run for which neither steps nor views nor seconds are set (3DGS).
+DEFAULT_STEPS = 30_000
+
+
+def facts_of(config: RunConfig, scene: Scene) -> Facts:
+    """Return the facts about a run.
+
+    Args:
+        config: The configuration, with the settings of the user alone.
+        scene: Its scene.
+
+    Raises:
+        UserError: A component is wrong, or no rasterizer runs on the device.
+    """
+    views, because = views_per_step_of(config)
+    backbone = build(Backbone, config.backbone.name, config.backbone.options)
+    backbone, _ = pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
+    device = with_device(config)[0].device.partition(":")[0]
+    rasterizer, _ = choose_rasterizer(config.rasterizer.name, Wanted(device, backbone.response))
+    choice = config.densifier or ComponentChoice(name="")
+    steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
+    planned = steps or DEFAULT_STEPS
+    return Facts(
+        device=device,
+        planned=None if config.seconds is not None else planned,
+        total=DEFAULT_STEPS if config.seconds is not None else planned,
+        mode=config.schedule,
+        reference=config.reference,
+        views_per_step=views,
+        views_because=because,
+        photos=len(scene.train_views),
+        pixels=scene.train_pixels,
+        photos_per_point=photos_per_point(scene),
+        own_points=config.reading.init == "points",
+        batched=config.batch_rule != "none",
+        scale=scene.similarity.scale,
+        start=None,
+        backbone=backbone,
+        densifier=lambda name: build(Densifier, name, choice.options),
+        provides=load(Rasterizer, rasterizer).provides,
+        given=given_settings(config),
+    )
+
+
+def with_decisions(
+    config: RunConfig, scene: Scene
+) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
+    """Return the configuration with all settings decided, the table, and what makes it again.
+
+    Raises:
+        UserError: See `facts_of`; or the recipe leaves a setting open.
+    """
+    if is_complete(config):
+        return config, rows_of(config), repeats
+    facts = facts_of(config, scene)
+    rows = decide(config, facts)
+
+    def again(length: Length) -> tuple[Decision, ...]:
+        return decide(config, replace(facts, **vars(length)))
+
+    return applied(config, rows), rows, again
+
+
+def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[str, Decision]:
+    """Return setting -> decision, for what the user leaves open.
+
+    Args:
+        config: The configuration, with the settings of the user alone.
+        scene: Its scene.
+        start: Primitives at the start, if the number of primitives is asked for.
+
+    Raises:
+        UserError: See `with_decisions`.
+    """
+    rows = decide(config, replace(facts_of(config, scene), start=start))
+    return {row.setting: row for row in rows}
+
+
+def edits_of(config: RunConfig, scene: Scene) -> int:
+    """Return the edits of density control in a run.
+
+    Raises:
+        UserError: See `with_decisions`.
+    """
+    config, _, _ = with_decisions(config, scene)
+    views, _ = views_per_step_of(config)
+    steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
+    choice = cast("ComponentChoice", config.densifier)
+    densifier = build(Densifier, choice.name, choice.options)
+    counting = Counting(views=views, photos=len(scene.train_views), reference=config.reference)
+    return schedule_of(config, densifier, steps or DEFAULT_STEPS, counting).edits()
+
+
+def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
+    """Return the run with the numbers of the length that is planned now; components stay.
+
+    Args:
+        setup: The run.
+        planned: Steps that it is planned with.
+        start: Primitives at the start; None before they are counted.
+    """
+    numbers = {each.name for each in fields(Numbers)}
+    rows = {row.setting: row for row in setup.decide(Length(planned, planned, start))}
+    table = {row.setting: row for row in setup.decisions}
+    table |= {name: row for name, row in rows.items() if name in numbers}
+    config = applied(setup.config, tuple(table.values()))
+    return replace(setup, config=config, decisions=tuple(table.values()))

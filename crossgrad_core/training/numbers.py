@@ -1,0 +1,48 @@
+"""The decided settings as training reads them: plain values, none of them open."""
+
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.schedule import Unit
+from crossgrad_core.errors import UserError
+from crossgrad_core.wording import listed
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The settings of a run that a recipe decides, each described in `RunConfig`."""
+
+    rate_factor: float
+    hurried_rates: bool
+    beta1: float
+    beta2: float
+    position_lr: Literal["extent", "per-axis"]
+    max_scale_ratio: float
+    lr_tail: float
+    floaters: Literal["keep", "remove"]
+    dropout: float
+    growth: Literal["free", "curve"]
+    max_gaussians: int | Literal["auto"]
+    step_order: Literal["optimize-first", "densify-first"]
+    events: Unit
+    min_refinements: int
+    reset_every: int
+    sh_start: float
+
+    @classmethod
+    def of(cls, config: RunConfig) -> "Numbers":
+        """Return the numbers of a configuration.
+
+        Raises:
+            UserError: A number is open: no recipe decided it.
+        """
+        values = {each.name: getattr(config, each.name) for each in fields(cls)}
+        if missing := [name for name, value in values.items() if value is None]:
+            raise UserError(
+                "settings that a run needs have no value",
+                where=listed(missing),
+                expected="a value from the user or from the recipe",
+                todo="set them, or choose a --recipe that decides them",
+            )
+        return cls(**values)

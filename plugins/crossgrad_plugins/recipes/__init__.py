@@ -1,0 +1,1 @@
+"""Recipes: the decided settings of a run."""

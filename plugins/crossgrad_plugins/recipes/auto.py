@@ -1,0 +1,385 @@
+"""Recipe `auto`: the values that were measured to be best for the length and the device."""
+
+from functools import cached_property
+from typing import Final, Literal
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import REFERENCE, Decision, Densifier, Facts, Recipe, shortness
+from crossgrad_plugins.recipes import budget
+
+#: Adam's decay rates as published.
+BETA1, BETA2 = 0.9, 0.999
+#: Components of long runs, and the ones that replace them in short runs.
+DENSIFIER, SHORT_DENSIFIER = "adc", "absgrad"
+RESOLUTION, SHORT_RESOLUTION = "full", "interlaced"
+START, BARE_START, EXPOSURE = "filled", "sfm", "auto"
+#: Training photos from which on a short run grows by absolute gradients; with fewer photos it
+#: overfits.
+MANY_PHOTOS: Final = 100
+
+#: The published rates are for `REFERENCE` steps. A shorter run has them times the ratio of the two
+#: to this power, because the sum of the rates falls with the length, but not as fast.
+SHORTNESS: Final = 0.45
+#: The largest factor, which runs of some 1,000 steps have.
+MOST: Final = 4.5
+#: A run that shows each training photo fewer times than this, in the mean, is hurried: it ends long
+#: before it overfits.
+HURRY: Final = 40
+#: Power and largest factor of the rates of hurried runs.
+HURRIED_SHORTNESS, HURRIED_MOST = 0.65, 6.3
+#: Adam's second moment averages over this share of the steps of a hurried run, and over this many
+#: steps at least. Gradients of the first steps are much larger than later ones, and hold later
+#: steps back for the 1,000 steps of the published average.
+MEMORY, LEAST_MEMORY = 1 / 50, 50
+#: Decay of the first moment in short runs, which averages over 3 steps instead of 10.
+SHORT_BETA1: Final = 0.7
+#: Largest standard deviation, as a share of the distance to the nearest camera at whose side a
+#: Gaussian is.
+SCALE_RATIO: Final = 0.5
+#: Share of a hurried short run before SH bands above the first are drawn: until then they cost time
+#: and gain little.
+SH_START: Final = 0.5
+#: Share of the run over which constant learning rates fade.
+LR_TAIL: Final = 0.25
+#: Share of the Gaussians that a view is drawn without if at most so many photos show a point.
+DROPOUT, FEW_PHOTOS = 0.3, 5
+#: Edits that growth along the curve has in runs of so many views or more. In shorter runs, new
+#: primitives have no time to settle and can cost 1 dB.
+EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
+#: The page that shows how these values were measured.
+SCHEDULES: Final = "docs/schedules.md"
+
+
+class Auto(Recipe):
+    """What was measured to be best for the length and the device, decided from the facts."""
+
+    @override
+    def decide(self, facts: Facts) -> list[Decision]:
+        choice = Choice(facts)
+        return [
+            *components(choice),
+            *growth(choice),
+            *rates(choice),
+            *steps(choice),
+            *ends(choice),
+        ]
+
+
+class Choice:
+    """The values that several rows share, each worked out once.
+
+    Args:
+        facts: The facts about the run.
+    """
+
+    def __init__(self, facts: Facts) -> None:
+        self.facts = facts
+        self.given = facts.given
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether the backbone has Gaussians with axes of their own, drawn as published."""
+        backbone = self.facts.backbone
+        return bool(backbone.axes) and backbone.response == "plain"
+
+    @cached_property
+    def hurried(self) -> bool:
+        """Whether the run shows each training photo only a few times."""
+        views = self.facts.views
+        if views is None or "beta2" in self.given:
+            return False
+        return views < min(REFERENCE, HURRY * self.facts.photos)
+
+    @cached_property
+    def densifier_name(self) -> str:
+        """Name of the densifier."""
+        named = self.given.get("densifier")
+        return self._usual_densifier if named is None else str(named.name)
+
+    @cached_property
+    def _usual_densifier(self) -> str:
+        facts = self.facts
+        usual = facts.backbone.default_densifier
+        suits = usual == DENSIFIER and self.is_plain and facts.photos >= MANY_PHOTOS
+        here = suits and facts.short and facts.device == "cpu"
+        if not here or self.usual_growth(budgeted=True) == "free":
+            return usual
+        needs = facts.densifier(SHORT_DENSIFIER).needs
+        return SHORT_DENSIFIER if needs <= facts.provides else usual
+
+    @cached_property
+    def densifier(self) -> Densifier:
+        """The densifier."""
+        return self.facts.densifier(self.densifier_name)
+
+    def usual_growth(self, *, budgeted: bool) -> Literal["free", "curve"]:
+        """How primitives grow in a run of any length, as was set or as suits the densifier."""
+        given: Literal["free", "curve"] | None = self.given.get("growth")
+        if given is not None:
+            return given
+        # A bound that the user names is a limit and not a target.
+        named = self.given["max_gaussians"] not in {None, "auto"}
+        led = budgeted and self.facts.unit == "views"
+        return "curve" if led and not named else "free"
+
+    @cached_property
+    def length(self) -> int:
+        """Length of the schedule, in what it counts."""
+        return self.facts.schedule(self.facts.unit).length
+
+    @cached_property
+    def growth(self) -> Literal["free", "curve"]:
+        """How primitives grow in this run: there is no budget at the published length."""
+        usual = self.usual_growth(budgeted=self.densifier.budgeted)
+        return usual if self.length < REFERENCE or "growth" in self.given else "free"
+
+    @cached_property
+    def led(self) -> bool:
+        """Whether growth follows the curve to a budget that suits the length."""
+        return self.growth == "curve" and self.length < REFERENCE
+
+
+def components(choice: Choice) -> list[Decision]:
+    """Return the rows of components."""
+    facts, name = choice.facts, choice.densifier_name
+    usual = facts.backbone.default_densifier
+    swapped = name != usual
+    budgeted = choice.densifier.budgeted
+    led = not choice.densifier.edits or choice.usual_growth(budgeted=budgeted) == "curve"
+    first = led and choice.is_plain and facts.device == "cpu" and facts.short
+    start = START if facts.own_points else BARE_START
+    return [
+        Decision(
+            "views_per_step",
+            facts.views_per_step.setting,
+            facts.views_because or "usual for the sampler",
+            override="--views K" if facts.views_because else "",
+        ),
+        Decision(
+            "densifier",
+            name,
+            f"short run of {MANY_PHOTOS} photos or more" if swapped else "usual for the backbone",
+            f"{facts.photos} training photos; {SCHEDULES}",
+            f"--densifier {usual}" if swapped else "",
+        ),
+        Decision(
+            "resolution",
+            SHORT_RESOLUTION if first else RESOLUTION,
+            "pixels are most of a step on a CPU" if first else "all pixels in every step",
+            "docs/resolutions.md",
+            f"--resolution {RESOLUTION}" if first else "",
+        ),
+        Decision(
+            "start",
+            start,
+            "adds points where the scene has few"
+            if facts.own_points
+            else "the points that --init names",
+            "docs/starts.md",
+        ),
+        Decision("exposure", EXPOSURE, "as the photos need it", "docs/exposure.md"),
+        _dropout(facts),
+    ]
+
+
+def _dropout(facts: Facts) -> Decision:
+    photos = facts.photos_per_point
+    few = 0.0 < photos <= FEW_PHOTOS
+    return Decision(
+        "dropout",
+        DROPOUT if few else 0.0,
+        "few photos show each point" if few else "enough photos show each point",
+        f"a point lies in {photos:g} of {facts.photos} photos (median); docs/few-photos.md",
+        "--dropout 0" if few else "",
+    )
+
+
+def growth(choice: Choice) -> list[Decision]:
+    """Return the rows of density control."""
+    facts, led = choice.facts, choice.led
+    schedule = facts.schedule(facts.unit)
+    usual = choice.usual_growth(budgeted=choice.densifier.budgeted)
+    long = (
+        facts.unit == "views" and not facts.published and choice.length >= SHORTEST_RUN_WITH_EDITS
+    )
+    edits = EDITS if usual == "curve" and long else 0
+    resets = 0 if led else choice.densifier.window(schedule).reset_every or 0
+    rows = [
+        Decision("events", facts.unit, "published numbers" if facts.published else "any K"),
+        Decision(
+            "growth",
+            choice.growth,
+            "suits the length of the run" if led else "as density control requests",
+            "Taming 3DGS; " + SCHEDULES,
+            "--growth free" if led else "",
+        ),
+        _budget(choice),
+        Decision(
+            "min_refinements",
+            edits,
+            "the curve needs some edits" if edits else "as many as the schedule has",
+            SCHEDULES,
+        ),
+        Decision(
+            "reset_every",
+            resets,
+            "the curve already limits growth" if led else "as published",
+            SCHEDULES,
+            f"--set reset_every={schedule.reset_every or 3000}" if led else "",
+        ),
+    ]
+    if "division" in type(choice.densifier).model_fields:
+        why = "children side by side leave no holes" if led else "as published"
+        division, force = ("axis", "--set densifier.division=drawn") if led else ("drawn", "")
+        rows.append(Decision("densifier.division", division, why, SCHEDULES, force))
+    return rows
+
+
+def _budget(choice: Choice) -> Decision:
+    facts = choice.facts
+    asked = choice.given["max_gaussians"] == "auto"
+    if choice.growth == "free" and not asked:
+        return Decision("max_gaussians", 0, "growth is free", SCHEDULES)
+    most: int | str = "auto"
+    if facts.start is not None:
+        most = budget.budget(facts.start, choice.length, facts.pixels, hurried=choice.hurried)
+    return Decision(
+        "max_gaussians",
+        most,
+        "the number that suits the length" if most else "no bound at the published length",
+        f"{facts.start} primitives at first, photos of {facts.pixels / 1e6:.2f} MP; {SCHEDULES}",
+        "--max-gaussians N",
+    )
+
+
+def rates(choice: Choice) -> list[Decision]:
+    """Return the rows of learning rates and of Adam."""
+    factor, hurried = _rate_factor(choice), choice.hurried
+    own = hurried and "rate_factor" not in choice.given
+    beta1, beta2 = _beta1(choice), _beta2(choice)
+    few = f"fewer than {HURRY} views of each photo"
+    return [
+        Decision(
+            "rate_factor",
+            factor,
+            f"published rates are for {REFERENCE:,} steps",
+            SCHEDULES,
+            "--rate-factor 1" if factor != 1.0 else "",
+        ),
+        Decision(
+            "hurried_rates",
+            own,
+            few if own else "one factor for all blocks",
+            SCHEDULES,
+            "--set hurried_rates=false" if own else "",
+        ),
+        Decision(
+            "beta1",
+            beta1,
+            "short runs average over fewer steps" if beta1 != BETA1 else "as published",
+            SCHEDULES,
+            f"--set beta1={BETA1}" if f"{beta1:.3g}" != f"{BETA1:.3g}" else "",
+        ),
+        Decision(
+            "beta2",
+            beta2,
+            few if hurried else "as published",
+            SCHEDULES,
+            f"--set beta2={BETA2}" if f"{beta2:.3g}" != f"{BETA2:.3g}" else "",
+        ),
+    ]
+
+
+def _rate_factor(choice: Choice) -> float:
+    facts = choice.facts
+    schedule = facts.schedule(facts.unit)
+    steps = facts.total if facts.mode == "scaled" else schedule.step_of(schedule.length)
+    if facts.steps is None or schedule.pace.views(steps) >= REFERENCE:
+        return 1.0
+    power, most = (HURRIED_SHORTNESS, HURRIED_MOST) if choice.hurried else (SHORTNESS, MOST)
+    return min(max(1.0, float((REFERENCE / steps) ** power)), most)
+
+
+def _beta1(choice: Choice) -> float:
+    """Return the decay of the first moment: published with a batch rule, and with anchors."""
+    facts = choice.facts
+    if facts.views is None or facts.batched or not facts.backbone.axes:
+        return BETA1
+    return BETA1 - (BETA1 - SHORT_BETA1) * shortness(facts.views)
+
+
+def _beta2(choice: Choice) -> float:
+    facts = choice.facts
+    if not choice.hurried or facts.steps is None or facts.views is None:
+        return BETA2
+    memory = max(LEAST_MEMORY, MEMORY * facts.steps)
+    if facts.batched:
+        # With K views per step, Adam averages over 1/K of the steps.
+        memory *= facts.views / facts.steps
+    return min(BETA2, 1.0 - 1.0 / memory)
+
+
+def steps(choice: Choice) -> list[Decision]:
+    """Return the rows of how a step moves Gaussians."""
+    facts, short = choice.facts, choice.facts.short
+    along = short and facts.backbone.gaussian_tensors is not None
+    bounded = short and facts.backbone.learns_scales
+    share = _sh_start(choice)
+    return [
+        Decision("step_order", "optimize-first", "density control sees the new values"),
+        Decision(
+            "position_lr",
+            "per-axis" if along else "extent",
+            "short runs step by the size of a Gaussian" if along else "as published",
+            SCHEDULES,
+            "--position-lr extent" if along else "",
+        ),
+        Decision(
+            "max_scale_ratio",
+            SCALE_RATIO if bounded else 0.0,
+            "large Gaussians near a camera hide the scene" if bounded else "as published",
+            "docs/floaters.md",
+            "--set max_scale_ratio=0" if bounded else "",
+        ),
+        Decision(
+            "sh_start",
+            share,
+            "SH bands gain little before" if share else "degree by degree from the start",
+            SCHEDULES,
+            "--set sh_start=0" if share else "",
+        ),
+    ]
+
+
+def _sh_start(choice: Choice) -> float:
+    """Return the share of the run before the SH degree grows, as a whole number of views."""
+    facts = choice.facts
+    if not choice.hurried or facts.unit != "views" or facts.published:
+        return 0.0
+    schedule = facts.schedule(facts.unit)
+    # Another schedule than the run's own may be longer than the run.
+    length = min(schedule.length, schedule.counted(schedule.total))
+    return int(SH_START * shortness(schedule.length) * length) / length
+
+
+def ends(choice: Choice) -> list[Decision]:
+    """Return the rows of the end of a run."""
+    edits = choice.densifier.edits
+    fades = any(not block.lr.decays for block in choice.facts.backbone.trained_blocks())
+    return [
+        Decision(
+            "lr_tail",
+            LR_TAIL if fades else 0.0,
+            "constant rates fade at the end" if fades else "all rates decay already",
+            "docs/steady-ends.md",
+            "--lr-tail 0" if fades else "",
+        ),
+        Decision(
+            "floaters",
+            "remove" if edits else "keep",
+            "no photo shows them, and they hide the scene" if edits else "the primitives stay",
+            "docs/floaters.md",
+            "--floaters keep" if edits else "",
+        ),
+    ]

@@ -1,0 +1,55 @@
+"""Recipe `published`: the rules of the original code of 3DGS, whatever the length of the run."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Decision, Facts, Recipe, Unit
+
+#: Near plane of the original code, in units of the scene's own frame.
+NEAR: Final = 0.2
+BECAUSE: Final = "as published"
+#: Settings that do not depend on any fact.
+VALUES: Final[Mapping[str, Any]] = {
+    "start": "sfm",
+    "exposure": "none",
+    "resolution": "full",
+    "dropout": 0.0,
+    "floaters": "keep",
+    "growth": "free",
+    "min_refinements": 0,
+    "sh_start": 0.0,
+    "position_lr": "extent",
+    "max_scale_ratio": 0.0,
+    "rate_factor": 1.0,
+    "hurried_rates": False,
+    "beta1": 0.9,
+    "beta2": 0.999,
+    "lr_tail": 0.0,
+    "step_order": "densify-first",
+    "rasterizer.footprint": "3-sigma",
+}
+
+
+class Published(Recipe):
+    """Order of a step, 3-sigma footprint, near plane, rates and schedule as published."""
+
+    rasterizer_options: ClassVar[frozenset[str]] = frozenset({"footprint"})
+
+    @override
+    def decide(self, facts: Facts) -> list[Decision]:
+        unit: Unit = facts.given.get("events") or "steps"
+        named = facts.given.get("densifier")
+        name = facts.backbone.default_densifier if named is None else named.name
+        resets = facts.densifier(name).window(facts.schedule(unit)).reset_every or 0
+        values = {
+            **VALUES,
+            "views_per_step": facts.views_per_step.setting,
+            "densifier": name,
+            "events": unit,
+            "max_gaussians": 0,
+            "reset_every": resets,
+            "rasterizer.near": NEAR * facts.scale,
+        }
+        return [Decision(setting, value, BECAUSE, "3DGS") for setting, value in values.items()]
