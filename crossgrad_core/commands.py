@@ -320,13 +320,14 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
     Raises:
         UserError: As `assemble`, or a setting would change nothing.
     """
+    from crossgrad_core.recipe import table
     from crossgrad_core.run import assemble as assembling
     from crossgrad_core.run import unused_settings as nothing
     from crossgrad_core.training import step
 
     setup = assembling.assemble(config, scene, reader)
     nothing.refuse_labels_for_nothing(setup)
-    nothing.refuse_settings_for_nothing(config, setup)
+    nothing.refuse_settings_for_nothing(table.open_again(config), setup)
     step.check_largest_draw(setup)
     return setup
 

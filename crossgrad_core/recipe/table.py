@@ -10,9 +10,9 @@ from crossgrad_core.contract.component import answered
 from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.recipe import Facts, Recipe
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.validation import as_user_error
-from crossgrad_core.wording import listed
+from crossgrad_core.wording import listed, plural
 
 #: Settings that training and assembly read and that have no default: a recipe decides each.
 DECIDED: Final = (
@@ -34,8 +34,11 @@ def is_given(config: RunConfig, setting: str) -> bool:
     value = getattr(config, name, None)
     if option:
         return isinstance(value, ComponentChoice) and option in value.options
-    chosen = value.name if isinstance(value, ComponentChoice) else value
-    return name in config.model_fields_set and chosen is not None and chosen != AUTO
+    if name not in config.model_fields_set or value is None:
+        return False
+    if isinstance(value, ComponentChoice):
+        return value.name != AUTO or AUTO in entries(plural(name))
+    return bool(value != AUTO)
 
 
 def given_settings(config: RunConfig) -> dict[str, Any]:

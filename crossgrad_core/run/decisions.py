@@ -12,7 +12,14 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.recipe import Facts
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Counting
-from crossgrad_core.recipe.table import applied, decide, given_settings, is_complete, rows_of
+from crossgrad_core.recipe.table import (
+    applied,
+    decide,
+    given_settings,
+    is_complete,
+    open_again,
+    rows_of,
+)
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.usual_device import with_device
@@ -74,6 +81,9 @@ def with_decisions(
     Raises:
         UserError: See `facts_of`; or the recipe leaves a setting open.
     """
+    if config.seconds is not None:
+        # The seconds are planned anew, and with them all that follows the length.
+        config = open_again(config)
     if is_complete(config):
         return config, rows_of(config), repeats
     facts = facts_of(config, scene)

@@ -10,27 +10,32 @@ import torch
 from crossgrad_core.contract.adam_state import BETAS, EPS, AdamRule, AdamState
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.recipe.lines import short_lines
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import rates
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rates import (
-    factor_of,
     means_rate_at,
-    note_on_plan,
     rates_at,
     rule_at,
 )
 from crossgrad_core.training.rngs import STREAMS
 from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.recipes import auto
 
 
 def assembled(**settings):
     return assemble(parsed({"steps": 40, **settings}), sample_scene(), "none")
+
+
+def told_of(setup, setting):
+    """The line of a decision, if the terminal shows it."""
+    return [line for line in short_lines(setup.decisions) if line.startswith(f"{setting} ")]
 
 
 def trained(number, *plugins, **settings):
@@ -77,7 +82,7 @@ EIGHTH = 8.0**0.45
         ({"steps": 3_750, "views": 2}, EIGHTH),
         ({"max_views": 7_500, "views": 2, "steps": None}, EIGHTH),
         ({"steps": 3_750, "rate_factor": 0.5}, 0.5),
-        ({"steps": 3_750, "preset": "inria"}, 1.0),
+        ({"steps": 3_750, "recipe": {"name": "published"}}, 1.0),
         ({"steps": 3_750, "schedule": "absolute"}, 1.0),
         ({"steps": 9, "schedule": "absolute", "reference": 3_750, "views": 1}, EIGHTH),
         ({"steps": 9, "schedule": "absolute", "reference": 7_500, "views": 2}, EIGHTH),
@@ -91,9 +96,9 @@ def test_a_shorter_run_has_larger_rates(settings, factor):
     for name, own in (("opacities", 1.0), ("scales", sizes), ("f_rest", 1.0)):
         rate = own * factor * published[name].at(0)
         assert rates_at(setup, 1)[name] == pytest.approx(rate, rel=1e-9)
-    told = [note for note in setup.notes if "learning rates" in note]
+    told = told_of(setup, "rate_factor")
     assert len(told) == (factor != 1.0 and "rate_factor" not in settings)
-    assert all(note.endswith(f" times {factor:.3g}") for note in told)
+    assert all(f"rate_factor {factor:.3g}: " in line for line in told)
 
 
 #: Views of a run that shows each of the nine training photos forty times.
@@ -107,8 +112,8 @@ PASSES = 360
         ({"steps": 1_000, "views": 2}, 1_000),
         ({"steps": 9_487, "views": 1}, 2_371),
         ({"steps": 30_000, "views": 1}, 0),
-        ({"steps": 2_000, "preset": "inria"}, 0),
-        ({"steps": 2_000, "preset": "inria", "events": "views"}, 0),
+        ({"steps": 2_000, "recipe": {"name": "published"}}, 0),
+        ({"steps": 2_000, "recipe": {"name": "published"}, "events": "views"}, 0),
         ({"steps": 2_000, "events": "steps"}, 0),
         ({"steps": 2_000, "schedule": "absolute"}, 0),
         ({"steps": 900, "schedule": "absolute", "reference": 2_000, "views": 1}, 450),
@@ -116,12 +121,12 @@ PASSES = 360
         ({"steps": 2_000, "sh_from": 1, "views": 1}, 1_000),
         ({"steps": 2_000, "sh_start": 0.0}, 0),
         ({"steps": 2_000, "views": 1, "sh_start": 0.3}, 600),
-        ({"steps": 2_000, "preset": "inria", "sh_start": 0.3}, 600),
+        ({"steps": 2_000, "recipe": {"name": "published"}, "sh_start": 0.3}, 600),
         ({"steps": 2_000, "beta2": 0.999}, 0),
     ],
 )
 def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wait, monkeypatch):
-    monkeypatch.setattr(rates, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "HURRY", 10_000)
     setup = assembled(**settings)
     schedule = setup.schedule
     assert schedule.sh_wait == pytest.approx(wait, abs=1)
@@ -130,9 +135,8 @@ def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wa
     if wait:
         before = schedule.step_of(schedule.sh_wait) - 1
         assert schedule.sh_degree(before) == settings.get("sh_from", 0)
-    told = [note for note in setup.notes if "harmonics above" in note]
-    assert len(told) == (wait > 0 and "sh_start" not in settings)
-    assert all(f" after {schedule.sh_wait:,} views " in note for note in told)
+    rows = [row for row in setup.decisions if row.setting == "sh_start" and row.override]
+    assert len(rows) == (wait > 0 and "sh_start" not in settings)
 
 
 def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
@@ -141,18 +145,20 @@ def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
     # As it was planned, whatever the clock makes of it.
     planned = parsed({"steps": PASSES - 2, "views": 1})
     setup = assemble(planned, sample_scene(), "none")
-    longer = schedule_of(setup.config, setup.densifier, 2 * PASSES, setup.schedule.counting)
+    longer = setup.at_length(2 * PASSES, None)
+    longer = schedule_of(longer.in_force, setup.densifier, 2 * PASSES, setup.schedule.counting)
     assert longer.sh_wait == PASSES
 
 
 @pytest.mark.parametrize("settings", [{"backbone": {"name": "scaffold"}}, {"sh_from": 3}])
 def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
-    monkeypatch.setattr(rates, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "HURRY", 10_000)
     setup = assembled(sh_start=0.5, steps=2_000, **settings)
     with pytest.raises(UserError, match="sh_start"):
         refuse_settings_for_nothing(setup.config, setup)
-    assert not any("harmonics above" in n for n in assembled(steps=2_000, **settings).notes)
-    assert any("harmonics above" in note for note in assembled(steps=2_000).notes)
+    late = [row.setting for row in assembled(steps=2_000).decisions if row.override]
+    none = [row.setting for row in assembled(steps=2_000, **settings).decisions if row.override]
+    assert "sh_start" in late and "sh_start" not in none
 
 
 def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
@@ -174,7 +180,7 @@ def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
         (PASSES, {"beta2": 0.9}, 0.9),
         (PASSES - 2, {"events": "steps"}, 0.98),
         (PASSES, {"events": "steps"}, 0.999),
-        (PASSES - 2, {"preset": "inria"}, 0.999),
+        (PASSES - 2, {"recipe": {"name": "published"}}, 0.999),
         (PASSES - 2, {"schedule": "absolute"}, 0.999),
         (PASSES - 2, {"rate_factor": 1.0}, 0.98),
     ],
@@ -182,14 +188,14 @@ def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
 def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, beta2, views):
     setup = assembled(max_views=length, steps=None, views=views, **settings)
     assert len(setup.train_views) == 9
-    first = 0.9 if {"preset", "schedule"} & settings.keys() else 0.7
+    first = 0.9 if {"recipe", "schedule"} & settings.keys() else 0.7
     assert all(rule_at(setup, step) == AdamRule((first, beta2)) for step in (1, length // views))
-    told = [note for note in setup.notes if "second moment" in note]
+    told = told_of(setup, "beta2")
     assert len(told) == (beta2 == 0.98)
-    assert all("fewer than 40 views " in note and " over 50 steps " in note for note in told)
+    assert all("fewer than 40 views of each photo" in line for line in told)
     own = beta2 == 0.98 and "rate_factor" not in settings
-    assert all(("scales at 2 times the rate of the rest" in note) == own for note in told)
-    plain = factor_of(setup.config, setup.schedule, 9) * 5e-3
+    assert len(told_of(setup, "hurried_rates")) == own
+    plain = setup.numbers.rate_factor * 5e-3
     assert rates_at(setup, 1)["scales"] == pytest.approx((2.0 if own else 1.0) * plain, rel=1e-9)
 
 
@@ -204,7 +210,7 @@ def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, be
         ({"steps": None, "max_views": 9_487, "views": 1}, 0.8),
         ({"steps": 30_000}, 0.9),
         ({"steps": 90_000}, 0.9),
-        ({"steps": 5, "preset": "inria"}, 0.9),
+        ({"steps": 5, "recipe": {"name": "published"}}, 0.9),
         ({"steps": 5, "schedule": "absolute"}, 0.9),
         ({"steps": 5, "schedule": "absolute", "reference": 2_000}, 0.7),
         ({"steps": 5, "batch_rule": "sqrt", "views": 2}, 0.8),
@@ -213,26 +219,17 @@ def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, be
         ({"steps": 5, "backbone": {"name": "mip"}}, 0.7),
         ({"steps": 5, "beta1": 0.5}, 0.5),
         ({"steps": 30_000, "beta1": 0.0}, 0.0),
-        ({"steps": 5, "beta1": 0.5, "preset": "inria"}, 0.5),
+        ({"steps": 5, "beta1": 0.5, "recipe": {"name": "published"}}, 0.5),
     ],
 )
 def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, beta1):
     setup = assembled(**{"views": 1, **settings})
     for step in (1, 5):
         assert rule_at(setup, step).betas[0] == pytest.approx(beta1, abs=1e-4)
-    told = [note for note in setup.notes if "first moment" in note]
+    told = told_of(setup, "beta1")
     ours = "beta1" not in settings and "batch_rule" not in settings and beta1 < 0.9
     assert len(told) == ours
-    assert all(f"beta1 {beta1:.3g} (--set beta1=0.9: published)" in note for note in told)
-
-
-def test_the_first_moment_of_a_budget_is_told_as_a_rule():
-    told = [n for n in assembled(steps=None, seconds=60.0).notes if "first moment" in n]
-    assert told == [
-        "Adam's first moment: beta1 0.7 where the steps draw up to 3,000 views, 0.9 as published "
-        "from 30,000 on"
-    ]
-    assert not any("first" in n for n in assembled(steps=None, seconds=60.0, beta1=0.9).notes)
+    assert all(f"beta1 {beta1:.3g}: " in each and "=0.9)" in each for each in told)
 
 
 @pytest.mark.parametrize("steps", [60, 5_000])
@@ -240,7 +237,7 @@ def test_the_first_moment_of_a_budget_is_told_as_a_rule():
 def test_under_the_batch_rule_the_second_moment_averages_over_as_many_steps(
     steps, views, monkeypatch
 ):
-    monkeypatch.setattr(rates, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "HURRY", 10_000)
     setup = assembled(steps=steps, views=views, batch_rule="sqrt")
     first, second = rule_at(setup, 1).betas
     if steps * views < 30_000:
@@ -256,38 +253,31 @@ def test_the_rule_that_a_run_was_planned_with_stays_when_the_clock_changes_it(
     planned, beta2, steps
 ):
     setup = assembled(steps=planned)
-    setup = replace(setup, schedule=replace(setup.schedule, total=steps))
+    setup = replace(setup, schedule=replace(setup.schedule, total=steps)).at_length(steps, None)
     assert rule_at(setup, 1) == AdamRule((0.7, beta2))
-    assert note_on_plan(setup) == tuple(n for n in setup.notes if "second moment" in n)
+    power, most = (0.65, 6.3) if beta2 == 0.98 else (0.45, 4.5)
+    assert setup.numbers.rate_factor == min(most, (30_000 / steps) ** power)
 
 
 def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(monkeypatch):
-    monkeypatch.setattr(rates, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "HURRY", 10_000)
     for steps, memory in ((2_000, 50), (5_000, 100), (29_999, 599.98), (30_000, 1_000)):
         setup = assembled(steps=steps)
         assert rule_at(setup, 1).betas[1] == pytest.approx(1 - 1 / memory, abs=1e-12)
-        assert factor_of(setup.config, setup.schedule, 9) == pytest.approx(
-            min(6.3, (30_000 / steps) ** 0.65)
-        )
+        assert setup.numbers.rate_factor == pytest.approx(min(6.3, (30_000 / steps) ** 0.65))
 
 
 def test_where_the_clock_decides_the_rates_follow_its_plan():
     setup = assembled(steps=None, seconds=60.0)
-    note, hurried = (note for note in setup.notes if "30,000 / steps" in note)
-    assert note.endswith(" times (30,000 / steps)^0.45, at most 4.5")
-    assert hurried == (
-        "if these are fewer than 40 views of each training photo: (30,000 / steps)^0.65, at most "
-        "6.3, scales at 2 times the rate of the rest, Adam's second moment averages over a 50th of "
-        "the steps, 50 at least"
-    )
-    own = assembled(steps=None, seconds=60.0, rate_factor=2.0)
-    (note,) = (note for note in own.notes if "second moment" in note)
-    assert note.startswith("if these are") and "30,000" not in note and "scales" not in note
-    own = assembled(steps=None, seconds=60.0, beta2=0.99)
-    assert not any("second moment" in note for note in own.notes)
-    shorter = replace(setup, schedule=replace(setup.schedule, total=3_750))
-    published, planned = (rates_at(each, 1)["opacities"] for each in (setup, shorter))
-    assert planned == pytest.approx(EIGHTH * published)
+    for name in ("rate_factor", "beta1", "beta2"):
+        (row,) = (row for row in setup.decisions if row.setting == name)
+        assert row.because == "decided when the length is planned" and not row.override
+    planned = redecided(setup, 3_750)
+    published, now = (rates_at(each, 1)["opacities"] for each in (setup, planned))
+    assert now == pytest.approx(EIGHTH * published)
+    assert told_of(planned, "rate_factor")
+    own = redecided(assembled(steps=None, seconds=60.0, rate_factor=2.0), 3_750)
+    assert own.numbers.rate_factor == 2.0 and not told_of(own, "rate_factor")
 
 
 def test_a_first_step_goes_as_much_farther():

@@ -238,7 +238,7 @@ def test_any_number_of_views_on_photos_of_different_sizes(tmp_path, views):
 
 
 def test_published_order_differs_and_runs(scene, tmp_path):
-    assert run(scene, tmp_path / "a", preset="inria", steps=60, **GROWTH) == 0
+    assert run(scene, tmp_path / "a", recipe={"name": "published"}, steps=60, **GROWTH) == 0
     run(scene, tmp_path / "b", steps=60, **GROWTH)
     assert not same(parameters(tmp_path / "a"), parameters(tmp_path / "b"))
 

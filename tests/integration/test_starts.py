@@ -47,7 +47,7 @@ def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
     assert one == other
 
 
-@pytest.mark.parametrize("options", [("--init", "random"), ("--preset", "inria")], ids=str)
+@pytest.mark.parametrize("options", [("--init", "random"), ("--recipe", "published")], ids=str)
 def test_these_runs_start_bare(scene, tmp_path, options):
     """Their configuration says so, and repeats the run."""
     assert run(scene, tmp_path / "run", *options) == 0

@@ -40,6 +40,8 @@ SCALE_RATIO: Final = 0.5
 #: Share of a hurried short run before SH bands above the first are drawn: until then they cost time
 #: and gain little.
 SH_START: Final = 0.5
+#: The highest SH degree.
+MOST_DEGREES: Final = 3
 #: Share of the run over which constant learning rates fade.
 LR_TAIL: Final = 0.25
 #: Share of the Gaussians that a view is drawn without if at most so many photos show a point.
@@ -47,6 +49,8 @@ DROPOUT, FEW_PHOTOS = 0.3, 5
 #: Edits that growth along the curve has in runs of so many views or more. In shorter runs, new
 #: primitives have no time to settle and can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
+#: The reason while only the seconds of a run are known.
+UNKNOWN: Final = "decided when the length is planned"
 #: The page that shows how these values were measured.
 SCHEDULES: Final = "docs/schedules.md"
 
@@ -173,9 +177,7 @@ def components(choice: Choice) -> list[Decision]:
         Decision(
             "start",
             start,
-            "adds points where the scene has few"
-            if facts.own_points
-            else "the points that --init names",
+            "adds points where the scene has few" if facts.own_points else "the points of --init",
             "docs/starts.md",
         ),
         Decision("exposure", EXPOSURE, "as the photos need it", "docs/exposure.md"),
@@ -255,6 +257,9 @@ def _budget(choice: Choice) -> Decision:
 
 def rates(choice: Choice) -> list[Decision]:
     """Return the rows of learning rates and of Adam."""
+    if choice.facts.steps is None:
+        values = {"rate_factor": 1.0, "hurried_rates": False, "beta1": BETA1, "beta2": BETA2}
+        return [Decision(name, value, UNKNOWN, SCHEDULES) for name, value in values.items()]
     factor, hurried = _rate_factor(choice), choice.hurried
     own = hurried and "rate_factor" not in choice.given
     beta1, beta2 = _beta1(choice), _beta2(choice)
@@ -295,7 +300,7 @@ def _rate_factor(choice: Choice) -> float:
     facts = choice.facts
     schedule = facts.schedule(facts.unit)
     steps = facts.total if facts.mode == "scaled" else schedule.step_of(schedule.length)
-    if facts.steps is None or schedule.pace.views(steps) >= REFERENCE:
+    if schedule.pace.views(steps) >= REFERENCE:
         return 1.0
     power, most = (HURRIED_SHORTNESS, HURRIED_MOST) if choice.hurried else (SHORTNESS, MOST)
     return min(max(1.0, float((REFERENCE / steps) ** power)), most)
@@ -326,6 +331,8 @@ def steps(choice: Choice) -> list[Decision]:
     along = short and facts.backbone.gaussian_tensors is not None
     bounded = short and facts.backbone.learns_scales
     share = _sh_start(choice)
+    banded = any(block.rests for block in facts.backbone.trained_blocks())
+    late = share > 0.0 and banded and facts.given.get("sh_from") != MOST_DEGREES
     return [
         Decision("step_order", "optimize-first", "density control sees the new values"),
         Decision(
@@ -345,9 +352,9 @@ def steps(choice: Choice) -> list[Decision]:
         Decision(
             "sh_start",
             share,
-            "SH bands gain little before" if share else "degree by degree from the start",
+            "SH bands gain little before" if late else "degree by degree from the start",
             SCHEDULES,
-            "--set sh_start=0" if share else "",
+            "--set sh_start=0" if late else "",
         ),
     ]
 

@@ -15,7 +15,9 @@ from crossgrad_core.contract.schedule import (
     Schedule,
 )
 from crossgrad_core.registry.entries import build
-from crossgrad_core.training.schedules import schedule_of, unit_of
+from crossgrad_core.run.decisions import with_decisions
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.training.schedules import schedule_of
 
 
 def test_published_schedule_at_reference_length():
@@ -317,6 +319,7 @@ def test_any_lengths_in_turn_keep_what_was_and_what_is_ahead(text, seed):
 def test_times_that_the_user_set_stay_whatever_the_length():
     counting = in_views("2")
     config = RunConfig(steps=600, densify_from=30, densify_every=40, densify_until=400)
+    config, *_ = with_decisions(config, sample_scene())
     densifier = build("densifiers", "adc", {})
     schedule = schedule_of(config, densifier, 600, counting)
     assert view_counts(schedule) == list(range(70, 400, 40))
@@ -330,10 +333,11 @@ def test_times_that_the_user_set_stay_whatever_the_length():
         ({}, "views"),
         ({"schedule": "absolute"}, "steps"),
         ({"schedule": "absolute", "reference": 600}, "views"),
-        ({"preset": "inria"}, "steps"),
+        ({"recipe": {"name": "published"}}, "steps"),
         ({"events": "steps"}, "steps"),
-        ({"preset": "inria", "events": "views"}, "views"),
+        ({"recipe": {"name": "published"}, "events": "views"}, "views"),
     ],
 )
 def test_published_rules_count_steps_and_all_others_views(settings, unit):
-    assert unit_of(RunConfig(**settings)) == unit
+    config, *_ = with_decisions(RunConfig(**settings), sample_scene())
+    assert config.events == unit

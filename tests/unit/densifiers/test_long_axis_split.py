@@ -45,7 +45,7 @@ def parameters(seed=0, n=3):
     return {name: torch.tensor(t).float().requires_grad_() for name, t in tensors.items()}
 
 
-def context(params, *, led=True, room=100):
+def context(params, *, room=100):
     """Every Gaussian asks to grow."""
     n = len(params["means"])
     gaussians = Gaussians(torch.ones(n, 3), torch.zeros(n, 4), torch.ones(n, 3), torch.ones(n))
@@ -67,7 +67,6 @@ def context(params, *, led=True, room=100):
         views=(view_record(view, gaussians, screen),),
         means_lr=1e-4,
         room=room,
-        led=led,
     )
 
 
@@ -126,12 +125,12 @@ def test_extreme_opacities_stay_finite(logit):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
-    ("division", "led", "sides"),
-    [(None, True, True), (None, False, False), ("axis", False, True), ("drawn", True, False)],
+    ("options", "sides"),
+    [({}, False), ({"division": "axis"}, True), ({"division": "drawn"}, False)],
 )
-def test_published_children_unless_growth_is_led_or_the_run_says_so(method, division, led, sides):
+def test_published_children_unless_the_run_says_so(method, options, sides):
     params = parameters()
-    edit, new = grown(method(division=division), params, led=led)
+    edit, new = grown(method(**options), params)
     kept = len(new["means"]) - int(edit.fresh.sum())
     drawn, _ = grown(method(division="drawn"), params)
     assert kept == (0 if sides else int((~drawn.fresh).sum()))

@@ -5,12 +5,11 @@ import pytest
 from crossgrad_core.commands import configured
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.registry.entries import build, load
-from crossgrad_core.run import usual_densifier as chosen
+from crossgrad_core.registry.entries import load
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
-from crossgrad_core.run.usual_views import views_per_step_spec_of
+from crossgrad_core.run.decisions import table_of
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_plugins.recipes import auto as chosen
 
 USUAL = {
     "a short run": ({}, "absgrad"),
@@ -18,7 +17,7 @@ USUAL = {
     "seconds": ({"steps": None, "seconds": 60}, "absgrad"),
     "as long as published": ({"steps": 30_000}, "adc"),
     "no length": ({"steps": None}, "adc"),
-    "the preset": ({"preset": "inria"}, "adc"),
+    "the recipe": ({"recipe": {"name": "published"}}, "adc"),
     "absolute": ({"schedule": "absolute"}, "adc"),
     "of another length": ({"schedule": "absolute", "reference": 2000}, "absgrad"),
     "counted in steps": ({"events": "steps"}, "adc"),
@@ -58,7 +57,7 @@ def test_where_pixels_pull_is_asked_in_short_runs_of_plain_gaussians(case):
     given = {"steps": 2000, **settings}
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
     assert setup.selection.names["densifier"] == expected
-    told = [note for note in setup.notes if note.startswith("densifier absgrad, ")]
+    told = [row for row in setup.decisions if row.setting == "densifier" and row.override]
     assert len(told) == (expected == "absgrad")
 
 
@@ -73,9 +72,7 @@ def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
 
 
 def usual_of(**settings):
-    config = configured(settings)
-    backbone = build("backbones", config.backbone.name, {})
-    return chosen.usual_densifier(config, views_per_step_spec_of(config), backbone, photos=2)
+    return table_of(configured(settings), sample_scene())["densifier"].value
 
 
 @pytest.mark.parametrize("name", ["auto", "numba"])
@@ -94,8 +91,3 @@ def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, 
 
 def test_a_gpu_has_the_published_one_also_where_there_is_none():
     assert usual_of(steps=2000, device="cuda") == "adc"
-
-
-def test_what_earlier_versions_wrote_has_the_published_one(tmp_path):
-    written = {"steps": 2000, "revisions": []}
-    assert usual_of(**migrated(written, tmp_path / "config.yaml")) == "adc"

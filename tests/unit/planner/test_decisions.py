@@ -498,7 +498,7 @@ def test_seconds_are_the_most_that_may_be_spent(seconds):
     assert (decided.max_views, decided.seconds, decided.steps) == (2_000, seconds, None)
 
 
-@pytest.mark.parametrize("mine", [{"preset": "inria"}, {"schedule": "absolute"}])
+@pytest.mark.parametrize("mine", [{"recipe": {"name": "published"}}, {"schedule": "absolute"}])
 @pytest.mark.parametrize(("seconds", "choice"), [(None, "30,000 steps"), (60.0, "60 s")])
 def test_published_schedules_keep_their_length(mine, seconds, choice):
     found = length_of(20, **mine, **({} if seconds is None else {"seconds": seconds}))
@@ -553,9 +553,9 @@ def test_dropout_where_few_photos_show_a_point(photos, choice):
     found = plan_for(orbit(photos)).of_part("dropout")
     assert (found.choice, found.basis, found.settings) == (choice, "decided", {})
     assert found.figures == {"photos_of_a_point": photos}
-    assert plan_for(orbit(photos), preset="fast").of_part("dropout").choice == choice
+    assert plan_for(orbit(photos), recipe={"name": "auto"}).of_part("dropout").choice == choice
     assert plan_for(orbit(photos), dropout=0.2).of_part("dropout").basis == "given"
-    assert plan_for(orbit(photos), preset="inria").of_part("dropout").choice == "none"
+    assert plan_for(orbit(photos), recipe={"name": "published"}).of_part("dropout").choice == "none"
 
 
 @pytest.mark.parametrize("backbone", ["scaffold", "mip"])

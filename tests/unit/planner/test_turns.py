@@ -152,7 +152,8 @@ def test_what_the_user_set_wins(given):
 
 
 @pytest.mark.parametrize(
-    "given", [{"operator": {"name": "pcgrad"}}, {"views_per_step": 2}, {"preset": "inria"}]
+    "given",
+    [{"operator": {"name": "pcgrad"}}, {"views_per_step": 2}, {"recipe": {"name": "published"}}],
 )
 def test_what_was_not_measured_is_not_chosen(given):
     found = decision(scene_of(AROUND), **given)

@@ -135,8 +135,8 @@ def options_of(**settings):
     return selection.rasterizer
 
 
-def test_the_preset_asks_for_it_in_the_units_of_the_scene():
-    published = options_of(preset="inria")
+def test_the_published_recipe_requires_for_it_in_the_units_of_the_scene():
+    published = options_of(recipe={"name": "published"})
     assert published.footprint == "3-sigma"
     assert published.near == pytest.approx(0.2 * 0.01)
     assert (published.max_alpha, published.dilation) == (0.99, 0.3)
@@ -146,8 +146,8 @@ def test_the_preset_asks_for_it_in_the_units_of_the_scene():
 
 def test_what_the_user_sets_wins():
     chosen = {"name": "torch", "footprint": "alpha", "near": 0.5}
-    assert options_of(preset="inria", rasterizer=chosen).footprint == "alpha"
-    assert options_of(preset="inria", rasterizer=chosen).near == 0.5
+    assert options_of(recipe={"name": "published"}, rasterizer=chosen).footprint == "alpha"
+    assert options_of(recipe={"name": "published"}, rasterizer=chosen).near == 0.5
 
 
 def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
@@ -157,6 +157,6 @@ def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
 
     monkeypatch.setattr(selecting, "load", lambda slot, name: Common)
     with pytest.raises(UserError) as caught:
-        options_of(preset="inria")
+        options_of(recipe={"name": "published"})
     assert "footprint of the original code" in str(caught.value)
     assert "leave --rasterizer out" in str(caught.value)

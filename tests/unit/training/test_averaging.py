@@ -277,9 +277,9 @@ def test_noise_after_every_step_does_not_keep_the_average_from_growing():
 
 
 def test_the_published_rule_has_neither():
-    config = resolved(setup_of(preset="inria")).model_dump()
+    config = resolved(setup_of(recipe={"name": "published"})).model_dump()
     assert (config["lr_tail"], config["average"]) == (0.0, 0.0)
-    asked = resolved(setup_of(preset="inria", lr_tail=0.2, average=0.1))
+    asked = resolved(setup_of(recipe={"name": "published"}, lr_tail=0.2, average=0.1))
     assert (asked.lr_tail, asked.average) == (0.2, 0.1)
 
 
@@ -296,12 +296,9 @@ def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
 
 
 def test_a_run_says_what_it_does_at_its_end():
-    none = setup_of(lr_tail=0.0)
-    assert not [note for note in none.notes if "learning-rate tail" in note]
-    assert resolved(setup_of()).lr_tail == 0.25
-    notes = [n for n in setup_of(lr_tail=0.25, average=0.1).notes if "learning-rate tail" in n]
-    assert "fade to 0.01 of their value over the last 25% of the steps" in notes[0]
-    assert "last 10% of the steps are averaged" in notes[1]
+    shown = {row.setting: row.value for row in setup_of().decisions if row.override}
+    assert resolved(setup_of()).lr_tail == shown["lr_tail"] == 0.25
+    assert "lr_tail" not in {row.setting for row in setup_of(lr_tail=0.0).decisions}
 
 
 @pytest.mark.parametrize(

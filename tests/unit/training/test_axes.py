@@ -18,7 +18,6 @@ from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.contents import Checkpoint
 from crossgrad_core.run.checkpoint_io import check_settings, settings_of
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.axes import LIMIT, _usual, step_along_axes
@@ -203,8 +202,8 @@ def setup_of(backbone="vanilla", **settings):
         ({"steps": 30_000}, False),
         ({"steps": 30_000, "position_lr": "per-axis"}, True),
         ({"position_lr": "extent"}, False),
-        ({"preset": "inria"}, False),
-        ({"preset": "inria", "position_lr": "per-axis"}, True),
+        ({"recipe": {"name": "published"}}, False),
+        ({"recipe": {"name": "published"}, "position_lr": "per-axis"}, True),
         ({"schedule": "absolute"}, False),
         ({"schedule": "absolute", "reference": 10}, True),
     ],
@@ -247,9 +246,7 @@ def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
         refuse_settings_for_nothing(config, setup)
 
 
-def test_runs_of_before_go_on_as_they_began(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["position_lr"] == "extent"
-    assert "position_lr" not in migrated({}, tmp_path)
+def test_runs_of_before_go_on_as_they_began():
     # A setting that a checkpoint does not know yet is none that was changed.
     config = setup_of().config
     stored = settings_of(config)

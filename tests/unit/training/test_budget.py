@@ -26,8 +26,9 @@ from crossgrad_core.training.budget import (
 )
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.expected_cost import PrimitiveCounts, cost_of_run, growth_ahead
-from crossgrad_core.training.growth_budget import curve, usual_budget
+from crossgrad_core.training.growth_budget import curve
 from crossgrad_core.training.schedules import growth_note
+from crossgrad_plugins.recipes.budget import budget as usual_budget
 
 
 class Hook:

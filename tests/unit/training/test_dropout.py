@@ -11,15 +11,15 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import ViewSample
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.dropout import DROPOUT, FEW_PHOTOS, dropped, photos_per_point
+from crossgrad_core.training.dropout import dropped, photos_per_point
 from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
 from crossgrad_core.training.views import render_views
+from crossgrad_plugins.recipes.auto import DROPOUT, FEW_PHOTOS
 
 
 def setup_of(scene=None, **given):
@@ -97,16 +97,16 @@ def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
     [
         (FEW_PHOTOS, {}, DROPOUT),
         (FEW_PHOTOS + 1, {}, 0.0),
-        (FEW_PHOTOS, {"preset": "inria"}, 0.0),
+        (FEW_PHOTOS, {"recipe": {"name": "published"}}, 0.0),
         (FEW_PHOTOS, {"dropout": 0.0}, 0.0),
         (FEW_PHOTOS + 1, {"dropout": 0.2}, 0.2),
-        (1, {"preset": "inria", "dropout": 0.2}, 0.2),
+        (1, {"recipe": {"name": "published"}, "dropout": 0.2}, 0.2),
     ],
 )
 def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share):
     setup = setup_of(with_photos(photos), **given)
     assert resolved(setup).dropout == share
-    noted = [note for note in setup.notes if note.startswith("dropout")]
+    noted = [row for row in setup.decisions if row.setting == "dropout" and row.override]
     assert len(noted) == (share > 0.0 and "dropout" not in given)
 
 
@@ -136,8 +136,3 @@ def test_photos_of_a_point_are_those_in_whose_image_it_lies():
     # Three points lie in three photos, one in one, and one in none, which does not count.
     assert photos_per_point(scene) == 3.0
     assert photos_per_point(posed_scene(ahead)) == 0.0
-
-
-def test_runs_of_before_go_on_without(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["dropout"] == 0.0
-    assert "dropout" not in migrated({}, tmp_path)

@@ -10,7 +10,7 @@ from crossgrad_core.training.loop import evaluates_after
 
 @pytest.mark.parametrize("views", [1, 2])
 def test_usual_evaluations_are_far_from_resets_of_the_opacities(views):
-    config = RunConfig(steps=20_000, views=views, preset="inria")
+    config = RunConfig(steps=20_000, views=views, recipe={"name": "published"})
     setup = assemble(config, sample_scene(), "none")
     resets = [step for step in range(1, 20_000) if setup.schedule.resets(step)]
     found = [step for step in range(1, 20_000) if evaluates_after(setup, step)]
@@ -31,7 +31,7 @@ def test_else_they_are_at_multiples(steps, given):
         ({"steps": 20_000}, None),
         ({"steps": 20_000, "growth": "free"}, 2000),
         ({"steps": 20_000, "max_gaussians": 10**6}, 2000),
-        ({"steps": 20_000, "preset": "inria"}, 2000),
+        ({"steps": 20_000, "recipe": {"name": "published"}}, 2000),
         ({"steps": 20_000, "reset_every": 500}, 500),
         ({"steps": 30_000}, 3000),
         ({"steps": 9999, "growth": "free"}, None),

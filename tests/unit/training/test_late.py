@@ -307,7 +307,7 @@ def everything(state):
         ({"operator": "pcgrad", "views": 3}, ()),
         ({"operator": "pcgrad", "views": 2, "backbone": "distance"}, ()),
         ({"operator": "graddrop", "views": 2}, ()),
-        ({"preset": "inria"}, ()),
+        ({"recipe": {"name": "published"}}, ()),
         ({"average": 0.5}, ()),
         ({}, (Decay,)),
         ({"views": 2}, (PerView,)),

@@ -67,7 +67,7 @@ def changes(setup):
         {"views_per_step": 2, "operator": ComponentChoice(name="pcgrad")},
         {"views_per_step": 2, "backward": "joint"},
         {"rasterizer": ComponentChoice(name="torch")},
-        {"preset": "inria"},
+        {"recipe": {"name": "published"}},
         {"backbone": "mip"},
     ],
     ids=str,
@@ -78,7 +78,7 @@ def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(setting
         setup.manager.register(plugin())
     found, state = changes(setup)
     # In the published order the last step has none of the optimizer.
-    last = STEPS - (settings.get("preset") == "inria")
+    last = STEPS - ("recipe" in settings)
     due = [step for step in range(1, last + 1) if not setup.schedule.rests(step)]
     assert found.pop("f_rest") == due
     assert state.adam.steps["f_rest"] == len(due)

@@ -9,19 +9,17 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import scale_clamp
 from crossgrad_core.training.scale_clamp import (
-    BOUND,
     EVERY,
     LEAST,
     clamp_scales,
-    max_scale_ratio_of,
 )
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
+from crossgrad_plugins.recipes.auto import SCALE_RATIO as BOUND
 
 ANCHORS = ("octree", "scaffold")
 AXES = sorted(
@@ -161,7 +159,7 @@ def test_a_step_bounds_sizes(backbone):
         ({"steps": 30_000}, 0.0),
         ({"steps": 30_000, "max_scale_ratio": 0.7}, 0.7),
         ({"max_scale_ratio": 0.0}, 0.0),
-        ({"preset": "inria"}, 0.0),
+        ({"recipe": {"name": "published"}}, 0.0),
         ({"schedule": "absolute"}, 0.0),
         ({"options": {"lr_scales": 0.0}}, 0.0),
         *(({"backbone": name}, 0.0) for name in ANCHORS),
@@ -170,10 +168,9 @@ def test_a_step_bounds_sizes(backbone):
 )
 def test_which_runs_have_a_bound(settings, bound):
     setup = setup_of(**settings)
-    assert max_scale_ratio_of(setup) == bound
-    told = [note for note in setup.notes if "max_scale_ratio=0" in note]
-    usual = bound == BOUND and "seconds" not in settings
-    assert len(told) == usual
+    assert setup.numbers.max_scale_ratio == bound
+    told = [row for row in setup.decisions if row.override == "--set max_scale_ratio=0"]
+    assert len(told) == (bound == BOUND)
 
 
 @pytest.mark.parametrize(
@@ -184,8 +181,3 @@ def test_a_bound_is_refused_where_no_sizes_learn(settings):
     config = setup.config.model_copy(update={"max_scale_ratio": 0.5})
     with pytest.raises(UserError, match="no Gaussians with axes that learn"):
         refuse_settings_for_nothing(config, setup)
-
-
-def test_runs_of_before_go_on_without_a_bound(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["max_scale_ratio"] == 0.0
-    assert "max_scale_ratio" not in migrated({}, tmp_path)

@@ -129,7 +129,7 @@ IDLE = [
     ({"min_refinements": 6, "densify_from": 0, "densify_every": 9}, "min_refinements"),
     ({"min_refinements": 6, "schedule": "absolute", "events": "views"}, "min_refinements"),
     ({"lr_tail_factor": 0.5, "lr_tail": 0.0}, "lr_tail_factor"),
-    ({"lr_tail_factor": 0.5, "preset": "inria"}, "lr_tail_factor"),
+    ({"lr_tail_factor": 0.5, "recipe": {"name": "published"}}, "lr_tail_factor"),
     (
         {
             "backbone": {

@@ -49,7 +49,7 @@ def _seeds() -> Sequence[Case]:
         {_FILE: _CHAIN, _SETS: b"operator.cagrad.c=0.3\nobservers.diagnostics.every=5"},
         {_FILE: _ALIASES, _SETS: b"reading=null\n"},
         {_FILE: b"", _SETS: _MANY},
-        {_FILE: b"preset: inria\n", _SETS: b"rasterizer.max_alpha=0.99\noperator=a+b\n"},
+        {_FILE: b"recipe: published\n", _SETS: b"rasterizer.max_alpha=0.99\noperator=a+b\n"},
         {_FILE: resolved, _SETS: b""},
     ]
 
