@@ -160,7 +160,7 @@ class RunConfig(BaseModel):
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
         (), description="(step, steps in all from there on) of a run that followed the clock"
     )
-    revised: tuple[dict[str, float | str], ...] = Field(
+    revised: tuple[dict[str, int | float | str], ...] = Field(
         (), description="the settings that changed with each of these"
     )
     planned_seconds: float | None = Field(

@@ -230,7 +230,7 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
     """Whether a pair has probably been conflicting, this step's cosine included."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
-    tau = {"v2": 0.9, "low": 0.6}[options["preset"]] if options["tau"] is None else options["tau"]
+    tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]
     seen: tuple[Number, Number, int] = question.memory.get(pair, (number(0), number(0), 0))
     first = beta * seen[0] + (1 - beta) * cosine
     second = beta * seen[1] + (1 - beta) * cosine**2

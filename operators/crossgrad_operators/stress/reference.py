@@ -37,7 +37,7 @@ ORACLES: Final[Mapping[str, Oracle]] = {
 OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "confgate": {"warmup": 0},
     "soft": {"threshold": 0.25, "strength": 0.5},
-    "dispatch": {"preset": "geometry-projection"},
+    "dispatch": {"variant": "geometry-projection"},
     "chain": {"links": ["preconditioner", "symmetric", "mean"]},
 }
 

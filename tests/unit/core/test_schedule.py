@@ -15,6 +15,7 @@ from crossgrad_core.contract.schedule import (
     Schedule,
 )
 from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.schedules import schedule_of
@@ -199,9 +200,14 @@ def test_more_photos_than_edits_have_room_for_leave_the_warm_up_as_it_is(photos)
     assert schedule.edits() == FEWEST_EDITS
 
 
-def test_edits_that_are_asked_for_from_a_length_on_follow_the_clock_there_and_back():
-    counting = replace(in_views("1"), edits_from=600)
-    short, long = (Schedule.for_run(views, counting=counting) for views in (599, 600))
+def test_edits_of_a_curve_begin_with_a_length_and_follow_the_clock_there_and_back():
+    setup = assemble(RunConfig(steps=700, views=1), sample_scene(), "none")
+
+    def schedule(views):
+        config = setup.at_length(views, None).in_force
+        return schedule_of(config, setup.densifier, views, setup.schedule.counting)
+
+    short, long = schedule(599), schedule(600)
     assert short.edits() == 0
     assert long.edits() == FEWEST_EDITS
     assert short.with_length(long, 100).edits() == FEWEST_EDITS

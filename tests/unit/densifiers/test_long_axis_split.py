@@ -84,7 +84,7 @@ def covariances(tensors):
 @pytest.mark.parametrize("seed", range(5))
 def test_two_children_have_mean_spread_and_mass_of_their_parent(seed):
     params = parameters(seed)
-    edit, new = grown(AdaptiveDensityControl(), params)
+    edit, new = grown(AdaptiveDensityControl(division="axis"), params)
     assert dict(edit.counts) == {"cloned": 0, "split": 3, "pruned": 0}
     assert edit.source.tolist() == [0, 1, 2, 0, 1, 2]
     assert edit.fresh.all()
@@ -105,7 +105,7 @@ def test_children_lie_on_the_longest_axis():
     with torch.no_grad():
         params["quats"][:] = torch.tensor([1.0, 0, 0, 0])
         params["scales"][:] = torch.tensor([[1.0, 2, 3], [3, 2, 1], [1, 3, 2]]).log()
-    _, new = grown(AdaptiveDensityControl(), params)
+    _, new = grown(AdaptiveDensityControl(division="axis"), params)
     apart = (new["means"][3:] - new["means"][:3]).numpy()
     far = 2 * 3 * sqrt(1 - 0.6**2)
     assert apart == pytest.approx(far * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), abs=1e-5)
@@ -117,7 +117,7 @@ def test_extreme_opacities_stay_finite(logit):
     params = parameters()
     with torch.no_grad():
         params["opacities"][:] = logit
-    _, new = grown(AdaptiveDensityControl(prune_opacity=0.0), params)
+    _, new = grown(AdaptiveDensityControl(prune_opacity=0.0, division="axis"), params)
     assert torch.isfinite(new["opacities"]).all()
     shares = torch.sigmoid(new["opacities"]) / torch.sigmoid(torch.tensor(logit).double())
     assert shares.numpy() == pytest.approx(1 / 1.2, rel=1e-5)
@@ -138,7 +138,7 @@ def test_published_children_unless_the_run_says_so(method, options, sides):
 
 
 def test_the_strongest_are_split_where_room_is_short():
-    edit, new = grown(AdaptiveDensityControl(), parameters(), room=1)
+    edit, new = grown(AdaptiveDensityControl(division="axis"), parameters(), room=1)
     assert edit.source.tolist() == [0, 1, 2, 2]
     assert edit.counts["held_back"] == 2
     assert len(new["means"]) == 4

@@ -72,18 +72,16 @@ def same(one, two):
     ],
 )
 def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left):
-    config = RunConfig(lr_tail=share)
-    assert tail_lr_factor(config, CONSTANT, step, 1000) == pytest.approx(left, rel=1e-12)
-    assert tail_lr_factor(config, DECAYING, step, 1000) == 1.0
-    assert tail_lr_factor(config, LearningRate(0.3, 0.3), step, 1000) == pytest.approx(
-        left, rel=1e-12
-    )
+    setup = setup_of(lr_tail=share, steps=1000)
+    assert tail_lr_factor(setup, CONSTANT, step) == pytest.approx(left, rel=1e-12)
+    assert tail_lr_factor(setup, DECAYING, step) == 1.0
+    assert tail_lr_factor(setup, LearningRate(0.3, 0.3), step) == pytest.approx(left, rel=1e-12)
 
 
 def test_what_is_left_of_a_rate_is_an_option():
-    config = RunConfig(lr_tail=0.5, lr_tail_factor=0.25)
-    assert tail_lr_factor(config, CONSTANT, 100, 100) == 0.25
-    assert tail_lr_factor(config, CONSTANT, 75, 100) == 0.5
+    setup = setup_of(lr_tail=0.5, lr_tail_factor=0.25, steps=100)
+    assert tail_lr_factor(setup, CONSTANT, 100) == 0.25
+    assert tail_lr_factor(setup, CONSTANT, 75) == 0.5
 
 
 def recorded(setup):

@@ -12,6 +12,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import budget
 from crossgrad_core.training.budget import (
@@ -27,6 +28,7 @@ from crossgrad_core.training.budget import (
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.expected_cost import PrimitiveCounts, cost_of_run, growth_ahead
 from crossgrad_core.training.growth_budget import curve
+from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.schedules import growth_note
 from crossgrad_plugins.recipes.budget import budget as usual_budget
 
@@ -55,12 +57,28 @@ class Run:
     hook: Hook = field(default_factory=Hook)
     notes: tuple[str, ...] = ("a note on the scene",)
     pixel_share: float = 0.6
+    revised: dict = field(default_factory=dict)
     trained_blocks: tuple[Block, ...] = ()
+
+    @property
+    def in_force(self):
+        return self.config
+
+    @property
+    def numbers(self):
+        return Numbers.of(self.config)
+
+    def following(self, steps, start):
+        return {}
+
+    def at_length(self, steps, start):
+        return self
 
 
 def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
+    config = RunConfig(steps=steps, schedule=mode, events="steps", densifier={"name": densifier})
     return Run(
-        RunConfig(steps=steps, schedule=mode, events="steps"),
+        with_decisions(config, sample_scene())[0],
         build("densifiers", densifier, {}),
         SimpleNamespace(
             names={"densifier": densifier},

@@ -294,11 +294,10 @@ def test_budgets_by_length():
     assert hurried == pytest.approx([n * 90_000 * 30 / 29 for n in (1, 2**0.9, 4**0.9)], abs=1)
     twelve = [usual_budget(90_000, 1_000, 12_000_000, hurried=each) for each in (False, True)]
     assert twelve[1] == pytest.approx(twelve[0] * 2, abs=2)
-    lengths = range(1_000, 30_001, 500)
+    lengths = range(1_000, 27_001, 500)
     for hurried in (False, True):
         budgets = [usual_budget(30_000, length, 480_000, hurried=hurried) for length in lengths]
-        assert budgets[:-1] == sorted(set(budgets[:-1]))
-        assert budgets[-1] == 0
+        assert budgets == sorted(set(budgets))
 
 
 @pytest.mark.parametrize(("settings", "more"), [({}, 2), ({"beta2": 0.999}, 1)])

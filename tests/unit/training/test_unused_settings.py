@@ -8,6 +8,7 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
+from crossgrad_core.recipe.table import open_again
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.app import run
 from crossgrad_core.run.assemble import assemble
@@ -194,7 +195,9 @@ def test_settings_that_do_something_are_not(settings):
     setup = refusal(settings)
     # What a run wrote down repeats it.
     config = resolved(setup)
-    refuse_settings_for_nothing(config, assemble(config, sample_scene(), "none"))
+    setup = assemble(config, sample_scene(), "none")
+    refuse_settings_for_nothing(open_again(config), setup)
+    assert resolved(setup).model_dump(exclude={"reader"}) == config.model_dump(exclude={"reader"})
 
 
 def test_gaussians_of_a_file_are_not_bounded(tmp_path):

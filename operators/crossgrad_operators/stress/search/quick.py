@@ -96,7 +96,7 @@ def _soft(batch: Batch, options: Options) -> Solved:
 
 
 def _confgate(batch: Batch, options: Options) -> Solved:
-    tau = options["tau"] or {"v2": 0.9, "low": 0.6}[options["preset"]]
+    tau = options["tau"] or {"v2": 0.9, "low": 0.6}[options["variant"]]
     limit = -_DEVIATION * NormalDist().inv_cdf(tau)
     return _projection(batch, _order(batch.views), limit=limit)
 
