@@ -35,6 +35,11 @@ def require_mpmath() -> Any:  # noqa: ANN401 - untyped
     return mpmath
 
 
+def number(value: object) -> Number:
+    """A 50-digit number."""
+    return require_mpmath().mp.mpf(value)
+
+
 def exact_gramian(case: Case) -> Matrix:
     """[K][K] Gramian of a case, zero in rows of views that are not finite."""
     mpf = require_mpmath().mp.mpf
