@@ -27,7 +27,7 @@ _HEAD = (
 )
 LEGEND = (
     "outside: share outside the operator's set (docs/operators.md); usual: the same of gradients\n"
-    "  with K 2 to 20, P 1 to 50 and norms over seven decades; 1 % of these is allowed.\n"
+    "  with K 2 to 20 (mostly few), P 1 to 50, norms over seven decades; 1 % of these is allowed.\n"
     "error: the worst inside the set, in units of u kappa; |u|: the longest outside it, over the\n"
     "  longest gradient; jump: how far a result moves, over the longest gradient, where gradients\n"
     "  move by 1e-12 of themselves and the method is continuous.\n"

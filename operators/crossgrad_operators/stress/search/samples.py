@@ -63,7 +63,9 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
         rows = reshaped if admitted.admits(len(reshaped)) else rows
     batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    found = [change(rng, piece) for change, piece in zip(MUTATIONS, pieces, strict=True)]
+    # In any order, because the last pieces of a small batch are empty.
+    order = rng.permutation(len(MUTATIONS)).tolist()
+    found = [MUTATIONS[place](rng, piece) for place, piece in zip(order, pieces, strict=True)]
     result = rounded(np.nan_to_num(np.concatenate(found)), parent.dtype)
     return Batch(result, parent.dtype, parent.family.removesuffix(MUTATED) + MUTATED)
 
