@@ -248,7 +248,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
-    from crossgrad_core.run.migration import marked
+    from crossgrad_core.run.config_version import marked
 
     write_mapping(path, marked(settings))
 

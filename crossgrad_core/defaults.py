@@ -24,8 +24,6 @@ SHORT_RESOLUTION: Final = "interlaced"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
-#: What runs of 0.1 measure: their configurations did not say it.
-METRICS_OF_0_1: Final = "psnr+ssim+ssim-skimage+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
 #: What stands in for it in short runs of many photos on a CPU.

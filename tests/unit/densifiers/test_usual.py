@@ -8,7 +8,6 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run import usual_densifier as chosen
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.usual_views import views_per_step_spec_of
 from crossgrad_core.testing.fixtures import sample_scene
 
@@ -94,8 +93,3 @@ def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, 
 
 def test_a_gpu_has_the_published_one_also_where_there_is_none():
     assert usual_of(steps=2000, device="cuda") == "adc"
-
-
-def test_what_earlier_versions_wrote_has_the_published_one(tmp_path):
-    written = {"steps": 2000, "revisions": []}
-    assert usual_of(**migrated(written, tmp_path / "config.yaml")) == "adc"

@@ -5,7 +5,6 @@ from support.grey_scene import grey_scene
 
 from crossgrad_core.commands import configured
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 
 DIFFERENT, EQUAL = [0.1, 0.2, 0.4, 0.2], [0.2, 0.2, 0.2, 0.2]
 
@@ -30,10 +29,3 @@ def test_what_is_named_and_published_rules_have_no_gains(given):
 
 def test_published_rules_have_the_exposure_that_is_named():
     assert taken(DIFFERENT, preset="inria", exposure={"name": "auto"})[0] == "gain"
-
-
-def test_runs_of_earlier_versions_go_on_without_gains(tmp_path):
-    old = {"revisions": [], "steps": 100}
-    assert migrated(old, tmp_path)["exposure"] == {"name": "none"}
-    kept = {**old, "exposure": {"name": "gain"}}
-    assert migrated(kept, tmp_path)["exposure"] == {"name": "gain"}

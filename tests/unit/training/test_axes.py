@@ -18,7 +18,6 @@ from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.contents import Checkpoint
 from crossgrad_core.run.checkpoint_io import check_settings, settings_of
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.axes import LIMIT, _usual, step_along_axes
@@ -247,10 +246,7 @@ def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
         refuse_settings_for_nothing(config, setup)
 
 
-def test_runs_of_before_go_on_as_they_began(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["position_lr"] == "extent"
-    assert "position_lr" not in migrated({}, tmp_path)
-    # A setting that a checkpoint does not know yet is none that was changed.
+def test_a_setting_that_a_checkpoint_does_not_know_counts_as_unchanged():
     config = setup_of().config
     stored = settings_of(config)
     del stored["position_lr"]

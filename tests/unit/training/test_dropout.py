@@ -11,7 +11,6 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import ViewSample
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
@@ -136,8 +135,3 @@ def test_photos_of_a_point_are_those_in_whose_image_it_lies():
     # Three points lie in three photos, one in one, and one in none, which does not count.
     assert photos_per_point(scene) == 3.0
     assert photos_per_point(posed_scene(ahead)) == 0.0
-
-
-def test_runs_of_before_go_on_without(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["dropout"] == 0.0
-    assert "dropout" not in migrated({}, tmp_path)

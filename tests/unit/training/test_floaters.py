@@ -13,7 +13,6 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
@@ -244,11 +243,6 @@ def test_only_none_keeps_its_set():
     said = (Path(__file__).parents[3] / "docs" / "settings.md").read_text(encoding="utf-8")
     row = next(line for line in said.splitlines() if line.startswith("| `floaters`"))
     assert "none" in row
-
-
-def test_runs_of_before_go_on_without(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["floaters"] == "keep"
-    assert "floaters" not in migrated({}, tmp_path)
 
 
 def test_one_and_many_in_words():

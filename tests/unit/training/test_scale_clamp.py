@@ -9,7 +9,6 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import scale_clamp
@@ -184,8 +183,3 @@ def test_a_bound_is_refused_where_no_sizes_learn(settings):
     config = setup.config.model_copy(update={"max_scale_ratio": 0.5})
     with pytest.raises(UserError, match="no Gaussians with axes that learn"):
         refuse_settings_for_nothing(config, setup)
-
-
-def test_runs_of_before_go_on_without_a_bound(tmp_path):
-    assert migrated({"revisions": []}, tmp_path)["max_scale_ratio"] == 0.0
-    assert "max_scale_ratio" not in migrated({}, tmp_path)

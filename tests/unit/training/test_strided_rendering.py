@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.migration import migrated
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.render_callback import RenderCallback
@@ -234,11 +232,6 @@ def test_an_n_that_is_named_is_that_of_photos_that_are_large_enough(asked, coars
 def test_a_run_without_a_stage_says_that_a_share_of_zero_was_asked_for():
     resolution = build("resolutions", "interlaced", {"coarsest": 2, "until": 0.0})
     assert "this share of the run is 0" in resolution.messages(Schedule.for_run(100))[0]
-
-
-def test_runs_of_before_go_on_with_all_pixels():
-    rest = migrated({"revisions": [], "steps": 100}, Path("config.yaml"))
-    assert rest["resolution"] == {"name": "full"}
 
 
 def test_a_rasterizer_with_one_dilation_is_refused():
