@@ -104,7 +104,7 @@ def judged(
             # Third-party code may raise anything.
             return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
-        finding = held(exact, found, reference, views, memory)
+        finding = compared(exact, found, reference, views, memory)
         if finding.reason == UNPROVEN:
             return finding, []
         findings.append(finding)
@@ -113,14 +113,14 @@ def judged(
     return max(findings, key=lambda finding: finding.severity), times
 
 
-def held(
+def compared(
     exact: ExactCase,
     found: Tensor | None,
     reference: Reference,
     views: Views,
     memory: dict[Any, Any],
 ) -> Finding:
-    """Judges a result by its reference; the oracle may write to the memory."""
+    """Compares a result with its reference; the oracle may write to the memory."""
     expected: Answer | ElementRule | None = reference.rule
     try:
         if reference.oracle is not None:

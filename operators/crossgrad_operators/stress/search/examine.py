@@ -6,10 +6,11 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from crossgrad_operators.stress.case import short
 from crossgrad_operators.stress.reference import Views
-from crossgrad_operators.stress.runner import held
+from crossgrad_operators.stress.runner import compared
 from crossgrad_operators.stress.search.batch import Batch, results, search_views
 from crossgrad_operators.stress.search.families import USUAL
 from crossgrad_operators.stress.solvers import UnprovenError
@@ -28,21 +29,18 @@ def examine(subject: Subject, batch: Batch) -> list[Finding]:
     """Runs an operator on a batch and judges every result."""
     with np.errstate(all="ignore"):
         found = results(subject.operator, batch)
-        tensors = list(torch.from_numpy(found))
-        cases = [exact_case(batch, place) for place in range(len(found))]
-        reference, views = subject.reference, search_views(batch.views)
-        if reference.oracle is not None or reference.rule is not None:
-            return [
-                held(exact, result, reference, views, {})
-                for exact, result in zip(cases, tensors, strict=True)
-            ]
-        apart = _lawful(subject, batch, found).tolist()
         return [
-            by_law(exact, result, error)
-            if bool(torch.isfinite(result).all())
-            else held(exact, result, reference, views, {})
-            for exact, result, error in zip(cases, tensors, apart, strict=True)
+            _judged(subject, exact_case(batch, place), torch.from_numpy(found[place]), apart)
+            for place, apart in enumerate(_from_laws(subject, batch, found))
         ]
+
+
+def _judged(subject: Subject, exact: ExactCase, result: Tensor, apart: float | None) -> Finding:
+    views = search_views(exact.case.views)
+    finding = compared(exact, result, subject.reference, views, {})
+    if apart is None or finding.verdict != "ok":
+        return finding
+    return by_law(exact, result, apart)
 
 
 def exact_case(batch: Batch, place: int) -> ExactCase:
@@ -50,17 +48,22 @@ def exact_case(batch: Batch, place: int) -> ExactCase:
     return ExactCase(short(batch.family, batch.rows[place], batch.dtype))
 
 
-def _lawful(subject: Subject, batch: Batch, found: Floats) -> Floats:
-    """[B] how far results are from scaling with the gradients and from following their order."""
+def _from_laws(subject: Subject, batch: Batch, found: Floats) -> list[float] | list[None]:
+    """[B] how far results are from scaling with the gradients and from following their order.
+
+    None for operators that have a reference.
+    """
+    if subject.reference.oracle is not None or subject.reference.rule is not None:
+        return [None] * len(found)
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
-    apart = np.asarray(np.linalg.norm(scaled - found, axis=1))
+    apart = np.linalg.norm(scaled - found, axis=1)
     # Near singular Gramians the order may matter; usual gradients are far from them.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)
         apart = np.maximum(apart, np.linalg.norm(other - found, axis=1))
-    return apart
+    return [float(distance) for distance in apart]
 
 
 def largest_jump(

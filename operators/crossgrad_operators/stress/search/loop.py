@@ -20,7 +20,7 @@ from crossgrad_operators.stress.search.worst_cases import WorstCases, specimen
 from crossgrad_operators.stress.suite import Subject
 
 #: Cases of a round that are moved by a little, which needs no exact arithmetic.
-JUMPS = 16
+JUMPS = 64
 
 
 @dataclass(frozen=True)
