@@ -17,7 +17,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare.comparison import Options, compared
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.tables import tables_of
+from crossgrad_plugins.compare.tables import csv_tables
 
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 #: Another scene file, photo or setting makes other results, and the command says so.
@@ -137,7 +137,7 @@ def compared_tables(folder):
     comparison = compared(read_runs([folder], skip_broken=False), Options())
     views = worst_views(comparison)
     with_pictures(comparison, views)
-    return tables_of(comparison, views)
+    return csv_tables(comparison, views)
 
 
 @THOROUGH

@@ -12,20 +12,22 @@ from crossgrad_core.commands import Progress, UserError, count, one_line, table_
 from crossgrad_plugins.compare.checks.code import differing_code
 from crossgrad_plugins.compare.comparison import Comparison, Options, compared
 from crossgrad_plugins.compare.cost import COSTS
-from crossgrad_plugins.compare.figures.curves import draw_curves
+from crossgrad_plugins.compare.figures.curves import (
+    draw_curves,
+    draw_frontier,
+    draw_primitives,
+    draw_regimes,
+)
 from crossgrad_plugins.compare.figures.differences import draw_differences
-from crossgrad_plugins.compare.figures.frontier import draw_frontier
 from crossgrad_plugins.compare.figures.phases import draw_phases
-from crossgrad_plugins.compare.figures.primitives import draw_primitives
 from crossgrad_plugins.compare.figures.profile import draw_profile
-from crossgrad_plugins.compare.figures.regimes import draw_regimes
 from crossgrad_plugins.compare.figures.style import Drawn
 from crossgrad_plugins.compare.load_runs import check_places, read_runs
 from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
 from crossgrad_plugins.compare.page import page_of
 from crossgrad_plugins.compare.parallel import in_parallel
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.tables import TABLES, tables_of
+from crossgrad_plugins.compare.tables import TABLES, csv_tables
 from crossgrad_plugins.compare.terminal import lines_of
 
 #: Where a comparison goes by default, beside the runs.
@@ -74,7 +76,7 @@ def compare(
     files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}
     files |= {f"{FIGURES}/{figure.name}.png": figure.png for figure in figures}
     files |= {
-        name: table_bytes(rows) for name, rows in tables_of(comparison, views).items() if rows
+        name: table_bytes(rows) for name, rows in csv_tables(comparison, views).items() if rows
     }
     write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):

@@ -55,6 +55,11 @@ class Run:
         """How it ended: finished, stopped or failed."""
         return str(self.summary.get("status"))
 
+    @property
+    def environment(self) -> Mapping[str, Any]:
+        """Its machine and code, as summary.json has them."""
+        return self.summary.get("environment") or {}
+
     @cached_property
     def settings(self) -> Settings:
         """Its configuration, flat, without what tells no arms apart."""

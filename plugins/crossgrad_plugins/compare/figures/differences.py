@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 from crossgrad_plugins.compare.comparison import OVERALL, Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
-from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.style import (
     FAINT,
     INK,
@@ -19,6 +18,7 @@ from crossgrad_plugins.compare.figures.style import (
     styled,
     wrapped,
 )
+from crossgrad_plugins.compare.narrative import where_text
 from crossgrad_plugins.compare.statistics.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ _COLORS = {
     Verdict.EQUIVALENT: "#009E73",
     Verdict.INCONCLUSIVE: "#666666",
 }
-_TITLES = {cost.name: f"equal {cost.title}" for cost in COSTS}
 
 
 def draw_differences(comparison: Comparison) -> Drawn | None:
@@ -72,12 +71,6 @@ def draw_differences(comparison: Comparison) -> Drawn | None:
             f"band is the margin of {comparison.quantity.margin:g} "
             f"{comparison.quantity.unit}.".replace(" .", "."),
         )
-
-
-def where_text(contrast: Contrast) -> str:
-    """Where a contrast was taken, as a row is called."""
-    text = _TITLES.get(contrast.where, contrast.where)
-    return f"{text} *" if contrast.inside else text
 
 
 def _by_regime(comparison: Comparison) -> list[Contrast]:
