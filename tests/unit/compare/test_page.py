@@ -168,7 +168,7 @@ def test_all_that_is_written_is_known_to_the_next_comparison(written):
     files = {path.relative_to(written).as_posix() for path in written.rglob("*.*")}
     assert files <= {"index.html", *app.OWNED}
     modules = {path.stem for path in Path(app.__file__).parent.glob("figures/*.py")}
-    assert modules - {"__init__", "style", "fonts", "panels", "curves"} <= set(app.DRAWINGS)
+    assert modules - {"__init__", "style", "panels", "curves"} <= set(app.DRAWINGS)
     found = compared(read_runs([written.parent], skip_broken=False), Options())
     assert set(csv_tables(found, {})) == set(TABLES)
 
