@@ -14,8 +14,9 @@ from support.damage import DAMAGES, cases, command, files_of
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
 from crossgrad_plugins.compare.tables import csv_tables
 

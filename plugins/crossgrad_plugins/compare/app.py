@@ -9,7 +9,7 @@ from typing import Final
 
 from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes, text_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
-from crossgrad_plugins.compare.comparison import Comparison, Options, compared
+from crossgrad_plugins.compare.comparison import Comparison, compared
 from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import (
     draw_curves,
@@ -22,6 +22,7 @@ from crossgrad_plugins.compare.figures.phases import draw_phases
 from crossgrad_plugins.compare.figures.profile import draw_profile
 from crossgrad_plugins.compare.figures.style import Drawn
 from crossgrad_plugins.compare.load_runs import check_places, read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
 from crossgrad_plugins.compare.page import page_of
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views

@@ -12,9 +12,10 @@ from crossgrad_plugins.compare.checks.machines import comparable_costs
 from crossgrad_plugins.compare.checks.metrics import quantities_of
 from crossgrad_plugins.compare.checks.scenes import check_scenes, differing_regimes
 from crossgrad_plugins.compare.contrasts import Contrast, Runs
-from crossgrad_plugins.compare.cost import ClockChoice, Cost
+from crossgrad_plugins.compare.cost import Cost
 from crossgrad_plugins.compare.interpolate import is_inside, shared_amount, value_at
 from crossgrad_plugins.compare.load_runs import RunRecord
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
@@ -24,27 +25,6 @@ END = "at the end"
 OVERALL = "overall"
 #: Up to so many arms every pair of them has a row in every table.
 _FEW_ARMS = 3
-
-
-@dataclass(frozen=True)
-class Options:
-    """How runs are compared.
-
-    Attributes:
-        metric: Name of the figure.
-        margin: What counts as no difference; None for the figure's usual margin.
-        baseline: The arm that the others are compared with; None for all with all.
-        clock: Which seconds.
-        target: The quality to reach; None for what the weakest arm ends with, by scene.
-        names: `OLD:NEW` names of arms.
-    """
-
-    metric: str = "psnr"
-    margin: float | None = None
-    baseline: str | None = None
-    clock: ClockChoice = ClockChoice.AUTO
-    target: float | None = None
-    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +105,7 @@ def compared(found: RunRecord, options: Options) -> Comparison:
     notes = check_scenes(found.runs)
     quantities, about_figures = quantities_of(found.runs, options.metric, options.margin)
     costs, about_clocks = comparable_costs(found.runs, options.clock)
-    arms = renamed(arms_of(found.runs, found.failed), options.names)
+    arms = renamed(arms_of(found.runs, found.failed), options.name or ())
     _check_baseline(arms, options.baseline)
     cells = Cells.of(arms)
     main = cells.main()

@@ -10,10 +10,11 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.targets import ratios
 
 OLD = Path(__file__).parents[2] / "integration" / "data" / "run-0.1"

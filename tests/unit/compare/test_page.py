@@ -12,12 +12,13 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.cli.main import main
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.figures import differences
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases, phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.tables import TABLES, cost_table, csv_tables
 
 SCENE = '<b>&"x"$y_$'
@@ -259,7 +260,7 @@ def page_with(folder, capsys, name):
                 regimes={name: 1.0, "near": -1.0},
             )
             run.write(folder / f"{views}-{seed}")
-    options = Options(names=(f"views=1:{name}",))
+    options = Options(name=[f"views=1:{name}"])
     app.compare([folder], options, folder / "out", skip_broken=False)
     said = capsys.readouterr()
     return (folder / "out" / "index.html").read_text(), said.out + said.err

@@ -8,8 +8,9 @@ import pytest
 from scipy.stats import trim_mean, ttest_1samp
 from support.run_folders import RunFolder
 
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap, iqm
 from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate, pairs_needed
 from crossgrad_plugins.compare.statistics.verdict import Verdict, holm, opposed, verdicts
