@@ -38,7 +38,7 @@ class _Seconds(BaseModel):
 
 
 class _Summary(BaseModel):
-    """The part of summary.json that a comparison takes for granted, of any version."""
+    """The part of summary.json that a comparison takes for granted."""
 
     status: str
     scene: str
@@ -246,15 +246,8 @@ def _in_words(error: ValueError) -> str:
 
 
 def _config(results: "RunResults") -> dict[str, object]:
-    """The configuration with the names and the defaults of this version.
-
-    What a run had to say about a setting that is newer than its version is not known: such a one
-    is there with its default, or not at all where that is none.
-    """
     try:
-        config = RunConfig.model_validate(results.config)
-        stated = config.model_dump(mode="json", exclude_unset=True)
-        return _without_nulls(config.model_dump(mode="json"), stated)
+        return RunConfig.model_validate(results.config).model_dump(mode="json")
     except ValueError as error:
         raise UserError(
             "unreadable configuration of a run",
@@ -262,15 +255,6 @@ def _config(results: "RunResults") -> dict[str, object]:
             found=_in_words(error),
             todo="restore the file, or read the run with the version that wrote it",
         ) from error
-
-
-def _without_nulls(settings: Mapping[str, Any], besides: Mapping[str, Any]) -> dict[str, object]:
-    """The settings without those that are null, besides some, and likewise in inner ones."""
-    return {
-        name: _without_nulls(value, besides.get(name) or {}) if isinstance(value, dict) else value
-        for name, value in settings.items()
-        if value is not None or name in besides
-    }
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:

@@ -116,7 +116,7 @@ def cost_table(c: Comparison) -> Table:
         row = [arm, *(_mean([run.spent(cost) for run in runs], cost) for cost in c.costs)]
         row += [
             _mean([run.number("primitives") for run in runs]),
-            _mean([run.peak_primitives for run in runs]),
+            _mean([run.number("peak_primitives") for run in runs]),
             _mean([run.number("peak_memory_mib") for run in runs]),
             f"{len(c.main[arm])}" + (f" + {failed} failed" if failed else ""),
         ]
@@ -346,7 +346,7 @@ def _run(c: Comparison, arm: str, run: Run) -> Row:
         for regime in run.results.regimes
     }
     numbers["primitives"] = run.number("primitives")
-    numbers["peak_primitives"] = run.peak_primitives
+    numbers["peak_primitives"] = run.number("peak_primitives")
     numbers["peak_memory_mib"] = run.number("peak_memory_mib")
     row |= {key: nan if number is None else number for key, number in numbers.items()}
     return row | {key: str(run.environment.get(key) or "") for key in ("crossgrad", "commit")}

@@ -1,4 +1,4 @@
-"""Folders that are damaged, unfinished, old, or alone."""
+"""Folders that are damaged, unfinished, or alone."""
 
 import json
 import shutil
@@ -16,8 +16,6 @@ from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
 from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.targets import ratios
-
-OLD = Path(__file__).parents[2] / "integration" / "data" / "run-0.1"
 
 
 def headlines(folder: Path) -> str:
@@ -195,7 +193,7 @@ def test_three_seeds_say_how_many_would_do(tmp_path):
 
 
 def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
-    shutil.copytree(OLD, tmp_path / "runs" / "old")
+    RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
     assert "One arm: there is nothing to compare it with" in page
@@ -209,20 +207,6 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
     assert "One arm" in headlines(tmp_path)
     RunFolder(scene="city", seed=5, views_per_step=2).write(tmp_path / "3")
     assert "share no scene with the same seed" in headlines(tmp_path)
-
-
-def test_an_old_run_beside_a_new_one(tmp_path):
-    shutil.copytree(OLD, tmp_path / "old")
-    RunFolder(
-        scene="tiny",
-        steps=20,
-        held_out=("0000.png", "0008.png"),
-        regimes={"far": 0.0},
-        photos="photos: 32 x 24 px (9) from images/, not resized",
-    ).write(tmp_path / "new")
-    found = compared(read_runs([tmp_path], skip_broken=False), Options())
-    assert "ssim_skimage is not compared: new did not measure it" in found.notes
-    assert len(found.arms) == 2
 
 
 def test_figures_of_views_that_are_gone_are_told(folder):
