@@ -1,5 +1,6 @@
 """From folders to runs: what is broken, unfinished or of another kind is sorted out."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -288,9 +289,6 @@ def without_length(label: str) -> str:
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
-    """The folders below the last one that they share."""
-    shared = 0
-    parts = [folder.parts for folder in folders]
-    while parts and all(len(p) > shared + 1 and p[shared] == parts[0][shared] for p in parts):
-        shared += 1
-    return {folder: "/".join(folder.parts[shared:]) for folder in folders}
+    """Return the paths below the last folder that they share."""
+    shared = os.path.commonpath([folder.parent for folder in folders])
+    return {folder: folder.relative_to(shared).as_posix() for folder in folders}
