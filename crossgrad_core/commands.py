@@ -29,6 +29,7 @@ from crossgrad_core.system.checksums import (
     drop_checksums,
     write_checksums,
 )
+from crossgrad_core.system.command_options import argument, command_of, option
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import (
     disk_errors,
@@ -107,6 +108,7 @@ __all__ = [
     "accepts",
     "affordable_steps",
     "announce",
+    "argument",
     "assemble",
     "assemble_new",
     "available_cores",
@@ -120,6 +122,7 @@ __all__ = [
     "check_unchanged",
     "chosen",
     "clear_half_written",
+    "command_of",
     "configured",
     "controls_of",
     "count",
@@ -149,6 +152,7 @@ __all__ = [
     "offers",
     "one_line",
     "open_run",
+    "option",
     "panels_of",
     "parse_number",
     "photos_per_point",

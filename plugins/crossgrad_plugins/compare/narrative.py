@@ -70,6 +70,13 @@ def opposed_text(contrast: Contrast) -> str:
     return f"surely otherwise on {', '.join(shown)}" if shown else ""
 
 
+def where_text(contrast: Contrast) -> str:
+    """Return where a contrast was taken; a star marks runs that were read before their ends."""
+    title = _TITLES.get(contrast.where)
+    text = contrast.where if title is None else f"equal {title}"
+    return f"{text} *" if contrast.inside else text
+
+
 def verdict_text(contrast: Contrast) -> str:
     """The verdict, and on which scenes it is surely not so."""
     found = opposed_text(contrast)

@@ -1,4 +1,4 @@
-"""Folders that are damaged, unfinished, old, or alone."""
+"""Folders that are damaged, unfinished, or alone."""
 
 import json
 import shutil
@@ -10,10 +10,11 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.targets import ratios
 
 
@@ -192,7 +193,7 @@ def test_three_seeds_say_how_many_would_do(tmp_path):
 
 
 def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
-    RunFolder().write(tmp_path / "runs" / "alone")
+    RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
     assert "One arm: there is nothing to compare it with" in page
