@@ -35,6 +35,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.export import renderer
+from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import Verdict, verdict_of
 
 #: A fall of the held-out PSNR that has to be reported, dB.
@@ -129,7 +130,7 @@ def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
     wrong = KINDS[kind](right, rng)
     scene = wrong.model.scene()
     begun = process_time()
-    verdict = verdict_of(scene, range(len(scene.views)))
+    verdict = verdict_of(scene, range(len(scene.views)), pixels_of(scene))
     seconds = process_time() - begun
     fall = None
     if steps is not None:
@@ -154,7 +155,7 @@ def right_scene(path: Path, seed: int, size: int) -> Outcome:
     model = harmless(varied(base(path, size), rng), rng)
     scene = model.scene()
     begun = process_time()
-    verdict = verdict_of(scene, range(len(scene.views)))
+    verdict = verdict_of(scene, range(len(scene.views)), pixels_of(scene))
     seconds, text = process_time() - begun, text_of(verdict)
     tracks = any(len(rows) for rows in model.seen)
     count = len(scene.views)

@@ -85,11 +85,11 @@ class Bench:
     def is_off(self) -> bool:
         """Whether a small change makes the photos agree better."""
         evidence = self._evidence
-        rigs = [probe.change(evidence.rig) for probe in probes()]
-        rows = np.tile(evidence.rows, (len(rigs) + 1, 1))
-        agreement = replace(evidence, rows=rows).agreement(evidence.rig.joined(rigs))
-        each = scores(agreement, tracked=evidence.tracked).reshape(len(rigs) + 1, -1).mean(axis=1)
-        return bool(each[1:].max() > each[0] + _PROBED)
+        first, *others = [probe.change(evidence.rig) for probe in probes()]
+        rows = np.tile(evidence.rows, (1 + len(others), 1))
+        agreement = replace(evidence, rows=rows).agreement(first.joined(others))
+        each = scores(agreement, tracked=evidence.tracked).reshape(1 + len(others), -1).mean(axis=1)
+        return bool(each.max() > self.before + _PROBED)
 
     def diagnosis(self) -> Diagnosis:
         """The change that makes the photos agree best; the likely ones are tried first."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from crossgrad_core.scene.self_check.evidence import (
     Agreement,
     Booleans,
     Evidence,
+    Pixels,
     observed,
     tested,
 )
@@ -103,8 +105,13 @@ _UNRELATED: Final = (
 _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
 
-def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
+def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
     """The outcome for some views of a scene.
+
+    Args:
+        scene: The scene.
+        views: Rows of the views.
+        pixels: Decodes their photos.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -118,8 +125,8 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
     # Beside photos with tracks, points that may be hidden say too little about single photos.
     if has_tracks.any():
         rows = rows[has_tracks]
-        return _Group.of(observed(scene, rows), rows).verdict()
-    return _Group.of(tested(scene, rows, _MOST_TESTED), rows).verdict()
+        return _Group.of(observed(scene, rows, pixels), rows).verdict()
+    return _Group.of(tested(scene, rows, pixels, _MOST_TESTED), rows).verdict()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +155,7 @@ class _Group:
         evidence = self.evidence.of_photos()
         return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
-    @property
+    @cached_property
     def better(self) -> float:
         """The correlation of the better photos; 0 if no photo has one."""
         known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
@@ -159,13 +166,14 @@ class _Group:
         """[V] photos about which something can be said."""
         return np.isfinite(self.agreement.correlation) | self._out
 
-    @property
+    @cached_property
     def _out(self) -> Booleans:
         """[V] photos that have most of their observed points out of frame."""
         if not self.evidence.tracked:
             return np.zeros(len(self.views), dtype=np.bool_)
         return np.asarray(self.agreement.share < _IN_FRAME)
 
+    @cached_property
     def bad(self) -> Booleans:
         """[V] photos that disagree."""
         correlation, noise = self.agreement.correlation, self.agreement.noise
@@ -192,7 +200,7 @@ class _Group:
             if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
-        bad = self.bad()
+        bad = self.bad
         if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < _LEAST:
             return self._as_a_whole(verdict)
         found = self._of_all(np.flatnonzero(self.told & ~bad))
@@ -251,7 +259,7 @@ class _Group:
 
     def suspects(self) -> tuple[Cause, ...]:
         """Why single photos disagree."""
-        bad, correlation = self.bad(), self.agreement.correlation
+        bad, correlation = self.bad, self.agreement.correlation
         if self.recolored:
             rows = np.flatnonzero(bad)
             return (Cause(self._named(rows), *_STRANGE),) if len(rows) else ()

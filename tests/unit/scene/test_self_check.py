@@ -12,6 +12,7 @@ from crossgrad_core.commands import configured
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_and_check, read_scene
 from crossgrad_core.scene.self_check.check import checked
+from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import verdict_of
 
 KINDS = (
@@ -63,7 +64,7 @@ def without_tracks(model):
 
 def found(model):
     scene = model.scene()
-    return verdict_of(scene, range(len(scene.views)))
+    return verdict_of(scene, range(len(scene.views)), pixels_of(scene))
 
 
 def causes(verdict):
@@ -146,7 +147,8 @@ def test_masked_pixels_are_no_contradiction(model):
 
     scene = model.scene()
     views = tuple(replace(view, photo=Half(view.photo)) for view in scene.views)
-    verdict = verdict_of(replace(scene, views=views), range(len(views)))
+    masked = replace(scene, views=views)
+    verdict = verdict_of(masked, range(len(views)), pixels_of(masked))
     assert not causes(verdict)
     assert verdict.in_frame > 0.95
 
