@@ -4,7 +4,7 @@
         [--trained 60] [--out FILE]
 
 The towns are those of benchmarks/towns.py, 24 photos of either kind. Each wrong scene has a random
-kind and strength, number of photos and points, crop, and tracks or none. Some of them are trained
+kind and strength, number of photos and points, crop, fx over fy, and tracks or none. Some of them are trained
 for 150 steps on photos of 100 pixels, as is the right scene that each was made from: `fall` is
 the difference of the held-out PSNR, mean by kind and strength. `found` counts the scenes that were
 reported with the right cause, or with the right photos. Right scenes have random photos and points,
@@ -180,12 +180,15 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
         told = "yes" if tracks else "no"
         yield f"| {kind} | {strength} | {told} | {len(members)} | {found} | {shown} |"
     found = sum(each.found for each in hard)
+    fallen = [each for each in outcomes if each.fall is not None and each.fall >= FALL]
+    found_fallen = sum(each.found for each in fallen)
     right = [each for each in outcomes if each.kind == "right"]
     warned = sum(not each.found for each in right)
     yield ""
     yield (
         f"Kinds and strengths that cost {FALL:g} dB or more in the mean: {found} of {len(hard)} "
-        f"scenes found. Right scenes: {warned} of {len(right)} got a warning."
+        f"scenes found. Trained scenes that fall by {FALL:g} dB or more: {found_fallen} of "
+        f"{len(fallen)} found. Right scenes: {warned} of {len(right)} got a warning."
     )
 
 

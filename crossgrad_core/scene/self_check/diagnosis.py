@@ -27,8 +27,8 @@ _CLEARLY: Final = 0.03
 _PROBED: Final = 0.01
 #: How often the step of a search is halved.
 _ROUNDS: Final = 4
-#: How well photos agree, at least, after a change that repairs a scene, and what it gains.
-REPAIRED: Final = 0.45
+#: How well the photos of a scene agree at least, and what a change that repairs a scene gains.
+LEAST: Final = 0.35
 GAINED: Final = 0.25
 
 
@@ -49,7 +49,7 @@ class Diagnosis:
     @property
     def repairs(self) -> bool:
         """Whether the change makes photos agree that did not."""
-        return self.after >= REPAIRED and self.after >= self.before + GAINED
+        return self.after >= LEAST and self.after >= self.before + GAINED
 
 
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:

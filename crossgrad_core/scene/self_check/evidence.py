@@ -84,6 +84,13 @@ class Evidence:
         """The same with the colours of points as the other photos show them."""
         return replace(self, colors=None)
 
+    def sees_nothing(self, cameras: Integers) -> Booleans:
+        """Return for each of some cameras whether none of all points is in its frame."""
+        rows = np.broadcast_to(np.arange(len(self.rig.points)), (1, len(self.rig.points)))
+        return np.array(
+            [not self.rig.chosen([camera]).project(rows)[2].any() for camera in cameras], dtype=bool
+        )
+
     @property
     def colored(self) -> bool:
         """Whether the colours of the points differ, so that they can be compared."""

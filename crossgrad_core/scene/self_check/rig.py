@@ -106,7 +106,9 @@ class Rig:
         x, y, depth = local.transpose(1, 0, 2) + self.translations.T[:, :, None]
         front = depth > 0.0
         inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=front)
-        focal, principal = ((each / self.sizes).T[:, :, None] for each in (self.focal, self.principal))
+        focal, principal = (
+            (each / self.sizes).T[:, :, None] for each in (self.focal, self.principal)
+        )
         across, down = shares = focal * np.stack([x * inverse, y * inverse]) + principal
         inside = front & (across >= 0.0) & (across < 1.0) & (down >= 0.0) & (down < 1.0)
         if self.turn is not UPRIGHT:
