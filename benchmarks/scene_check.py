@@ -4,11 +4,11 @@
         [--trained 60] [--out FILE]
 
 The towns are those of benchmarks/towns.py, 24 photos of either kind. Each wrong scene has a random
-kind and strength, number of photos and points, crop, fx over fy, and tracks or none. Some of them are trained
-for 150 steps on photos of 100 pixels, as is the right scene that each was made from: `fall` is
-the difference of the held-out PSNR, mean by kind and strength. `found` counts the scenes that were
-reported with the right cause, or with the right photos. Right scenes have random photos and points,
-gains, noise, JPEG and frames; none of them should get a warning.
+kind and strength, number of photos and points, crop, fx over fy, and tracks or none. Some of them
+are trained for 150 steps on photos of 100 pixels, as is the right scene that each was made from:
+`fall` is the difference of the held-out PSNR, mean by kind and strength. `found` counts the scenes
+that were reported with the right cause, or with the right photos. Right scenes have random photos
+and points, gains, noise, JPEG and frames; none of them should get a warning.
 """
 
 import argparse

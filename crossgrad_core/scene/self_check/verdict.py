@@ -40,8 +40,8 @@ _FITS: Final = 0.7
 _FEW: Final = 2
 #: Points in frame of a photo that is compared with others, or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: Points in frame of a photo without tracks that disagrees: fewer may all be hidden.
-_FEWEST_UNHIDDEN: Final = 200
+#: Standard errors by which the correlation of a photo without tracks is below that bound.
+_ERRORS: Final = 3.0
 #: Points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
 #: The better photos: the upper quartile.
@@ -185,7 +185,8 @@ class _Group:
         if self.recolored:  # Colours that a few other photos show say too little.
             unlike[:] = False
         if not self.evidence.tracked:
-            unlike &= self.agreement.inside >= _FEWEST_UNHIDDEN
+            error = 1.0 / np.sqrt(np.maximum(self.agreement.inside, 1))
+            unlike &= correlation + _ERRORS * error < _BAD * self.better
         return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
 
     def verdict(self) -> Verdict:

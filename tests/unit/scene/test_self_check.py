@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.scenes import write_tiny_scene
 from support.scripts import BENCHMARKS
 
@@ -101,6 +102,26 @@ def test_each_kind_is_reported_with_its_cause_or_its_photos(contradictions, mode
 def test_the_cause_is_found_without_tracks(contradictions, model, kind):
     wrong = contradictions.KINDS[kind](without_tracks(model), np.random.default_rng(0))
     assert any(word in cause for word in wrong.causes for cause in causes(found(wrong.model)))
+
+
+@pytest.mark.parametrize("axis", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+def test_a_turned_camera_without_tracks_is_named(model, axis):
+    rotations = model.rotations.copy()
+    rotations[5] = (
+        Rotation.from_rotvec(np.radians(170.0) * np.array(axis)).as_matrix() @ rotations[5]
+    )
+    turned = without_tracks(model).posed(rotations, model.centers)
+    (cause,) = found(turned).some_wrong
+    assert cause.views == (5,)
+
+
+def test_the_cause_is_found_if_the_colours_of_the_points_are_noisy(contradictions, model):
+    noise = np.random.default_rng(0).normal(0.0, 130.0, model.colors.shape)
+    colors = np.clip(model.colors + noise, 0, 255).astype(np.uint8)
+    right = replace(without_tracks(model), colors=colors)
+    assert 0.35 < found(right).correlation < 0.45
+    wrong = contradictions.KINDS["OpenGL axes"](right, np.random.default_rng(0))
+    assert any("OpenGL" in cause for cause in causes(found(wrong.model)))
 
 
 @pytest.mark.parametrize("seed", range(12))
