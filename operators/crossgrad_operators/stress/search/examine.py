@@ -74,8 +74,8 @@ def largest_jump(
     """The case whose result moves most where gradients do by 1e-12, and how far it moves.
 
     The distance is divided by the length of the longest gradient. Cases at which the method is not
-    continuous do not count; None if all of the first ones are such. Gradients are float64, in which so small a
-    change is exact enough.
+    continuous do not count; None if all of the cases that moved most are such. Gradients are
+    float64, in which so small a change is exact enough.
     """
     wide = replace(batch, dtype=torch.float64)
     noise = _NUDGE * rng.standard_normal(batch.rows.shape)
