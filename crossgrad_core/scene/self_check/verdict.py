@@ -187,7 +187,8 @@ class _Group:
         if not self.evidence.tracked:
             error = 1.0 / np.sqrt(np.maximum(self.agreement.inside, 1))
             unlike &= correlation + _ERRORS * error < _BAD * self.better
-        return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
+        out = self._out & (np.nan_to_num(correlation) < _BAD * self.better)
+        return np.asarray(unlike | out)
 
     def verdict(self) -> Verdict:
         """The outcome for these photos."""
