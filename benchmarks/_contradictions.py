@@ -286,11 +286,13 @@ KINDS: Final[dict[str, Kind]] = {
 
 
 def varied(model: Model, rng: np.random.Generator) -> Model:
-    """A right scene: some of the photos and points, cropped photos, with or without tracks."""
+    """A right scene: some photos and points, cropped or stretched photos, tracks or none."""
     count = int(rng.integers(8, len(model.photos) + 1))
     model = model.views(np.sort(rng.choice(len(model.photos), count, replace=False)))
     if rng.random() < 0.5:
         model = _cropped(model, rng)
+    if rng.random() < 0.5:
+        model = _stretched(model, rng)
     if rng.random() < 0.5:
         model = _fewer_points(model, rng)
     if rng.random() < 0.4:
@@ -338,6 +340,15 @@ def _cropped(model: Model, rng: np.random.Generator) -> Model:
         at = calibrations[view, :2] * local[:, :2] / local[:, 2:] + calibrations[view, 2:]
         seen.append(rows[(at >= 0).all(axis=1)])
     return replace(model, photos=photos, calibrations=calibrations, seen=seen)
+
+
+def _stretched(model: Model, rng: np.random.Generator) -> Model:
+    """Photos with pixels that are not square: fx and fy differ."""
+    height, width = model.photos[0].shape[:2]
+    new_width = round(width * rng.uniform(0.8, 1.25))
+    photos = [np.array(Image.fromarray(each).resize((new_width, height))) for each in model.photos]
+    factor = new_width / width
+    return replace(model, photos=photos, calibrations=model.calibrations * [factor, 1, factor, 1])
 
 
 def _fewer_points(model: Model, rng: np.random.Generator) -> Model:

@@ -29,6 +29,7 @@ from crossgrad_core.system.checksums import (
     drop_checksums,
     write_checksums,
 )
+from crossgrad_core.system.command_options import argument, command_of, option
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import (
     disk_errors,
@@ -103,6 +104,7 @@ __all__ = [
     "accepts",
     "affordable_steps",
     "announce",
+    "argument",
     "assemble",
     "assemble_new",
     "available_cores",
@@ -116,6 +118,7 @@ __all__ = [
     "check_unchanged",
     "chosen",
     "clear_half_written",
+    "command_of",
     "configured",
     "controls_of",
     "count",
@@ -145,6 +148,7 @@ __all__ = [
     "offers",
     "one_line",
     "open_run",
+    "option",
     "panels_of",
     "parse_number",
     "photos_per_point",
@@ -238,7 +242,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
-    from crossgrad_core.run.file_version import marked
+    from crossgrad_core.run.config_version import marked
 
     write_mapping(path, marked(settings))
 

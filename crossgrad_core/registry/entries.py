@@ -14,7 +14,6 @@ from inspect import isabstract
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.deprecations import Change, change_of, change_of_import
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
 from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS, QUICK
@@ -161,10 +160,7 @@ def resolve_entry(entry: Entry) -> object:
             f"{singular(entry.slot)} {entry.name} cannot be imported",
             where=sentences(entry.origin, place),
             found=in_one_line(error),
-            todo=sentences(
-                change_of_import(error),
-                f"repair or uninstall {entry.distribution}; other {others} are not affected",
-            ),
+            todo=f"repair or uninstall {entry.distribution}; other {others} are not affected",
         ) from error
 
 
@@ -352,8 +348,6 @@ def _checked(entry: Entry, found: object) -> "type[Component]":
     base = cast("type[Component]", _resolve(f"crossgrad_core.contract.{word}:{word.capitalize()}"))
     if not (isinstance(found, type) and issubclass(found, base)):
         raise _wrong_kind(entry, base, f"{found!r}")
-    if change := change_of(entry.slot, found):
-        raise _of_an_older_version(entry, found, change)
     if isabstract(found):
         missing = sorted(getattr(found, "__abstractmethods__", ()))
         raise _wrong_kind(entry, base, f"{found.__name__} without the methods {listed(missing)}")
@@ -366,17 +360,6 @@ def _checked(entry: Entry, found: object) -> "type[Component]":
             todo=f"repair or uninstall {entry.distribution}",
         )
     return found
-
-
-def _of_an_older_version(entry: Entry, found: type, change: Change) -> UserError:
-    attribute = getattr(found, change.attribute)
-    return UserError(
-        f"{singular(entry.slot)} {entry.name} is written for an older crossgrad",
-        where=sentences(entry.origin, defined_at(attribute) or defined_at(found)),
-        expected=f"a {singular(entry.slot)} of crossgrad {VERSION}",
-        found=f"{found.__name__}.{change.attribute}, as in 0.1",
-        todo=sentences(change.now, f"or install a newer {entry.distribution}"),
-    )
 
 
 def _wrong_kind(entry: Entry, base: type, found: str) -> UserError:

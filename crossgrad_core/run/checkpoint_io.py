@@ -1,7 +1,6 @@
 """TrainState to checkpoint and back."""
 
 from dataclasses import asdict
-from math import nan
 from typing import Any, Final, cast
 
 from crossgrad_core.config import RunConfig
@@ -14,7 +13,7 @@ from crossgrad_core.system.version import VERSION
 from crossgrad_core.training import averaging
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.per_image_params import check_photos_are
-from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
+from crossgrad_core.training.rngs import restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed
@@ -160,11 +159,7 @@ def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
             exp_avg_sq={name: tensor.to(device) for name, tensor in checkpoint.exp_avg_sq.items()},
             steps=dict(checkpoint.adam_steps),
         ),
-        # A checkpoint of an earlier version lacks the streams that came later.
-        rngs={
-            **make_streams(setup.config.seed, scalars["rewinds"]),
-            **restored_streams(checkpoint.generators),
-        },
+        rngs=restored_streams(checkpoint.generators),
         states={name: state.to(device) for name, state in checkpoint.plugins.items()},
         step=checkpoint.step,
         last=_record(scalars["last"]),
@@ -175,9 +170,7 @@ def _restored(setup: Setup, checkpoint: Checkpoint) -> TrainState:
 
 
 def _clock(plain: dict[str, Any]) -> Clock:
-    """The clock; checkpoints of earlier versions tell neither training seconds by phase nor CPU."""
-    phases = _figures(plain.get("phases", {}))
-    plain = {"cpu": nan, **plain}
+    phases = _figures(plain["phases"])
     rest = {name: value for name, value in plain.items() if name != "phases"}
     return Clock(**_figures(rest), phases=phases)
 

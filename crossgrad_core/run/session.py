@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from math import isnan
 from pathlib import Path
 from time import perf_counter
 
@@ -228,7 +227,7 @@ def totals(setup: Setup, state: TrainState) -> Totals:
         primitives=state.primitives(setup),
         peak_memory_mib=peak_mebibytes(setup.device),
         loss=sum(losses) / len(losses) if losses else None,
-        cpu_seconds=None if isnan(state.clock.cpu) else state.clock.cpu,
+        cpu_seconds=state.clock.cpu,
         peak_primitives=max(state.counters.peak_primitives, state.primitives(setup)),
     )
 

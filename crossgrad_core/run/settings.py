@@ -17,7 +17,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import without_decided
 from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.registry.slots import GROUPS, LISTS
-from crossgrad_core.run.file_version import unmarked
+from crossgrad_core.run.config_version import unmarked
 from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, plural, singular, with_article
@@ -171,7 +171,7 @@ def _with_default_name(key: str, value: object) -> object:
 
 
 def _of_file(path: Path) -> Settings:
-    """The settings of a file, of whatever version."""
+    """The settings of a file."""
     return unmarked(_normalized(read_mapping(path, *_FILE)), path)
 
 

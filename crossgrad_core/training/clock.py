@@ -35,8 +35,7 @@ class Clock:
         phases: Training seconds by phase of the step; together they are `train`. Work of a GPU, or
             of the other threads alone, is counted in the phase that waits for it.
         cpu: Seconds of CPU time that the process took while it trained, all threads together, but
-            for what others do between two steps where this clock is no budget; NaN where an
-            earlier version, which did not count them, trained a part.
+            for what others do between two steps where this clock is no budget.
     """
 
     train: float = 0.0

@@ -11,9 +11,6 @@ STREAMS = (
     "background", "resolution", "density", "dropout",
 )  # fmt: skip
 
-#: Those that came after 0.1, whose checkpoints lack them: they start anew.
-_LATER = frozenset({"resolution", "density", "dropout"})
-
 
 def make_streams(seed: int, rewinds: int = 0) -> dict[str, np.random.Generator]:
     """Fresh generators of a run; `rewinds` gives other ones after a rewind."""
@@ -29,11 +26,11 @@ def restored_streams(states: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ra
     """Generators that continue from `states`.
 
     Raises:
-        KeyError: A stream is missing that every version has.
+        KeyError: A stream is missing.
         TypeError: A state is none of NumPy's.
         ValueError: Likewise.
     """
-    absent = [name for name in STREAMS if name not in states and name not in _LATER]
+    absent = [name for name in STREAMS if name not in states]
     if absent:
         raise KeyError(*absent)
     streams = {}

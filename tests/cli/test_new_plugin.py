@@ -4,6 +4,7 @@ import ast
 import json
 import sys
 import tomllib
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -11,11 +12,9 @@ from PIL import Image
 from support.distributions import write_distribution
 
 from crossgrad_core.cli.main import main
-from crossgrad_core.plugin import SceneOptions, StepRecord
+from crossgrad_core.plugin import SceneOptions
 from crossgrad_core.registry.slots import COMMANDS, OFFERED
-from crossgrad_plugins.authoring.new import slots
-from crossgrad_plugins.authoring.templates.observers import Template
-from crossgrad_plugins.authoring.templates.readers import Template as PosesReader
+from crossgrad_plugins.authoring.new import examples
 
 #: What every package may import.
 DOORS = ("crossgrad_core.plugin", "crossgrad_core.numerics", "crossgrad_core.testing")
@@ -47,7 +46,7 @@ def installed(folder, monkeypatch):
     return plugins
 
 
-@pytest.mark.parametrize("slot", slots())
+@pytest.mark.parametrize("slot", OFFERED)
 def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
     name = f"made-new-{slot}"
     code, out, err = ran("plugins", "new", name, "--slot", slot)
@@ -59,14 +58,14 @@ def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
     assert "1 of 1 plugins keep the contract of their slot" in out
 
 
-@pytest.mark.parametrize("slot", slots())
+@pytest.mark.parametrize("slot", OFFERED)
 def test_it_imports_the_core_through_its_doors(ran, tmp_path, slot):
     ran("plugins", "new", "made-new", "--slot", slot)
     own = {"readers": "crossgrad_core.scene", COMMANDS: "crossgrad_core.commands"}
     doors = (*DOORS, own.get(slot, DOORS[0]))
     for file in (tmp_path / "made-new").rglob("*.py"):
         text = file.read_text()
-        assert "emplate" not in text
+        assert "example" not in text
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and "crossgrad" in node.module:
                 assert node.module.startswith(doors)
@@ -83,19 +82,9 @@ def test_its_own_test_runs(ran, tmp_path, monkeypatch):
         names["test_contract"](check)
 
 
-def test_the_begun_observer_logs(caplog):
-    observer = Template(every=2)
-    with caplog.at_level("INFO"):
-        for step in (1, 2):
-            observer.crossgrad_step_end(step_record(step))
-    assert [each.getMessage() for each in caplog.records] == ["step 2: losses (0.5,)"]
-
-
-def step_record(step):
-    return StepRecord(step, (0,), ("a",), None, (0.5,), 1, {}, 1.0)
-
-
-def test_the_begun_reader_reads(tmp_path):
+def test_the_begun_reader_reads(ran, tmp_path, monkeypatch):
+    ran("plugins", "new", "made-new", "--slot", "readers")
+    monkeypatch.syspath_prepend(tmp_path / "made-new")
     (tmp_path / "images").mkdir()
     poses = []
     for number in range(3):
@@ -105,7 +94,7 @@ def test_the_begun_reader_reads(tmp_path):
         poses.append({"name": f"{number}.png", "size": [20, 16], "pinhole": [18.0, 18.0, 10.0, 8.0],
                       "world_to_camera": pose.tolist()})  # fmt: skip
     (tmp_path / "poses.json").write_text(json.dumps(poses))
-    reader = PosesReader()
+    reader = import_module("made_new").MadeNew()
     assert reader.accepts(tmp_path)
     scene = reader.read(tmp_path, SceneOptions(init="random"))
     assert [view.name for view in scene.views] == ["0.png", "1.png", "2.png"]
@@ -113,7 +102,7 @@ def test_the_begun_reader_reads(tmp_path):
 
 
 def test_every_slot_can_be_begun():
-    assert set(slots()) == set(OFFERED)
+    assert set(examples()) == set(OFFERED)
 
 
 def test_the_singular_will_do(ran, tmp_path):

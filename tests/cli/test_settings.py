@@ -3,7 +3,6 @@
 import pytest
 
 from crossgrad_core.config import ComponentChoice
-from crossgrad_core.defaults import METRICS_OF_0_1
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import Observer
 from crossgrad_core.registry.entries import entries, load
@@ -89,25 +88,7 @@ def test_a_step_to_stop_at_is_that_of_its_length(tmp_path):
 def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
     path = tmp_path / "config.yaml"
     path.write_text("steps: 40\nrevisions: [[10, 60]]\nplanned_seconds: 3.0\nseed: 1\n")
-    # A file with revisions and without `events` was written when schedules counted steps, one
-    # without `rate_factor` when rates did not follow the length, one without `lr_tail` when
-    # they did not fade, without `beta1` and `beta2` when they were the same for all lengths,
-    # without `growth`, `start`, `dropout` and `floaters` when nothing led growth, filled the start,
-    # was left out or removed, without `exposure` when there was none, without `resolution` when all
-    # pixels were drawn, and one without `metrics` by 0.1.
-    metrics = [{"name": name} for name in METRICS_OF_0_1.split("+")]
-    then = {"events": "steps", "rate_factor": 1.0, "lr_tail": 0.0, "metrics": metrics}
-    then |= {"growth": "free", "start": {"name": "sfm"}, "dropout": 0.0}
-    then |= {"beta1": 0.9, "beta2": 0.999}
-    then |= {
-        "floaters": "keep",
-        "position_lr": "extent",
-        "sh_start": 0.0,
-        "max_scale_ratio": 0.0,
-        "resolution": {"name": "full"},
-        "exposure": {"name": "none"},
-    }
-    expected = {"seconds": 5.0, "seed": 1, **then}
+    expected = {"seconds": 5.0, "seed": 1}
     assert merged(path, options, assignments) == expected
     kept = merged(path, {"seed": 2}, [])
     assert (kept["revisions"], kept["planned_seconds"]) == ([[10, 60]], 3.0)

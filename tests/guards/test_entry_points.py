@@ -17,8 +17,6 @@ SHELVES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
 OURS = [
     entry for slot in GROUPS for entry in registry.offers(slot) if entry.distribution == "crossgrad"
 ]
-#: What `crossgrad plugins new` copies, and no plugin of ours.
-TEMPLATES = "crossgrad_plugins.authoring.templates."
 COMMANDS_OF_OURS = [each for each in registry.offers(COMMANDS) if each.distribution == "crossgrad"]
 
 
@@ -56,7 +54,7 @@ def modules_of(package):
     spec = find_spec(package)
     places = spec.submodule_search_locations
     found = [info for info in pkgutil.walk_packages(places, f"{package}.") if not info.ispkg]
-    return [info.name for info in found if not info.name.startswith(TEMPLATES)]
+    return [info.name for info in found]
 
 
 def is_component(found):

@@ -54,7 +54,6 @@ HOMES = {
     "compiled or plain passes": (r"\bnative if .* else generic", {f"{CORE}/gradients/passes.py"}),
     "weights on a diagonal": (r"\[:, :: views \+ 1\]", {f"{CORE}/contract/gramian_operator.py"}),
     "a cast to a slot's type": (rf"cast\(\s*\"(type\[)?({'|'.join(SLOTS)})\b", set()),
-    "an edit that is none": (r"\bNoEdit\b", {f"{CORE}/registry/deprecations.py"}),
     "summed or separate gradients": (
         r"isinstance\([^)]*(Summed|Separate)Gradients",
         {f"{CORE}/contract/contexts.py"},

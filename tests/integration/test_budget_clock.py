@@ -1,7 +1,6 @@
 """Seconds of CPU beside those of the wall: what is counted, recorded and refused."""
 
 import json
-from math import isnan
 from types import SimpleNamespace
 
 import pytest
@@ -15,12 +14,11 @@ from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.run.checkpoint_io import _clock
 from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.results import machine
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.machine import WORTH_A_CALIBRATION, Machine, calibrated
-from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
+from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.session import totals
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import clock as clocks
@@ -144,20 +142,3 @@ def test_the_load_is_looked_at_once_in_a_second(monkeypatch):
     for _ in range(4):
         watch.crossgrad_step_end(record=None)
     assert watch.figures(1.0)["load"] == {"mean": 2.0, "max": 3.0}
-
-
-def test_a_table_of_before_goes_on_with_empty_cells(tmp_path):
-    columns = ("step", "views", "train_seconds", "cpu_seconds", "psnr")
-    old = "step,views,train_seconds,psnr\n5,10,1.5,20.0\n10,20,3.0,21.0\n15,30\n"
-    (tmp_path / "metrics.csv").write_text(old)
-    table = MetricsCsv.resume(tmp_path, columns, 10)
-    table.append({"step": 20, "views": 40, "train_seconds": 6.0, "cpu_seconds": 5.5, "psnr": 22.0})
-    rows = read_metrics(tmp_path)
-    assert [row["step"] for row in rows] == [5, 10, 20]
-    assert [row["cpu_seconds"] for row in rows] == [None, None, 5.5]
-    assert [row["psnr"] for row in rows] == [20.0, 21.0, 22.0]
-
-
-def test_a_checkpoint_of_before_does_not_know_its_cpu_seconds():
-    clock = _clock({"train": 3.0, "compile": 0.0, "load": 0.0, "evaluate": 0.0, "report": 0.0})
-    assert isnan(clock.cpu) and clock.train == 3.0

@@ -19,7 +19,7 @@ def test_runs_as_they_are_written(tmp_path, capsys):
     capsys.readouterr()
     assert ended("compare", str(tmp_path / "runs")) == 0
     printed = capsys.readouterr().out
-    assert "views=2 - views=1" in printed or "views=1 - views=2" in printed
+    assert "views=2  views=1" in printed or "views=1  views=2" in printed
     assert "one pair says nothing about noise" in printed
 
     folder = tmp_path / "runs" / "compare"

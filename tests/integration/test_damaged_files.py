@@ -14,10 +14,11 @@ from support.damage import DAMAGES, cases, command, files_of
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.tables import tables_of
+from crossgrad_plugins.compare.tables import csv_tables
 
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 #: Another scene file, photo or setting makes other results, and the command says so.
@@ -137,7 +138,7 @@ def compared_tables(folder):
     comparison = compared(read_runs([folder], skip_broken=False), Options())
     views = worst_views(comparison)
     with_pictures(comparison, views)
-    return tables_of(comparison, views)
+    return csv_tables(comparison, views)
 
 
 @THOROUGH

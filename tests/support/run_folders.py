@@ -65,6 +65,7 @@ class RunFolder:
                 "seed": self.seed,
                 "steps": self.steps,
                 "views_per_step": self.views_per_step,
+                "planned_seconds": self.planned,
                 **self.settings,
             }
         )
@@ -121,9 +122,6 @@ class RunFolder:
 
     def _summary(self, config: dict) -> dict:
         final = self.figures(1.0)
-        notes = [self.photos]
-        if self.planned is not None:
-            notes.append(f"{self.steps} steps planned for {self.planned:g} s: 12 probed steps")
         views = self.steps * self.views_per_step
         summary = {
             "status": self.status,
@@ -149,7 +147,7 @@ class RunFolder:
                 "phases": {name: share * self.seconds for name, share in PHASES.items()},
             },
             "seed": self.seed,
-            "notes": notes,
+            "notes": [self.photos],
             "definitions": {**DEFINITIONS, **self.definitions},
             "environment": {**ENVIRONMENT, **self.environment},
             "config": config,

@@ -6,13 +6,13 @@ from typing import Any, Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.file_version import NOTES, marked, unmarked
+from crossgrad_core.run.config_version import NOTES, marked, unmarked
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 from crossgrad_core.wording import listed
 
 FILE = "config.yaml"
-#: Settings of every run of every version.
+#: Settings of every run.
 _ALWAYS: Final = ("scene", "seed")
 
 
@@ -24,10 +24,10 @@ def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> 
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The settings in a run's config.yaml, as this version has them.
+    """Return the settings in a run's config.yaml.
 
     Raises:
-        UserError: There is none, so it is not the folder of a run, it is damaged, or of a newer
+        UserError: There is none, so it is not the folder of a run, it is damaged, or of another
             version.
     """
     path = folder / FILE
@@ -51,7 +51,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_notes(folder: Path) -> tuple[str, ...]:
-    """What a run noted at its start; nothing where it is of an earlier version."""
+    """Return the notes that a run wrote at its start."""
     notes = _content(folder).get(NOTES)
     return tuple(map(str, notes)) if isinstance(notes, list) else ()
 

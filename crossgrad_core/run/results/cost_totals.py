@@ -15,8 +15,7 @@ class Totals:
         primitives: Number of primitives.
         peak_memory_mib: Peak memory, MiB; None where the system does not say.
         loss: Mean photometric loss of the last step, None before the first.
-        cpu_seconds: CPU seconds of the process in the training seconds, all threads together; None
-            where they were not counted.
+        cpu_seconds: CPU seconds of the process in the training seconds, all threads together.
         peak_primitives: The most primitives that there were after a step; None where unknown.
     """
 
@@ -27,5 +26,5 @@ class Totals:
     primitives: int
     peak_memory_mib: float | None
     loss: float | None
-    cpu_seconds: float | None = None
+    cpu_seconds: float = 0.0
     peak_primitives: int | None = None

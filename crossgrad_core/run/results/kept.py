@@ -6,7 +6,7 @@ from typing import Any, Final, cast
 
 from crossgrad_core.contract.state import Json
 from crossgrad_core.run.changeable_settings import CHANGEABLE
-from crossgrad_core.run.file_version import NOTES
+from crossgrad_core.run.config_version import NOTES
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.run.results.plan_file import FILE as PLAN
@@ -44,7 +44,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     texts = scalars.get(KEY) or {}
     for name in (METRICS, PLAN):
         if name not in texts:
-            continue  # There was none, or the checkpoint is of an earlier version.
+            continue  # There was none when the checkpoint was written.
         content = texts[name].encode()
         found = _content(folder / name)
         if found == content:

@@ -21,8 +21,6 @@ Row: TypeAlias = dict[str, int | float | None]
 
 _FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
-#: Columns that tables of earlier versions lack.
-_LATER = frozenset({"cpu_seconds"})
 _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 
 
@@ -75,7 +73,7 @@ class MetricsCsv:
         if not path.is_file():
             return cls.create(folder, columns)
         table = cls(path, columns)
-        lines = _with_later_columns(_lines(path), columns)
+        lines = _lines(path)
         if not lines or tuple(lines[0]) != table.columns:
             raise UserError(
                 "cannot continue the table of another run",
@@ -151,15 +149,6 @@ def _is_step(number: float | None) -> bool:
 
 def _unreadable(path: Path, found: str) -> UserError:
     return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
-
-
-def _with_later_columns(lines: list[list[str]], columns: tuple[str, ...]) -> list[list[str]]:
-    """The lines of a table of an earlier version with empty cells in the columns that it lacks."""
-    if not lines or tuple(lines[0]) != tuple(name for name in columns if name not in _LATER):
-        return lines
-    whole = [line for line in lines[1:] if len(line) == len(lines[0])]
-    known = [dict(zip(lines[0], line, strict=True)) for line in whole]
-    return [list(columns), *([line.get(name, "") for name in columns] for line in known)]
 
 
 def _append(path: Path, content: bytes) -> None:

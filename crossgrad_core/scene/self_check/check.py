@@ -8,11 +8,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Final
 
-from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.state import Json
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photo_check import fits
-from crossgrad_core.scene.self_check.findings import Sketch, findings_of, sketch_of
+from crossgrad_core.scene.self_check.evidence import Pixels, pixels_of
+from crossgrad_core.scene.self_check.findings import findings_of
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
@@ -34,19 +35,19 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
         UserError: The scene disagrees as a whole.
     """
     begun = perf_counter()
-    views = _looked_at(scene, cache_mib)
+    pixels = pixels_of(scene)
     _LOG.info("checking points, poses and photos against each other")
-    sketched = {view: sketch for view in views if (sketch := _sketch(scene.views[view]))}
-    undecoded = [scene.views[view].name for view in views if view not in sketched]
-    views, sketches = [*sketched], [*sketched.values()]
+    looked_at = _looked_at(scene, cache_mib)
+    views = [view for view in looked_at if _is_decoded(pixels, view)]
+    undecoded = [scene.views[view].name for view in looked_at if view not in {*views}]
     names = [scene.views[view].name for view in views]
-    verdict = verdict_of(scene, views)
+    verdict = verdict_of(scene, views, pixels)
     if verdict.all_wrong is not None and not accept:
         raise _refusal(verdict, verdict.all_wrong, path)
     warnings = tuple(_warnings(scene, verdict, undecoded))
     for warning in warnings:
         _LOG.warning("%s", warning)
-    notes = (*warnings, *findings_of(scene, sketches, names))
+    notes = (*warnings, *findings_of(scene, [pixels(view)[0] for view in views], names))
     figures: dict[str, Json] = {
         "seconds": round(perf_counter() - begun, 3),
         **_figures(verdict),
@@ -58,12 +59,13 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
     return replace(scene, notes=(*scene.notes, *notes), check=figures)
 
 
-def _sketch(view: View) -> Sketch | None:
-    """The sketch of a photo; None if it cannot be decoded, which is reported when it is needed."""
+def _is_decoded(pixels: Pixels, view: int) -> bool:
+    """Decode a photo. If it cannot be decoded, return False; who needs the photo reports why."""
     try:
-        return sketch_of(view.photo.image().numpy())
+        pixels(view)
     except UserError:
-        return None
+        return False
+    return True
 
 
 def _looked_at(scene: Scene, cache_mib: int) -> Sequence[int]:

@@ -29,7 +29,9 @@ _IN_A_CELL, _CELLS = 6, 64
 FLAT: Final = 4.0
 
 Booleans: TypeAlias = NDArray[np.bool_]
-Pixels: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
+Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
+#: Decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool if only some pixels count.
+Pixels: TypeAlias = Callable[[int], Photo]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +44,12 @@ class Agreement:
         inside: [V] points whose colours were compared.
         correlation: [V] of the colours of points and photo; NaN where it cannot be told.
         spread: [V] standard deviation of the points' colours, levels of 255.
-        stops: [V] how much brighter the photo is than its points, in stops; NaN as above.
     """
 
     share: Floats
     inside: Integers
     correlation: Floats
     spread: Floats
-    stops: Floats
 
     @property
     def noise(self) -> Floats:
@@ -62,31 +62,34 @@ class Evidence:
     """The points that are looked at, and the photos.
 
     Attributes:
-        pixels: Decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool where pixels count.
+        pixels: Decodes the photo of a view.
         rig: The cameras that are looked at.
         rows: [V, N] rows of points for each camera, -1 where there are fewer.
         colors: [P, 3] colours of points; None takes those of the other photos of each point.
         tracked: Whether rows are observations; else points may be hidden or out of frame.
     """
 
-    pixels: Callable[[int], Pixels]
+    pixels: Pixels
     rig: Rig
     rows: Integers
     colors: NDArray[np.uint8] | None
     tracked: bool
 
     def chosen(self, cameras: Integers) -> "Evidence":
-        """The evidence of some cameras, whose photos are kept in memory from now on."""
-        return replace(
-            self,
-            pixels=cache(self.pixels),
-            rig=self.rig.chosen(cameras),
-            rows=self.rows[cameras, :MOST_TRIED],
-        )
+        """The evidence of some cameras."""
+        rows = self.rows[cameras, :MOST_TRIED]
+        return replace(self, rig=self.rig.chosen(cameras), rows=rows)
 
     def of_photos(self) -> "Evidence":
         """The same with the colours of points as the other photos show them."""
         return replace(self, colors=None)
+
+    def sees_nothing(self, cameras: Integers) -> Booleans:
+        """Return for each of some cameras whether none of all points is in its frame."""
+        rows = np.broadcast_to(np.arange(len(self.rig.points)), (1, len(self.rig.points)))
+        return np.array(
+            [not self.rig.chosen([camera]).project(rows)[2].any() for camera in cameras], dtype=bool
+        )
 
     @property
     def colored(self) -> bool:
@@ -104,47 +107,59 @@ class Evidence:
             inside &= _unhidden(shares, depth, inside)
         counts, framed = known.sum(axis=1), inside.sum(axis=1)
         share = np.divide(framed, counts, out=np.full(len(counts), np.nan), where=counts > 0)
-        shown, counting = self._shown(rig.photos, shares, inside)
-        inside[inside] = counting
-        cameras, columns = np.nonzero(inside)
-        rows, shown = self.rows[cameras, columns], shown[counting]
+        shown = self._shown(rig.photos, shares, inside)
         if self.colors is not None:
-            return _compared(share, cameras, shown, self.colors[rows].astype(np.float64))
+            expected = self.colors.take(self.rows, axis=0).astype(np.float64)
+            return _compared(share, inside, shown, expected)
+        rows = self.rows[inside]
         times = np.bincount(rows)[rows]
-        several = times > 1
-        expected = np.stack([np.bincount(rows, each)[rows] for each in shown.T], axis=-1) - shown
-        expected /= np.maximum(times - 1, 1)[:, None]
-        found = _compared(share, cameras[several], shown[several], expected[several])
+        sums = np.stack([np.bincount(rows, each)[rows] for each in shown[inside].T], axis=-1)
+        expected = np.zeros_like(shown)
+        expected[inside] = (sums - shown[inside]) / np.maximum(times - 1, 1)[:, None]
+        inside[inside] = times > 1
+        found = _compared(share, inside, shown, expected)
         few = found.inside < FEWEST_OF_PHOTOS
         return replace(found, correlation=np.where(few, np.nan, found.correlation))
 
-    def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> tuple[Floats, Booleans]:
-        """[O, 3] colours of the photos where they show the points inside; whether they count."""
-        numbers = inside.sum(axis=1)
-        places = shares[inside]
-        shown = np.empty((len(places), 3))
-        counting = np.ones(len(places), dtype=np.bool_)
-        end = 0
-        for photo, number in zip(photos, numbers, strict=True):
-            if not number:
-                continue
-            part = np.s_[end : end + number]
-            end += number
-            image, mask = self.pixels(int(photo))
+    def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> Floats:
+        """[V, N, 3] colours of the photos at the points inside; masked pixels are not inside."""
+        photo_of = np.repeat(photos, inside.sum(axis=1))
+        order = np.argsort(photo_of, kind="stable")
+        at = np.flatnonzero(inside)[order]
+        across, down = shares.reshape(2, -1).take(at, axis=1)
+        several, starts = np.unique(photo_of[order], return_index=True)
+        ends = np.append(starts, len(at))[1:]
+        shown = np.zeros((inside.size, 3))
+        for photo, start, end in zip(several.tolist(), starts, ends, strict=True):
+            image, mask = self.pixels(photo)
             height, width = image.shape[:2]
-            right, down = (places[part] * [width, height]).astype(np.int64).T
-            shown[part] = image[down, right]
+            rows = (down[start:end] * height).astype(np.int64)
+            pixels = rows * width + (across[start:end] * width).astype(np.int64)
+            shown[at[start:end]] = image.reshape(-1, 3).take(pixels, axis=0)
             if mask is not None:
-                counting[part] = mask[down, right]
-        return shown, counting
+                inside.flat[at[start:end]] = mask.reshape(-1).take(pixels)
+        return shown.reshape(*inside.shape, 3)
 
 
-def observed(scene: Scene, views: Integers) -> Evidence:
+def pixels_of(scene: Scene) -> Pixels:
+    """Decodes the photos of a scene, and keeps them."""
+
+    @cache
+    def decoded(view: int) -> Photo:
+        photo = scene.views[view].photo
+        mask = photo.mask()
+        return photo.image().numpy(), None if mask is None else mask.numpy()
+
+    return decoded
+
+
+def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
     """The points that some views observed: of many those that other photos are looked at for, too.
 
     Args:
         scene: The scene.
         views: Rows of the views.
+        pixels: Decodes their photos.
     """
     rank = np.random.default_rng(0).permutation(len(scene.points))
     rows = np.full((len(views), MOST_OBSERVED), -1)
@@ -152,33 +167,24 @@ def observed(scene: Scene, views: Integers) -> Evidence:
         seen = scene.views[view].seen
         if len(seen) > MOST_OBSERVED:
             first = len(rank) * MOST_OBSERVED / len(seen)
-            seen = seen[rank[seen] < first][:MOST_OBSERVED]
+            seen = seen.take(np.flatnonzero(rank.take(seen) < first)[:MOST_OBSERVED])
         rows[place, : len(seen)] = seen
-    return _evidence(scene, views, rows, tracked=True)
+    return Evidence(pixels, Rig.of(scene).chosen(views), rows, scene.point_colors, tracked=True)
 
 
-def tested(scene: Scene, views: Integers, most: int) -> Evidence:
+def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence:
     """Some points for each of some views without tracks: those in frame that none hides count.
 
     Args:
         scene: The scene.
         views: Rows of the views.
+        pixels: Decodes their photos.
         most: Points of all views together.
     """
     number, total = max(most // len(views), _TESTED), len(scene.points)
     some = np.random.default_rng(0).choice(total, min(number, total), replace=False)
     rows = np.broadcast_to(some, (len(views), len(some)))
-    return _evidence(scene, views, rows, tracked=False)
-
-
-def _evidence(scene: Scene, views: Integers, rows: Integers, *, tracked: bool) -> Evidence:
-    def pixels(view: int) -> Pixels:
-        photo = scene.views[view].photo
-        mask = photo.mask()
-        return photo.image().numpy(), None if mask is None else mask.numpy()
-
-    rig = Rig.of(scene).chosen(views)
-    return Evidence(pixels, rig, rows, scene.point_colors, tracked)
+    return Evidence(pixels, Rig.of(scene).chosen(views), rows, scene.point_colors, tracked=False)
 
 
 def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
@@ -186,8 +192,8 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
     cameras = len(depth)
     cells = np.clip(np.sqrt(inside.sum(axis=1) / _IN_A_CELL), 1, _CELLS).astype(np.int64)
     across, down = (
-        np.clip((shares[..., axis] * cells[:, None]).astype(np.int64), 0, cells[:, None] - 1)
-        for axis in (0, 1)
+        np.clip((share * cells[:, None]).astype(np.int64), 0, cells[:, None] - 1)
+        for share in shares
     )
     cell = (np.arange(cameras)[:, None] * _CELLS + down) * _CELLS + across
     nearest = np.full(cameras * _CELLS**2, np.inf)
@@ -195,25 +201,24 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
     return np.asarray(depth <= _HIDES * nearest[cell])
 
 
-def _compared(share: Floats, cameras: Integers, shown: Floats, expected: Floats) -> Agreement:
-    """The agreement of [O] observations of cameras, by their colours [O, 3]."""
-    total = len(share)
-    number = np.bincount(cameras, minlength=total)
+def _compared(share: Floats, inside: Booleans, shown: Floats, expected: Floats) -> Agreement:
+    """The agreement of cameras, by the colours [V, N, 3] of the points inside."""
+    number = inside.sum(axis=1)
     divisor = np.maximum(number, 1)
 
-    def summed(values: Floats) -> Floats:
-        return np.asarray(np.bincount(cameras, values, total))
+    def centered(colors: Floats) -> Floats:
+        colors = colors * inside[..., None]
+        means = np.einsum("vnc->vc", colors) / divisor[:, None]
+        return np.asarray((colors - means[:, None]) * inside[..., None])
 
-    def centered(values: Floats) -> tuple[Floats, Floats]:
-        means = np.stack([summed(channel) for channel in values.T], axis=-1) / divisor[:, None]
-        return means.mean(axis=1), values - means[cameras]
+    def products(first: Floats, second: Floats) -> Floats:
+        return np.asarray(np.einsum("vnc,vnc->v", first, second))
 
-    (light, off), (light_expected, off_expected) = centered(shown), centered(expected)
-    squares = summed((off**2).sum(axis=1)), summed((off_expected**2).sum(axis=1))
+    off, off_expected = centered(shown), centered(expected)
+    squares = products(off, off), products(off_expected, off_expected)
     spread = [np.sqrt(each / (3.0 * divisor)) for each in squares]
     told = (number >= FEWEST) & (np.minimum(*spread) >= FLAT)
-    product = summed((off * off_expected).sum(axis=1))
-    correlation = np.full(total, np.nan)
+    correlation = np.full(len(number), np.nan)
+    product = products(off, off_expected)
     correlation[told] = product[told] / np.sqrt(squares[0][told] * squares[1][told])
-    stops = np.where(told, 2.2 * np.log2((light + 1.0) / (light_expected + 1.0)), np.nan)
-    return Agreement(share, number, correlation, np.asarray(spread[1]), stops)
+    return Agreement(share, number, correlation, spread[1])

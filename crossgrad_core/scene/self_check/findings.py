@@ -1,7 +1,7 @@
 """Notes on equal poses, far points, and photos that are equal, blurred, dark or bright."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.scene.frame import camera_centers
-from crossgrad_core.scene.self_check.rig import Floats
+from crossgrad_core.scene.self_check.rig import Floats, Integers
 from crossgrad_core.scene.wording import count, name_some
 
 #: Poses are equal below this difference of their numbers, local units.
@@ -20,8 +20,6 @@ _INFINITE: Final = 1e4
 _SMALL: Final = 16
 #: Mean difference in levels of 255 below which two photos are almost equal.
 _ALMOST: Final = 0.5
-#: Rows of a photo that sharpness is measured in.
-_ROWS: Final = 6
 #: A photo is blurred below this share of the usual sharpness, and dark or bright beyond so many
 #: stops from the usual brightness.
 _BLURRED: Final = 0.15
@@ -32,45 +30,56 @@ _FEWEST_PHOTOS: Final = 5
 _APART: Final = 6
 
 
-@dataclass(frozen=True, eq=False)
-class Sketch:
-    """A photo as far as photos are compared with each other.
+class Sketches:
+    """Photos as far as they are compared with each other: pixels on a grid.
+
+    Args:
+        images: [H, W, 3] photos.
 
     Attributes:
-        small: [16, 16, 3] some of its pixels, levels of 255.
-        sharpness: Differences between neighbours over differences between pixels farther apart.
-        light: Mean level of its pixels, 0 to 255.
+        small: [V, 16, 16, 3] pixels, levels of 255.
+        sharpness: [V] differences between neighbours over differences between pixels farther apart;
+            NaN if those hardly differ.
+        light: [V] mean level of the pixels, 0 to 255.
     """
 
-    small: NDArray[np.float32]
-    sharpness: float
-    light: float
+    def __init__(self, images: Sequence[NDArray[np.uint8]]) -> None:
+        chosen = [image.reshape(-1, 3).take(_grid(*image.shape[:2]), axis=0) for image in images]
+        at, near, far = np.stack(chosen, axis=1).astype(np.float32)
+        self.small: NDArray[np.float32] = at
+        apart = np.abs(far - at).mean(axis=(1, 2, 3))
+        unlike = np.abs(near - at).mean(axis=(1, 2, 3))
+        self.sharpness = np.where(apart > 1.0, unlike / np.maximum(apart, 1.0), np.nan)
+        self.light = at.mean(axis=(1, 2, 3))
 
 
-def sketch_of(image: NDArray[np.uint8]) -> Sketch:
-    """The sketch of a photo [H, W, 3]."""
-    height, width = image.shape[:2]
-    down = (np.arange(_SMALL) + 0.5) * height / _SMALL
-    right = (np.arange(_SMALL) + 0.5) * width / _SMALL
-    small = image[down.astype(np.int64)[:, None], right.astype(np.int64)].astype(np.float32)
-    rows = image[:: max(1, height // _ROWS), :, 1].astype(np.int16)
-    near = np.abs(rows[:, 1:] - rows[:, :-1]).mean()
-    far = np.abs(rows[:, _APART:] - rows[:, :-_APART]).mean() if width > 2 * _APART else 0.0
-    return Sketch(small, float(near / far) if far > 1.0 else np.nan, float(small.mean()))
+@cache
+def _grid(height: int, width: int) -> Integers:
+    """Numbers of [3, 16, 16] pixels: on a grid, next to it, and farther to the right."""
+    shares = (np.arange(_SMALL) + 0.5) / _SMALL
+    down = (shares * height).astype(np.int64)
+    right = (shares * max(width - _APART, 1)).astype(np.int64)
+    columns = np.minimum(right + np.array([0, 1, _APART])[:, None], width - 1)
+    return np.asarray(down[:, None] * width + columns[:, None])
 
 
-def findings_of(scene: Scene, sketches: Sequence[Sketch], names: Sequence[str]) -> Iterator[str]:
+def findings_of(
+    scene: Scene, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
+) -> Iterator[str]:
     """Notes on a scene.
 
     Args:
         scene: The scene.
-        sketches: Photos that were looked at.
+        images: [H, W, 3] photos that were looked at.
         names: Their names.
     """
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
     yield from _equal_poses(poses, [view.name for view in scene.views])
     yield from _far_points(scene.points, camera_centers(poses))
-    if len(sketches) >= _FEWEST_PHOTOS:
+    if not images:
+        return
+    sketches = Sketches(images)
+    if len(images) >= _FEWEST_PHOTOS:
         yield from _unusual(sketches, names)
     yield from _almost_equal(sketches, names)
 
@@ -92,9 +101,9 @@ def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
         yield f"check: {count(far, 'point')} practically at infinity"
 
 
-def _unusual(sketches: Sequence[Sketch], names: Sequence[str]) -> Iterator[str]:
-    sharpness = np.array([each.sharpness for each in sketches])
-    light = np.log2(np.array([each.light for each in sketches]) + 1.0) * 2.2
+def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
+    sharpness = sketches.sharpness
+    light = np.log2(sketches.light + 1.0) * 2.2
     known = np.isfinite(sharpness)
     if known.any():
         low = known & (sharpness < _BLURRED * np.median(sharpness[known]))
@@ -105,10 +114,8 @@ def _unusual(sketches: Sequence[Sketch], names: Sequence[str]) -> Iterator[str]:
         yield f"check: {_listed(off, names)} much darker or brighter than the others"
 
 
-def _almost_equal(sketches: Sequence[Sketch], names: Sequence[str]) -> Iterator[str]:
-    if not sketches:
-        return
-    smalls = np.stack([each.small for each in sketches]).reshape(len(sketches), -1)
+def _almost_equal(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
+    smalls = sketches.small.reshape(len(names), -1)
     textured = smalls.std(axis=1) > 1.0
     order = np.argsort(smalls.mean(axis=1))
     order = order[textured[order]]

@@ -99,16 +99,18 @@ class Rig:
             rows: [V, N] rows of points for each camera.
 
         Returns:
-            [V, N, 2] places in the photo as shares of its width and height, [V, N] depths, and
+            [2, V, N] places in the photo as shares of its width and height, [V, N] depths, and
             [V, N] whether the point is in front of the camera and in its frame.
         """
-        local = self.points[rows] @ self.rotations.transpose(0, 2, 1) + self.translations[:, None]
-        depth = local[..., 2]
+        local = self.rotations @ self.points.take(rows, axis=0).transpose(0, 2, 1)
+        x, y, depth = local.transpose(1, 0, 2) + self.translations.T[:, :, None]
         front = depth > 0.0
         inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=front)
-        pixels = self.focal[:, None] * local[..., :2] * inverse[..., None] + self.principal[:, None]
-        shares = pixels / self.sizes[:, None]
-        inside = front & ((shares >= 0.0) & (shares < 1.0)).all(axis=-1)
+        focal, principal = (
+            (each / self.sizes).T[:, :, None] for each in (self.focal, self.principal)
+        )
+        across, down = shares = focal * np.stack([x * inverse, y * inverse]) + principal
+        inside = front & (across >= 0.0) & (across < 1.0) & (down >= 0.0) & (down < 1.0)
         if self.turn is not UPRIGHT:
-            shares = (shares - 0.5) @ self.turn.T + 0.5
+            shares = np.tensordot(self.turn, shares - 0.5, axes=1) + 0.5
         return shares, depth, inside

@@ -2,31 +2,29 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.scene.self_check.diagnosis import REPAIRED, Bench, Diagnosis, scores, some
+from crossgrad_core.scene.self_check.diagnosis import LEAST, Bench, Diagnosis, scores, some
 from crossgrad_core.scene.self_check.evidence import (
     FEWEST,
     Agreement,
     Booleans,
     Evidence,
+    Pixels,
     observed,
     tested,
 )
 from crossgrad_core.scene.self_check.rig import Floats, Integers
 from crossgrad_core.scene.self_check.trials import Trial, likely, turns
 
-#: The scene disagrees as a whole if its better photos correlate with the points by less ...
-_LEAST: Final = 0.35
-#: ... or if more of its photos disagree.
+#: The scene disagrees as a whole if more of its photos disagree.
 _MOST_BAD: Final = 0.6
-#: A photo disagrees below this share of the correlation of the better photos, if its points also
-#: have this many times the usual deviation from the colours that the photo predicts.
+#: A photo disagrees below this share of the correlation of the better photos.
 _BAD: Final = 0.33
-_NOISY: Final = 1.5
 #: Share of observed points in frame below which the pose of a photo is wrong.
 _IN_FRAME: Final = 0.5
 #: A photo below this share of the correlation of the better photos is tried out, and another photo
@@ -42,6 +40,8 @@ _FITS: Final = 0.7
 _FEW: Final = 2
 #: Points in frame of a photo that is compared with others, or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
+#: Standard errors by which the correlation of a photo without tracks is below that bound.
+_ERRORS: Final = 3.0
 #: Points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
 #: The better photos: the upper quartile.
@@ -103,8 +103,13 @@ _UNRELATED: Final = (
 _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
 
-def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
+def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
     """The outcome for some views of a scene.
+
+    Args:
+        scene: The scene.
+        views: Rows of the views.
+        pixels: Decodes their photos.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -118,8 +123,8 @@ def verdict_of(scene: Scene, views: Sequence[int]) -> Verdict:
     # Beside photos with tracks, points that may be hidden say too little about single photos.
     if has_tracks.any():
         rows = rows[has_tracks]
-        return _Group.of(observed(scene, rows), rows).verdict()
-    return _Group.of(tested(scene, rows, _MOST_TESTED), rows).verdict()
+        return _Group.of(observed(scene, rows, pixels), rows).verdict()
+    return _Group.of(tested(scene, rows, pixels, _MOST_TESTED), rows).verdict()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +153,7 @@ class _Group:
         evidence = self.evidence.of_photos()
         return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
-    @property
+    @cached_property
     def better(self) -> float:
         """The correlation of the better photos; 0 if no photo has one."""
         known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
@@ -159,22 +164,31 @@ class _Group:
         """[V] photos about which something can be said."""
         return np.isfinite(self.agreement.correlation) | self._out
 
-    @property
+    @cached_property
     def _out(self) -> Booleans:
-        """[V] photos that have most of their observed points out of frame."""
-        if not self.evidence.tracked:
-            return np.zeros(len(self.views), dtype=np.bool_)
-        return np.asarray(self.agreement.share < _IN_FRAME)
+        """[V] photos with most of their observed points, or all points, out of frame."""
+        if self.evidence.tracked:
+            return np.asarray(self.agreement.share < _IN_FRAME)
+        out = self.agreement.share == 0.0
+        out[out] = self.evidence.sees_nothing(np.flatnonzero(out))
+        return np.asarray(out)
 
+    @cached_property
     def bad(self) -> Booleans:
-        """[V] photos that disagree."""
+        """[V] photos that disagree: a low correlation, and points unlike the photo's colours."""
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
         usual = float(np.median(noise[good])) if good.any() else 0.0
-        # Colours that a few other photos show say too little about a single photo.
-        unlike = low & (np.nan_to_num(noise) > _NOISY * usual) & (not self.recolored)
-        return unlike | (self._out & (np.nan_to_num(correlation) < _BAD * self.better))
+        # Halfway between the noise of photos that agree and that of photos of something else.
+        unlike = low & (np.nan_to_num(noise) > usual * (1.0 - min(self.better, 0.99) ** 2) ** -0.25)
+        if self.recolored:  # Colours that a few other photos show say too little.
+            unlike[:] = False
+        if not self.evidence.tracked:
+            error = 1.0 / np.sqrt(np.maximum(self.agreement.inside, 1))
+            unlike &= correlation + _ERRORS * error < _BAD * self.better
+        out = self._out & (np.nan_to_num(correlation) < _BAD * self.better)
+        return np.asarray(unlike | out)
 
     def verdict(self) -> Verdict:
         """The outcome for these photos."""
@@ -192,8 +206,8 @@ class _Group:
             if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
             return replace(verdict, notes=("colours of points and photos cannot be compared",))
-        bad = self.bad()
-        if self.better < _LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < _LEAST:
+        bad = self.bad
+        if self.better < LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < LEAST:
             return self._as_a_whole(verdict)
         found = self._of_all(np.flatnonzero(self.told & ~bad))
         if found is not None:
@@ -236,14 +250,14 @@ class _Group:
 
     def _unexplained(self, verdict: Verdict) -> Verdict:
         """The outcome if most photos disagree and nothing that was tried repairs it."""
-        if self.better >= _LEAST:
+        if self.better >= LEAST:
             return replace(verdict, some_wrong=self.suspects())
         unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
-        if self._out.mean() > _MOST_BAD:
+        if self.evidence.tracked and self._out.mean() > _MOST_BAD:
             return replace(verdict, all_wrong=unrelated)
         if self.evidence.tracked and not self.recolored:
             other = self.by_photos()
-            if other.better >= _LEAST or not np.isfinite(other.agreement.correlation).any():
+            if other.better >= LEAST or not np.isfinite(other.agreement.correlation).any():
                 return other.verdict()
             return replace(verdict, all_wrong=unrelated)
         note = "colours of points and photos are unlike, so that nothing can be said"
@@ -251,13 +265,13 @@ class _Group:
 
     def suspects(self) -> tuple[Cause, ...]:
         """Why single photos disagree."""
-        bad, correlation = self.bad(), self.agreement.correlation
+        bad, correlation = self.bad, self.agreement.correlation
         if self.recolored:
             rows = np.flatnonzero(bad)
             return (Cause(self._named(rows), *_STRANGE),) if len(rows) else ()
         tried = bad | (np.nan_to_num(correlation, nan=1.0) < _SUSPECT * self.better)
         if not self.evidence.tracked:
-            tried &= self.agreement.inside >= _FEWEST_TESTED
+            tried &= self._out | (self.agreement.inside >= _FEWEST_TESTED)
         rows = np.flatnonzero(tried)[:_MOST_SUSPECTS]
         if not len(rows):
             return ()
@@ -271,7 +285,7 @@ class _Group:
         if common is not None:
             causes.append(common)
         left = np.setdiff1d(left, repaired)
-        if self.evidence.tracked and len(left := left[bad[left]]):
+        if len(left := left[bad[left]]):
             causes.append(Cause(self._named(left), *_STRANGE))
         return tuple(causes)
 
@@ -311,7 +325,7 @@ class _Group:
     @property
     def _fitting(self) -> float:
         """The score of a photo that fits."""
-        return max(_FITS * self.better, REPAIRED)
+        return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:
         """Those of some cameras that fit the photo of another one, of some candidates."""

@@ -28,28 +28,33 @@ def form(matrix: Matrix, x: Sequence[Number]) -> Number:
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
-    """Solution x of (M x)_S = right_S, zero outside the support S; None where M_SS is singular."""
+    """Solution x of (M x)_S = right_S, zero outside the support S; None where M_SS is singular.
+
+    M is positive semi-definite. The solution is that of Cholesky's method, L D L^T = M_SS.
+    """
     mp = require_mpmath().mp
-    size = len(support)
     # In units of the diagonal, so that no ratio of norms looks singular.
-    unit = {i: mp.sqrt(matrix[i][i]) for i in support}
-    rows = [
-        [matrix[i][j] / unit[i] / unit[j] for j in support] + [right[i] / unit[i]] for i in support
-    ]
-    for column in range(size):
-        pivot = max(range(column, size), key=lambda r: abs(rows[r][column]))
-        if abs(rows[pivot][column]) <= mp.mpf(SINGULAR):
+    unit = [mp.sqrt(matrix[i][i]) for i in support]
+    lower: list[Vector] = []
+    diagonal: Vector = []
+    y: Vector = []
+    for i, row in enumerate(support):
+        scaled: Vector = []
+        for j in range(i):
+            entry = matrix[row][support[j]] / unit[i] / unit[j]
+            scaled.append(entry - dot(scaled, lower[j]))
+        lower.append([value / pivot for value, pivot in zip(scaled, diagonal, strict=True)])
+        pivot = 1 - dot(scaled, lower[i])
+        if pivot <= mp.mpf(SINGULAR):
             return None
-        rows[column], rows[pivot] = rows[pivot], rows[column]
-        for other in range(size):
-            if other != column and rows[other][column]:
-                factor = rows[other][column] / rows[column][column]
-                rows[other] = [
-                    a - factor * b for a, b in zip(rows[other], rows[column], strict=True)
-                ]
+        diagonal.append(pivot)
+        y.append(right[row] / unit[i] - dot(lower[i], y))
     x = [mp.mpf(0)] * len(matrix)
-    for place, i in enumerate(support):
-        x[i] = rows[place][size] / rows[place][place] / unit[i]
+    solved: Vector = []
+    for i in reversed(range(len(support))):
+        later = [lower[k][i] for k in range(len(support) - 1, i, -1)]
+        solved.append(y[i] / diagonal[i] - dot(later, solved))
+        x[support[i]] = solved[-1] / unit[i]
     return x
 
 
@@ -63,7 +68,7 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)
     active: set[int] = set()
-    for _ in range(50 * len(matrix)):
+    for _ in range(10 * len(matrix)):
         slack = [m + o for m, o in zip(apply(matrix, x), offset, strict=True)]
         tolerance = mp.mpf(SINGULAR) * max(1, *x)
         waiting = [i for i in range(len(matrix)) if i not in active]
@@ -103,3 +108,18 @@ def _settle(
         if not falling:
             return True
     return True
+
+
+def pivots(matrix: Matrix) -> Vector:
+    """Pivots of the Cholesky factor of a positive semi-definite matrix, the largest first."""
+    left = [list(row) for row in matrix]
+    found = []
+    while left:
+        k = max(range(len(left)), key=lambda i: left[i][i])
+        pivot, column = left[k][k], left[k]
+        if pivot <= 0:
+            break
+        found.append(pivot)
+        kept = [i for i in range(len(left)) if i != k]
+        left = [[left[i][j] - column[i] * column[j] / pivot for j in kept] for i in kept]
+    return found

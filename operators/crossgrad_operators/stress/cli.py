@@ -159,10 +159,11 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
 
 def _rows(names: Sequence[str], dtypes: Types, rows: str, csv: Path | None) -> bool:
     from crossgrad_operators.stress.search.repeat import read_rows, run_rows
-    from crossgrad_operators.stress.search.subject import subjects
+    from crossgrad_operators.stress.suite import subject_of
 
     chosen = [read_rows(rows, dtype) for dtype in dtypes]
-    return _table([cell for each in chosen for cell in run_rows(subjects(names), each)], csv)
+    subjects = [subject_of(name) for name in names]
+    return _table([cell for each in chosen for cell in run_rows(subjects, each)], csv)
 
 
 def _table(cells: "list[Cell]", csv: Path | None) -> bool:
@@ -179,11 +180,11 @@ def _search(
 ) -> bool:
     from crossgrad_operators.stress.search.loop import Extent, search
     from crossgrad_operators.stress.search.report import as_text, failed, write_csv
-    from crossgrad_operators.stress.search.subject import subjects
+    from crossgrad_operators.stress.suite import subject_of
 
     seed, seconds = extent
     wanted = Extent(seed=seed, seconds=seconds, dtypes=dtypes)
-    tallies = search(subjects(names), wanted, progress=_Clock().tick)
+    tallies = search([subject_of(name) for name in names], wanted, progress=_Clock().tick)
     typer.echo(as_text(tallies))
     if csv is not None:
         write_csv(tallies, csv)
@@ -194,11 +195,11 @@ def _matrices(
     names: Sequence[str], dtypes: Types, extent: tuple[int, int], csv: Path | None
 ) -> bool:
     from crossgrad_operators.stress.search.finite import as_text, run_finite, write_csv
-    from crossgrad_operators.stress.search.subject import subjects
+    from crossgrad_operators.stress.suite import subject_of
 
     seed, matrices = extent
     found, progress = [], Progress()
-    for subject in subjects(names):
+    for subject in [subject_of(name) for name in names]:
         progress.tell(subject.name)
         found.append(run_finite(subject, matrices, seed, dtypes))
     typer.echo(as_text(found))

@@ -1,7 +1,6 @@
 """Exact Gramians and norms as 50-digit numbers (mpmath, a test dependency)."""
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,8 +14,8 @@ Matrix: TypeAlias = list[list[Number]]
 
 DIGITS = 50
 
-#: Halves of a float64 that multiply without error (Dekker 1971).
-_SPLITTER = 2.0**27 + 1.0
+#: Binary digits that products of float64 numbers span: a sum of that precision is exact.
+_RANGE = 4300
 
 
 def require_mpmath() -> Any:  # noqa: ANN401 - untyped
@@ -33,6 +32,11 @@ def require_mpmath() -> Any:  # noqa: ANN401 - untyped
             todo='install it: pip install "crossgrad[test]"',
         ) from None
     return mpmath
+
+
+def number(value: object) -> Number:
+    """A 50-digit number."""
+    return require_mpmath().mp.mpf(value)
 
 
 def exact_gramian(case: Case) -> Matrix:
@@ -67,47 +71,8 @@ def _finite_rows(case: Case) -> tuple[Rows, Rows]:
 
 
 def _dot(a: Rows, b: Rows) -> Number:
-    """The dot product of two float64 vectors without any error worth mentioning.
-
-    Every product is split into float64 numbers that add up to it exactly, and these are added with
-    `math.fsum`, which rounds once; doing it again on what is left gives the next digits.
-    """
-    mpf = require_mpmath().mp.mpf
-    # Powers of two keep splitting and products inside the range of float64.
-    first, second = _scaled(a), _scaled(b)
-    terms = [term for term in _products(first[0], second[0]) if term]
-    total = mpf(0)
-    for _ in range(4):
-        part = _fsum(terms)
-        if not part:
-            break
-        total += mpf(part)
-        terms.append(-part)
-    return total * mpf(2) ** (first[1] + second[1])
-
-
-def _fsum(terms: Iterable[float]) -> float:
-    return math.fsum(terms)
-
-
-def _scaled(vector: Rows) -> tuple[Rows, int]:
-    largest = float(np.abs(vector).max(initial=0.0))
-    if largest == 0.0:
-        return vector, 0
-    exponent = int(math.frexp(largest)[1])
-    return np.ldexp(vector, -exponent), exponent
-
-
-def _products(a: Rows, b: Rows) -> list[float]:
-    """Float64 numbers that add up to sum a_i b_i exactly, short of underflow at 1e-308."""
-    product = a * b
-    a_high, b_high = _high(a), _high(b)
-    a_low, b_low = a - a_high, b - b_high
-    error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
-    return [*product.tolist(), *error.tolist()]
-
-
-def _high(x: Rows) -> Rows:
-    scaled = _SPLITTER * x
-    high: Rows = scaled - (scaled - x)
-    return high
+    """The dot product of two float64 vectors, rounded once."""
+    mp = require_mpmath().mp
+    with mp.workprec(_RANGE):
+        total = mp.fdot(zip(a.tolist(), b.tolist(), strict=True))
+    return +total

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from crossgrad_operators.stress.algebra import Vector, dot, form
-from crossgrad_operators.stress.exact import Matrix, Number, require_mpmath
+from crossgrad_operators.stress.exact import Matrix, Number, number, require_mpmath
 
 #: 1 + cos up to which two directions are exactly opposite.
 OPPOSITE = "1e-12"
@@ -52,11 +52,6 @@ class Question:
 
 #: [n] weights.
 Oracle = Callable[[Question], Vector]
-
-
-def number(value: object) -> Number:
-    """A 50-digit number."""
-    return require_mpmath().mp.mpf(value)
 
 
 def lengths(gramian: Matrix) -> Vector:

@@ -9,7 +9,7 @@ depend on each other) are those of independent gradients.
 from collections.abc import Sequence
 
 from crossgrad_operators.stress.algebra import Vector, apply, complementary, dot, form, solve
-from crossgrad_operators.stress.exact import Matrix, Number, require_mpmath
+from crossgrad_operators.stress.exact import Matrix, Number, number, require_mpmath
 from crossgrad_operators.stress.oracles import (
     OPPOSITE,
     Question,
@@ -17,7 +17,6 @@ from crossgrad_operators.stress.oracles import (
     cosines,
     is_noise,
     lengths,
-    number,
     zeros,
 )
 from crossgrad_operators.stress.solvers import UnprovenError

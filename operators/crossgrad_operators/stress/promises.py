@@ -1,23 +1,22 @@
-"""The promises of each operator, and the set on which they hold: the one place that says so.
+"""The accuracy that each operator promises, and the set of gradients on which it holds.
 
 Inside the set the relative error is at most `PROMISED` u kappa, u the unit roundoff of the
 gradients' type and kappa = max |w_k| |g_k| / |u|; outside the result is finite and at most a stated
 factor times the longest gradient. docs/operators.md repeats the words, and a test holds it to that.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import sqrt
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_operators.stress.search.numba_kernels.convex import shortest
-from crossgrad_operators.stress.search.numba_kernels.measure import pivots_of
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from crossgrad_operators.stress.algebra import form, pivots
+from crossgrad_operators.stress.exact import Matrix, number
+from crossgrad_operators.stress.polyhedra import shortest
 
 #: Relative error that is promised inside the set, in units of u kappa.
 PROMISED: Final = 8.0
@@ -30,7 +29,7 @@ DEPENDENT: Final = 1e-29
 INDEPENDENT: Final = 1e-13
 #: The same for methods that divide by every eigenvalue.
 REGULAR: Final = 1e-8
-#: What rounding may add to a bound of 1.
+#: The amount that rounding may add to a bound of 1.
 SLIGHTLY: Final = 1e-3
 #: Ratio of norms up to which CAGrad tells directions that cancel from others.
 COMPARABLE: Final = 1e8
@@ -40,140 +39,136 @@ APART: Final = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """The terms in which sets are stated: B Gramians, as norms and cosines, and exact answers.
+    """The terms in which sets are stated: the n gradients that are not zero, and the exact answer.
 
     Attributes:
-        norms: [B, K] lengths of the gradients, 0 where a view is not present.
-        directions: [B, K, K, 2] cosines in 32 digits.
-        present: [B, K].
-        weights: [B, K] exact weights, rounded.
-        length: [B] |u|.
+        norms: [n] lengths of the gradients.
+        cosines: [n][n] in 50 digits.
+        weights: [n] exact weights, rounded.
+        length: |u|.
         unit: Unit roundoff of the gradients' type.
     """
 
-    norms: Floats
-    directions: Floats
-    present: Flags
-    weights: Floats
-    length: Floats
+    norms: NDArray[np.float64]
+    cosines: Matrix
+    weights: NDArray[np.float64]
+    length: float
     unit: float
 
     @property
-    def cosines(self) -> Floats:
-        """[B, K, K]."""
-        return self.directions[..., 0]
+    def longest(self) -> float:
+        """Length of the longest gradient."""
+        return float(self.norms.max(initial=0.0))
 
     @property
-    def longest(self) -> Floats:
-        """[B] length of the longest gradient."""
-        return np.asarray(self.norms.max(axis=1, initial=0.0))
+    def largest(self) -> float:
+        """The length of the longest weighted gradient, max |w_k| |g_k|."""
+        return float(np.abs(self.weights * self.norms).max(initial=0.0))
 
     @property
-    def largest(self) -> Floats:
-        """[B] max |w_k| |g_k|."""
-        return np.asarray(np.abs(self.weights * self.norms).max(axis=1, initial=0.0))
+    def kappa(self) -> float:
+        """The condition max |w_k| |g_k| / |u|, at least 1; 0 where the exact result is zero."""
+        if not self.weights.any():
+            return 0.0
+        return max(self.largest / self.length, 1.0) if self.length else float("inf")
 
     @property
-    def kappa(self) -> Floats:
-        """[B] max |w_k| |g_k| / |u|, at least 1; 0 where the exact result is zero."""
-        zero = ~self.weights.any(axis=1)
-        with np.errstate(all="ignore"):
-            return np.where(zero, 0.0, np.maximum(self.largest / self.length, 1.0))
-
-    @property
-    def ratio(self) -> Floats:
-        """[B] the longest over the shortest gradient that is not zero."""
-        norms = np.where(self.present, self.norms, np.inf).min(axis=1, initial=np.inf)
-        return np.asarray(self.longest / norms)
+    def ratio(self) -> float:
+        """The longest over the shortest gradient."""
+        return self.longest / float(self.norms.min(initial=np.inf))
 
     @cached_property
-    def distance(self) -> Floats:
-        """[B] distance of zero from the convex hull of the directions g_k / |g_k|."""
-        norms = np.zeros((*self.norms.shape, 2))
-        norms[..., 0] = self.present
-        weights, _ = shortest(norms, np.ascontiguousarray(self.directions), self.present)
-        x = weights[..., 0]
-        square = np.einsum("bi,bij,bj->b", x, self.cosines, x)
-        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+    def distance(self) -> float:
+        """Distance of zero from the convex hull of the directions g_k / |g_k|.
+
+        Raises:
+            UnprovenError: The nearest point of the hull is not found.
+        """
+        if not self.cosines:
+            return 0.0
+        x = shortest(self.cosines, [number(1)] * len(self.cosines))
+        return sqrt(max(form(self.cosines, x), 0))
 
     @cached_property
-    def pivots(self) -> Floats:
-        """[B, K] those of the cosines' Cholesky factor, the largest first."""
-        return np.asarray(pivots_of(np.ascontiguousarray(self.directions)))
+    def dependence(self) -> list[float]:
+        """Pivots of the cosines' Cholesky factor, the largest first."""
+        return [float(pivot) for pivot in pivots(self.cosines)]
 
     @property
-    def sines(self) -> Floats:
-        """[B, K, K] 1 - cos^2 of pairs of gradients; 1 where one is not present."""
-        high, low = self.cosines, self.directions[..., 1]
-        # 1 - |cos| is exact in two numbers.
-        sign = np.where(high < 0, -1.0, 1.0)
-        return np.asarray(((1.0 - sign * high) - sign * low) * (1.0 + np.abs(high)))
+    def sines(self) -> list[float]:
+        """1 - cos^2 of all pairs of gradients."""
+        pairs = (row[j] for i, row in enumerate(self.cosines) for j in range(i))
+        return [float((1 - cosine) * (1 + cosine)) for cosine in pairs]
 
     @property
-    def partial(self) -> Floats:
-        """[B] |w_1 g_1 + w_2 g_2| + ... + |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
+    def partial(self) -> float:
+        """|w_1 g_1 + w_2 g_2| + ... + |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
 
-        What rounding of each product and of each addition comes to, at most, in units of u kappa.
+        The most that rounding of each product and of each addition adds, in units of u kappa.
         """
         # In units of the largest, whose square may be too much for float64.
-        unit = np.where(self.largest > 0, self.largest, 1.0)
-        terms = self.weights * self.norms / unit[:, None]
-        total = np.abs(terms).sum(axis=1)
-        for last in range(2, terms.shape[1] + 1):
-            x = terms[:, :last]
-            square = np.einsum("bi,bij,bj->b", x, self.cosines[:, :last, :last], x)
-            total += np.sqrt(np.maximum(square, 0.0))
-        return np.asarray(total / np.maximum(self.length / unit, 1.0))
+        unit = self.largest or 1.0
+        terms = self.weights * self.norms / unit
+        cosines = np.array(self.cosines, dtype=np.float64).reshape(len(terms), len(terms))
+        total = float(np.abs(terms).sum())
+        for last in range(2, len(terms) + 1):
+            x = terms[:last]
+            total += max(float(x @ cosines[:last, :last] @ x), 0.0) ** 0.5
+        return total / max(self.length / unit, 1.0)
 
 
-def usual_bound(facts: Facts) -> Floats:
+def usual_bound(facts: Facts) -> float:
     """Eight, or where the weighted sum alone may lose more, that and two for the weights."""
-    return np.maximum(PROMISED, facts.partial + 2.0)
+    return max(PROMISED, facts.partial + 2.0)
 
 
-def pairwise_bound(facts: Facts) -> Floats:
+def pairwise_bound(facts: Facts) -> float:
     """Twice that in float64, where the Gramians of pairs are as coarse as the gradients."""
     return usual_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
-def views_bound(facts: Facts) -> Floats:
+def views_bound(facts: Facts) -> float:
     """One per view, at least eight: sums of one sign never get shorter."""
-    return np.asarray(np.maximum(PROMISED, facts.present.sum(axis=1)))
+    return max(PROMISED, float(len(facts.norms)))
 
 
-def everywhere(facts: Facts) -> Flags:
+def everywhere(_facts: Facts) -> bool:
     """Every Gramian."""
-    return np.ones(len(facts.norms), np.bool_)
+    return True
 
 
-def determined(facts: Facts) -> Flags:
+def determined(facts: Facts) -> bool:
     """The result is zero, or kappa u is at most 0.1."""
-    return np.asarray(facts.kappa * facts.unit <= DETERMINED)
+    return facts.kappa * facts.unit <= DETERMINED
 
 
-def clear(facts: Facts) -> Flags:
+def clear(facts: Facts) -> bool:
     """As `determined`, and directions depend on each other exactly or not nearly."""
-    sines = facts.sines.reshape(len(facts.norms), -1)
-    squares = np.concatenate([facts.pivots, sines], axis=1)
-    nearly = (squares > DEPENDENT) & (squares < INDEPENDENT)
-    return np.asarray(determined(facts) & ~nearly.any(axis=1))
+    return determined(facts) and not _any_between(
+        [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
+    )
 
 
-def independent(facts: Facts) -> Flags:
+def independent(facts: Facts) -> bool:
     """As `determined`, and directions of more than two views do not nearly depend."""
-    nearly = (facts.pivots > DEPENDENT) & (facts.pivots < REGULAR)
-    several = facts.present.sum(axis=1) > 2  # noqa: PLR2004
-    return np.asarray(determined(facts) & ~(several & nearly.any(axis=1)))
+    several = len(facts.norms) > 2  # noqa: PLR2004
+    return determined(facts) and not (
+        several and _any_between(facts.dependence, DEPENDENT, REGULAR)
+    )
 
 
-def comparable(facts: Facts) -> Flags:
+def comparable(facts: Facts) -> bool:
     """As `clear`; where zero is in the hull of the directions the norms have ratios up to 1e8."""
-    return np.asarray(clear(facts) & ((facts.distance >= APART) | (facts.ratio <= COMPARABLE)))
+    return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 
-def hull_apart(facts: Facts) -> Flags:
+def hull_apart(facts: Facts) -> bool:
     """Zero is not near the hull of the directions."""
-    return np.asarray(facts.distance >= APART)
+    return facts.distance >= APART
+
+
+def _any_between(values: Sequence[float], low: float, high: float) -> bool:
+    return any(low < value < high for value in values)
 
 
 @dataclass(frozen=True)
@@ -184,17 +179,17 @@ class Promise:
         words: The set, in words and formula.
         factor_words: The factor as a formula.
         factor: |u| / (longest gradient) that is not exceeded outside the set, for K views.
-        inside: Facts -> [B] which Gramians belong to the set.
-        bound: Facts -> [B] error that is not exceeded inside, in units of u kappa.
-        continuous: Facts -> [B] where the method is continuous in the gradients.
+        inside: Facts -> whether the Gramian belongs to the set.
+        bound: Facts -> error that is not exceeded inside, in units of u kappa.
+        continuous: Facts -> whether the method is continuous in the gradients there.
     """
 
     words: str
     factor_words: str
     factor: Callable[[int], float]
-    inside: Callable[[Facts], Flags] = determined
-    bound: Callable[[Facts], Floats] = usual_bound
-    continuous: Callable[[Facts], Flags] = everywhere
+    inside: Callable[[Facts], bool] = determined
+    bound: Callable[[Facts], float] = usual_bound
+    continuous: Callable[[Facts], bool] = everywhere
 
 
 #: What is promised of an operator that nothing is stated for.
@@ -202,7 +197,7 @@ ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), e
 _DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
 _CLEAR: Final = (
     "of these, those whose directions depend on each other exactly or not nearly: no pivot of the "
-    "cosines' Cholesky factor (32 digits, largest first), and no 1 - cos^2 of a pair, lies between "
+    "cosines' Cholesky factor (50 digits, largest first), and no 1 - cos^2 of a pair, lies between "
     "1e-29 and 1e-13"
 )
 _REGULAR: Final = (

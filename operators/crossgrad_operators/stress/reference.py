@@ -8,8 +8,8 @@ import numpy as np
 
 from crossgrad_operators.stress import oracles, polyhedra, solvers
 from crossgrad_operators.stress.algebra import apply
-from crossgrad_operators.stress.exact import Matrix, Number, require_mpmath
-from crossgrad_operators.stress.oracles import Oracle, Question, column_sums, number
+from crossgrad_operators.stress.exact import Matrix, Number, number, require_mpmath
+from crossgrad_operators.stress.oracles import Oracle, Question, column_sums
 
 #: Operator name -> its oracle. Operators of other names are checked without one.
 ORACLES: Final[Mapping[str, Oracle]] = {

@@ -104,22 +104,30 @@ def judged(
             # Third-party code may raise anything.
             return Finding("failed", reason=f"{type(error).__name__}: {error}"), []
         times.append(seconds)
-        try:
-            expected = _expected(reference, exact, views, memory)
-        except UnprovenError:
-            return Finding("failed", reason=UNPROVEN), []
-        findings.append(judge(exact, found, expected, reference.promise))
+        finding = compared(exact, found, reference, views, memory)
+        if finding.reason == UNPROVEN:
+            return finding, []
+        findings.append(finding)
         if not (state.values or state.tensors or state.per_primitive):
             break
     return max(findings, key=lambda finding: finding.severity), times
 
 
-def _expected(
-    reference: Reference, exact: ExactCase, views: Views, memory: dict[Any, Any]
-) -> Answer | ElementRule | None:
-    if reference.oracle is None:
-        return reference.rule
-    return answer(reference.oracle, exact.gramian, views, memory, reference.options)
+def compared(
+    exact: ExactCase,
+    found: Tensor | None,
+    reference: Reference,
+    views: Views,
+    memory: dict[Any, Any],
+) -> Finding:
+    """Compares a result with its reference; the oracle may write to the memory."""
+    expected: Answer | ElementRule | None = reference.rule
+    try:
+        if reference.oracle is not None:
+            expected = answer(reference.oracle, exact.gramian, views, memory, reference.options)
+        return judge(exact, found, expected, reference.promise)
+    except UnprovenError:
+        return Finding("failed", reason=UNPROVEN)
 
 
 def timed(

@@ -14,7 +14,7 @@ from crossgrad_operators.stress.algebra import (
     form,
     solve,
 )
-from crossgrad_operators.stress.exact import Matrix, require_mpmath
+from crossgrad_operators.stress.exact import Matrix, number, require_mpmath
 from crossgrad_operators.stress.oracles import (
     OPPOSITE,
     Question,
@@ -22,7 +22,6 @@ from crossgrad_operators.stress.oracles import (
     cosines,
     is_noise,
     lengths,
-    number,
     zeros,
 )
 

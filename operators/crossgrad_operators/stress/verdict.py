@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import hypot, inf, sqrt
+from math import hypot, inf, isnan, nan, sqrt
 from typing import Final, Literal
 
 import numpy as np
@@ -14,14 +14,16 @@ from crossgrad_operators.stress.exact import (
     Matrix,
     exact_gramian,
     finite_views,
-    require_mpmath,
     weighted_sum,
 )
-from crossgrad_operators.stress.promises import ALL, PROMISED, Facts, Promise
+from crossgrad_operators.stress.oracles import cosines, lengths
+from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
 #: From kappa u on only finiteness is promised: the input does not determine the result any better.
 UNDETERMINED: Final = 0.1
+#: Why a result fails that contains a NaN or an infinity.
+NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
@@ -38,11 +40,18 @@ class Finding:
             an error is promised, finite and not too long; `refused`: K is not admitted; `failed`.
         error: Relative error in units of u kappa; NaN without a reference.
         reason: Why it failed.
+        ratio: |u| over the longest gradient; NaN inside the set.
     """
 
     verdict: Verdict
-    error: float = float("nan")
+    error: float = nan
     reason: str = ""
+    ratio: float = nan
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the gradients lie outside the set on which an error is promised."""
+        return not isnan(self.ratio)
 
     @property
     def severity(self) -> tuple[int, float]:
@@ -75,43 +84,41 @@ def judge(
     if found is None or not exact.touched:
         return _either(found is None and not exact.touched, "None is for blocks without any view")
     if not bool(torch.isfinite(found).all()):
-        return Finding("failed", inf, "not finite")
+        return Finding("failed", inf, NOT_FINITE)
     if expected is None:
         return Finding("ok")
     if not isinstance(expected, Answer):
-        longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
-        scale = max(longest, float(found.double().norm()))
-        return _measured(exact.case, expected(exact.case, found), (scale, scale))
+        return by_law(exact, found, expected(exact.case, found), promise)
     return _against(exact, found, expected, promise)
+
+
+def by_law(exact: ExactCase, found: Tensor, error: float, promise: Promise = ALL) -> Finding:
+    """Judges the distance of a result from the nearest one that a rule or a law allows."""
+    longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
+    scale = max(longest, float(found.double().norm()))
+    return _measured(exact.case, error, (scale, scale), promise.bound(facts_of(exact)))
 
 
 def _against(exact: ExactCase, found: Tensor, expected: Answer, promise: Promise) -> Finding:
     facts = facts_of(exact, expected)
-    if not promise.inside(facts)[0]:
+    if not promise.inside(facts):
         return _outside(exact.case, found, facts, promise)
     if all(w == 0 for w in expected.weights):
         return _either(not bool(found.any()), "must be exactly zero")
     sizes = float(max(expected.largest, expected.length)), float(expected.length)
-    bound = float(promise.bound(facts)[0])
-    return _measured(exact.case, distance(exact.case, found, expected), sizes, bound)
+    return _measured(exact.case, distance(exact.case, found, expected), sizes, promise.bound(facts))
 
 
-def facts_of(exact: ExactCase, answer: Answer) -> Facts:
-    """What sets are stated in, from 50 digits."""
-    mp = require_mpmath().mp
-    gramian, views = exact.gramian, range(exact.case.views)
-    norms = [mp.sqrt(gramian[k][k]) for k in views]
-    cosines = [
-        [gramian[i][j] / norms[i] / norms[j] if norms[i] * norms[j] else mp.mpf(0) for j in views]
-        for i in views
-    ]
-    pairs = [[(float(c), float(c - float(c))) for c in row] for row in cosines]
+def facts_of(exact: ExactCase, answer: Answer | None = None) -> Facts:
+    """The terms in which sets are stated; without an answer, for sets that do not depend on it."""
+    gramian = exact.gramian
+    places = [k for k in range(exact.case.views) if gramian[k][k] > 0]
+    part = [[gramian[i][j] for j in places] for i in places]
     return Facts(
-        norms=np.array([[float(n) for n in norms]]),
-        directions=np.array([pairs]),
-        present=np.array([[bool(n > 0) for n in norms]]),
-        weights=np.array([[float(w) for w in answer.weights]]),
-        length=np.array([float(answer.length)]),
+        norms=np.array([float(n) for n in lengths(part)]),
+        cosines=cosines(part),
+        weights=np.array([float(answer.weights[k]) if answer else 0.0 for k in places]),
+        length=float(answer.length) if answer else 0.0,
         unit=_unit(exact.case),
     )
 
@@ -125,15 +132,13 @@ def _either(right: bool, otherwise: str) -> Finding:
 
 
 def _outside(case: Case, found: Tensor, facts: Facts, promise: Promise) -> Finding:
-    ratio = float(found.double().norm()) / float(facts.longest[0])
+    ratio = float(found.double().norm()) / facts.longest
     if ratio <= promise.factor(case.views):
-        return Finding("outside")
-    return Finding("failed", inf, f"{ratio:.3g} times the longest gradient")
+        return Finding("outside", ratio=ratio)
+    return Finding("failed", inf, f"{ratio:.3g} times the longest gradient outside the set", ratio)
 
 
-def _measured(
-    case: Case, error: float, sizes: tuple[float, float], bound: float = PROMISED
-) -> Finding:
+def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float) -> Finding:
     unit, (scale, length) = _unit(case), sizes
     # What gradual underflow takes from every element cannot be relative.
     lost = sqrt(case.size) * float(torch.finfo(case.dtype).smallest_normal) * unit
@@ -175,10 +180,5 @@ def one_sign(case: Case, found: Tensor) -> float:
 
 def _to_nearest_sign(rows: Rows, values: Rows) -> float:
     finite = rows[np.isfinite(rows).all(axis=1)]
-    return float(np.linalg.norm(to_one_sign(finite, values)))
-
-
-def to_one_sign(rows: Rows, values: Rows) -> Rows:
-    """[..., P] distances of values from the sums of rows [..., K, P] of one sign."""
-    positive, negative = rows.clip(min=0).sum(axis=-2), rows.clip(max=0).sum(axis=-2)
-    return np.asarray(np.minimum(abs(values - positive), abs(values - negative)))
+    positive, negative = finite.clip(min=0).sum(axis=0), finite.clip(max=0).sum(axis=0)
+    return float(np.linalg.norm(np.minimum(abs(values - positive), abs(values - negative))))

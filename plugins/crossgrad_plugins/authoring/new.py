@@ -1,6 +1,8 @@
 """`crossgrad plugins new`: a small package with one plugin, to begin with."""
 
 import re
+import tomllib
+from functools import cache
 from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
@@ -18,7 +20,11 @@ from crossgrad_core.commands import (
     with_article,
 )
 
-_TEMPLATES: Final = Path(__file__).parent / "templates"
+#: The example package: in the wheel, else in the checkout.
+_EXAMPLES: Final = (
+    Path(__file__).with_name("example"),
+    Path(__file__).parents[3] / "examples" / "plugin",
+)
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _PROJECT: Final = """\
 [build-system]
@@ -56,17 +62,26 @@ def test_contract(check):
 '''
 
 
-def slots() -> tuple[str, ...]:
-    """The slots, and commands, for which a package can be written."""
-    return tuple(slot for slot in OFFERED if (_TEMPLATES / f"{slot}.py").is_file())
+@cache
+def examples() -> dict[str, tuple[Path, str]]:
+    """Return slot -> module and member of its plugin in the example package."""
+    folder = next(folder for folder in _EXAMPLES if folder.is_dir())
+    project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    slots = {group: slot for slot, group in OFFERED.items()}
+    found = {}
+    for group, plugins in project["entry-points"].items():
+        (value,) = plugins.values()
+        module, _, member = value.partition(":")
+        found[slots[group]] = folder.joinpath(*module.split(".")).with_suffix(".py"), member
+    return found
 
 
 def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
-    """Writes pyproject.toml, one module and one test.
+    """Write pyproject.toml, one module from the example package, and one test.
 
     Args:
         name: Name of the plugin and of the package.
-        slot: The slot, one of `slots()`.
+        slot: The slot, one of `OFFERED`.
         folder: Where to; made here.
 
     Returns:
@@ -90,7 +105,8 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     """Path below the folder -> text."""
     kind = "".join(part.capitalize() for part in name.split("-"))
     member = module if slot == COMMANDS else kind
-    source = (_TEMPLATES / f"{slot}.py").read_text(encoding="utf-8")
+    example, model = examples()[slot]
+    source = example.read_text(encoding="utf-8")
     major, minor = VERSION.split(".")[:2]
     words = {
         "name": name,
@@ -106,7 +122,7 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),
-        f"{module}.py": source.replace("Template", kind).replace("def template(", f"def {module}("),
+        f"{module}.py": re.sub(rf"\b{model}\b", member, source),
         f"tests/test_{module}.py": _TEST.format(**words),
     }
 

@@ -1,8 +1,7 @@
 """The command `crossgrad compare`."""
 
 import os.path
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
@@ -10,22 +9,24 @@ from typing import Final
 
 from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes, text_bytes
 from crossgrad_plugins.compare.checks.code import differing_code
-from crossgrad_plugins.compare.comparison import Comparison, Options, compared
+from crossgrad_plugins.compare.comparison import Comparison, compared
 from crossgrad_plugins.compare.cost import COSTS
-from crossgrad_plugins.compare.figures.curves import draw_curves
+from crossgrad_plugins.compare.figures.curves import (
+    draw_curves,
+    draw_frontier,
+    draw_primitives,
+    draw_regimes,
+)
 from crossgrad_plugins.compare.figures.differences import draw_differences
-from crossgrad_plugins.compare.figures.frontier import draw_frontier
 from crossgrad_plugins.compare.figures.phases import draw_phases
-from crossgrad_plugins.compare.figures.primitives import draw_primitives
 from crossgrad_plugins.compare.figures.profile import draw_profile
-from crossgrad_plugins.compare.figures.regimes import draw_regimes
 from crossgrad_plugins.compare.figures.style import Drawn
 from crossgrad_plugins.compare.load_runs import check_places, read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
 from crossgrad_plugins.compare.page import page_of
-from crossgrad_plugins.compare.parallel import in_parallel
 from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.tables import TABLES, tables_of
+from crossgrad_plugins.compare.tables import TABLES, csv_tables
 from crossgrad_plugins.compare.terminal import lines_of
 
 #: Where a comparison goes by default, beside the runs.
@@ -74,7 +75,7 @@ def compare(
     files |= {f"{FIGURES}/{figure.name}.pdf": figure.pdf for figure in figures}
     files |= {f"{FIGURES}/{figure.name}.png": figure.png for figure in figures}
     files |= {
-        name: table_bytes(rows) for name, rows in tables_of(comparison, views).items() if rows
+        name: table_bytes(rows) for name, rows in csv_tables(comparison, views).items() if rows
     }
     write_files(folder, files, OWNED)
     for line in lines_of(comparison, notes):
@@ -97,19 +98,19 @@ def _check_numbers(options: Options) -> None:
 
 
 def drawn_figures(comparison: Comparison) -> list[Drawn]:
-    """All figures that can be drawn, in the order of the page."""
+    """Draw all figures that can be drawn, in the order of the page."""
     first, *rest = comparison.costs
-    drawings: list[Callable[[], Drawn | None]] = [
-        partial(draw_curves, comparison, first),
-        partial(draw_differences, comparison),
-        partial(draw_frontier, comparison, first),
-        partial(draw_regimes, comparison),
-        *(partial(draw_curves, comparison, cost) for cost in rest),
-        partial(draw_profile, comparison),
-        partial(draw_primitives, comparison, first),
-        partial(draw_phases, comparison),
-    ]
-    return [figure for figure in in_parallel(drawings) if figure is not None]
+    figures = (
+        draw_curves(comparison, first),
+        draw_differences(comparison),
+        draw_frontier(comparison, first),
+        draw_regimes(comparison),
+        *(draw_curves(comparison, cost) for cost in rest),
+        draw_profile(comparison),
+        draw_primitives(comparison, first),
+        draw_phases(comparison),
+    )
+    return [figure for figure in figures if figure is not None]
 
 
 def _default_folder(places: Sequence[Path]) -> Path:

@@ -1,5 +1,6 @@
 """From folders to runs: what is broken, unfinished or of another kind is sorted out."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,7 +39,7 @@ class _Seconds(BaseModel):
 
 
 class _Summary(BaseModel):
-    """The part of summary.json that a comparison takes for granted, of any version."""
+    """The part of summary.json that a comparison takes for granted."""
 
     status: str
     scene: str
@@ -246,15 +247,8 @@ def _in_words(error: ValueError) -> str:
 
 
 def _config(results: "RunResults") -> dict[str, object]:
-    """The configuration with the names and the defaults of this version.
-
-    What a run had to say about a setting that is newer than its version is not known: such a one
-    is there with its default, or not at all where that is none.
-    """
     try:
-        config = RunConfig.model_validate(results.config)
-        stated = config.model_dump(mode="json", exclude_unset=True)
-        return _without_nulls(config.model_dump(mode="json"), stated)
+        return RunConfig.model_validate(results.config).model_dump(mode="json")
     except ValueError as error:
         raise UserError(
             "unreadable configuration of a run",
@@ -262,15 +256,6 @@ def _config(results: "RunResults") -> dict[str, object]:
             found=_in_words(error),
             todo="restore the file, or read the run with the version that wrote it",
         ) from error
-
-
-def _without_nulls(settings: Mapping[str, Any], besides: Mapping[str, Any]) -> dict[str, object]:
-    """The settings without those that are null, besides some, and likewise in inner ones."""
-    return {
-        name: _without_nulls(value, besides.get(name) or {}) if isinstance(value, dict) else value
-        for name, value in settings.items()
-        if value is not None or name in besides
-    }
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
@@ -304,9 +289,6 @@ def without_length(label: str) -> str:
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
-    """The folders below the last one that they share."""
-    shared = 0
-    parts = [folder.parts for folder in folders]
-    while parts and all(len(p) > shared + 1 and p[shared] == parts[0][shared] for p in parts):
-        shared += 1
-    return {folder: "/".join(folder.parts[shared:]) for folder in folders}
+    """Return the paths below the last folder that they share."""
+    shared = os.path.commonpath([folder.parent for folder in folders])
+    return {folder: folder.relative_to(shared).as_posix() for folder in folders}

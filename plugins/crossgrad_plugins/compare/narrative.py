@@ -1,8 +1,8 @@
 """The results in plain words: the winner, by how much, how sure, at what cost."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import isinf, isnan
+from math import inf, isinf, isnan
 
 from crossgrad_core.commands import count
 from crossgrad_plugins.compare.comparison import Comparison
@@ -26,7 +26,7 @@ class Sentence:
 
 
 def headline(comparison: Comparison) -> tuple[Sentence, ...]:
-    """The first things to know."""
+    """Return the first things to know."""
     if not comparison.ends:
         return (_alone(comparison),)
     if len(comparison.ends) == 1:
@@ -40,7 +40,7 @@ def headline(comparison: Comparison) -> tuple[Sentence, ...]:
 
 
 def claim(contrast: Contrast) -> str:
-    """What is said about two arms."""
+    """Return the statement about two arms."""
     found = contrast.estimate
     if found is None:
         return f"{contrast.first} and {contrast.second} share no scene with the same seed"
@@ -63,21 +63,28 @@ def _except(contrast: Contrast) -> str:
 
 
 def opposed_text(contrast: Contrast) -> str:
-    """On which scenes it is surely not so, with the differences there."""
+    """Return the scenes that surely contradict the verdict, with their differences."""
     shown = [
         f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
     ]
     return f"surely otherwise on {', '.join(shown)}" if shown else ""
 
 
+def where_text(contrast: Contrast) -> str:
+    """Return where a contrast was taken; a star marks runs that were read before their ends."""
+    title = _TITLES.get(contrast.where)
+    text = contrast.where if title is None else f"equal {title}"
+    return f"{text} *" if contrast.inside else text
+
+
 def verdict_text(contrast: Contrast) -> str:
-    """The verdict, and on which scenes it is surely not so."""
+    """Return the verdict, and the scenes that surely contradict it."""
     found = opposed_text(contrast)
     return f"{contrast.verdict}, {found}" if found else str(contrast.verdict)
 
 
 def support(contrast: Contrast) -> str:
-    """How sure that is."""
+    """Return how sure the statement is."""
     found = contrast.estimate
     if found is None:
         return ""
@@ -94,7 +101,7 @@ def support(contrast: Contrast) -> str:
 
 
 def needed_text(contrast: Contrast) -> str:
-    """How many pairs would settle it."""
+    """Return how many pairs would settle the comparison."""
     found = contrast.estimate
     if found is None or found.pairs == 1:
         return _ONE_PAIR
@@ -109,7 +116,7 @@ def needed_text(contrast: Contrast) -> str:
 
 
 def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
-    """An interval with its signs and unit."""
+    """Return an interval with its signs and unit."""
     if isinf(interval[0]):
         return "unknown"
     digits, unit = contrast.quantity.decimals, contrast.quantity.unit
@@ -117,7 +124,7 @@ def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
 
 
 def noise_sentence(comparison: Comparison) -> str:
-    """The floor of noise by scene."""
+    """Return the floor of noise by scene."""
     quantity = comparison.quantity
     lacking = [scene for scene in comparison.scenes if scene not in comparison.noise]
     known = [
@@ -145,7 +152,7 @@ def _alone(comparison: Comparison) -> Sentence:
 
 
 def _unpaired(comparison: Comparison) -> Sentence:
-    """Why several arms have no pair."""
+    """Return why several arms have no pair."""
     failed = [arm.name for arm in comparison.arms if arm.failed and not arm.runs]
     if failed:
         return Sentence(
@@ -165,7 +172,7 @@ def _unpaired(comparison: Comparison) -> Sentence:
 
 
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
-    """What the leading arm is to the others.
+    """Return how the leading arm compares with the others.
 
     It leads by its mean over runs, from which the estimate of pairs can differ.
     """
@@ -184,46 +191,39 @@ def _of_the_best(comparison: Comparison) -> list[Sentence]:
     ):
         if groups[verdict]:
             found.append(
-                Sentence(f"It is {words} {_listed(groups[verdict])}", _why(groups[verdict]))
+                Sentence(
+                    f"It is {words} {_named(each.second for each in groups[verdict])}",
+                    _why(groups[verdict]),
+                )
             )
     return found
 
 
 def _against(contrasts: Sequence[Contrast]) -> str:
-    shown = [
+    return _named(
         f"{each.second} by {_size(each)} ({interval_text(each, each.estimate.wide)})"
-        for each in contrasts[:_MOST_NAMED]
+        for each in contrasts
         if each.estimate is not None
-    ]
-    more = len(contrasts) - len(shown)
-    return f"{', '.join(shown)}{f' and {more} more' if more else ''}"
+    )
 
 
-def _listed(contrasts: Sequence[Contrast]) -> str:
-    names = [each.second for each in contrasts]
-    shown = ", ".join(names[:_MOST_NAMED])
-    return shown if len(names) <= _MOST_NAMED else f"{shown} and {len(names) - _MOST_NAMED} more"
+def _named(texts: Iterable[str], separator: str = ", ") -> str:
+    """Return the first texts, and how many more there are."""
+    every = list(texts)
+    more = len(every) - _MOST_NAMED
+    shown = separator.join(every[:_MOST_NAMED])
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def _why(contrasts: Sequence[Contrast]) -> str:
-    first = contrasts[0]
-    if first.verdict is Verdict.EQUIVALENT:
-        return f"within {_margin(first)}"
-    needed = [c.estimate.needed for c in contrasts if c.estimate and c.estimate.needed]
-    pairs = max(c.estimate.pairs for c in contrasts if c.estimate)
-    if pairs == 1:
-        return _ONE_PAIR
-    if not needed:
-        return f"the noise is far above the margin of {_margin(first)}"
-    if max(needed) <= pairs:
-        if all(each.is_small or each.differs for each in contrasts):
-            return "sure by themselves, but not beside each other"
-        return f"differences too close to the margin of {_margin(first)} for {pairs} pairs"
-    return f"n \u2265 {max(needed)} pairs needed to tell {_margin(first)}, there are {pairs}"
+    """Return why arms are equivalent, or what the arm that is hardest to tell apart needs."""
+    if contrasts[0].verdict is Verdict.EQUIVALENT:
+        return f"within {_margin(contrasts[0])}"
+    return needed_text(max(contrasts, key=lambda c: (c.estimate and c.estimate.needed) or inf))
 
 
 def _lengths(comparison: Comparison) -> list[Sentence]:
-    """That runs of the same scene and seed have other lengths in one arm than in another."""
+    """Return a sentence if runs of a scene and seed have different lengths in two arms."""
     told: dict[str, dict[str, None]] = {}
     for problem in {problem for by in comparison.main.values() for problem in by}:
         own = {n: by[problem].length_text for n, by in comparison.main.items() if problem in by}
@@ -232,16 +232,14 @@ def _lengths(comparison: Comparison) -> list[Sentence]:
                 told.setdefault(name, {})[length] = None
     if not told:
         return []
-    shown = [
+    shown = (
         f"{name} {', '.join(sorted(told[name]))}" for name in comparison.ranking if name in told
-    ]
-    more = len(shown) - _MOST_NAMED
-    shown = [*shown[:_MOST_NAMED], *([f"{more} more"] if more > 0 else [])]
-    return [Sentence("The arms were given different lengths", "; ".join(shown))]
+    )
+    return [Sentence("The arms were given different lengths", _named(shown, "; "))]
 
 
 def _equal_costs(comparison: Comparison) -> list[Sentence]:
-    """What holds at equal costs, of the two arms of the first sentence."""
+    """Return what holds at equal costs for the two arms of the first sentence."""
     if not comparison.ends:
         return []
     couple = comparison.ends[0].first, comparison.ends[0].second

@@ -1,11 +1,10 @@
 """A finished run as the comparison sees it."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,6 @@ if TYPE_CHECKING:
     from crossgrad_core.commands import RunResults
 
 Array: TypeAlias = NDArray[np.float64]
-
-#: The note of a run whose length followed the clock, as runs write it until they are resumed.
-_PLANNED: Final = re.compile(r"steps planned for ([\d.]+) s\b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +51,11 @@ class Run:
         """How it ended: finished, stopped or failed."""
         return str(self.summary.get("status"))
 
+    @property
+    def environment(self) -> Mapping[str, Any]:
+        """Its machine and code, as summary.json has them."""
+        return self.summary.get("environment") or {}
+
     @cached_property
     def settings(self) -> Settings:
         """Its configuration, flat, without what tells no arms apart."""
@@ -63,19 +64,12 @@ class Run:
     @cached_property
     def length(self) -> tuple[str, float]:
         """The unit and the amount of the budget that it was given."""
-        if seconds := self.config.get("planned_seconds") or self._noted_seconds():
+        if seconds := self.config.get("planned_seconds"):
             return ("s CPU" if self.config.get("clock") == "cpu" else "s"), float(seconds)
         views = self.config.get("max_views")
         if views is not None:
             return "views", float(views)
         return "steps", float(self.config.get("steps") or self.summary.get("step") or 0)
-
-    def _noted_seconds(self) -> str | None:
-        """Its seconds as an older run, which has them in no setting, notes them."""
-        for note in self.summary.get("notes") or ():
-            if found := _PLANNED.search(str(note)):
-                return found[1]
-        return None
 
     @property
     def length_text(self) -> str:
@@ -106,13 +100,6 @@ class Run:
             value = value.get(name) if isinstance(value, Mapping) else None
         known = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
         return float(value) if known else None
-
-    @property
-    def peak_primitives(self) -> float | None:
-        """The most primitives that it had; of an older run, the most at an evaluation."""
-        counts = [row.get("primitives") for row in self.results.rows]
-        seen = [float(count) for count in counts if count is not None]
-        return self.number("peak_primitives") or max(seen, default=self.number("primitives"))
 
 
 def text_of(length: tuple[str, float]) -> str:

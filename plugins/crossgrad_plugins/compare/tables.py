@@ -1,17 +1,26 @@
-"""The tables of a comparison, as rows for CSV files."""
+"""The tables of a comparison: rows of texts for page and terminal, rows of values for CSV files."""
 
-from collections.abc import Mapping, Sequence
-from math import nan
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite, isnan, nan
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from crossgrad_core.commands import count
+from crossgrad_plugins.compare import narrative
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
-from crossgrad_plugins.compare.cost import COSTS
-from crossgrad_plugins.compare.figures.curves import band
+from crossgrad_plugins.compare.cost import COSTS, Cost
+from crossgrad_plugins.compare.figures.panels import band
 from crossgrad_plugins.compare.figures.phases import phases_of
+from crossgrad_plugins.compare.narrative import interval_text, where_text
 from crossgrad_plugins.compare.pictures import WorstView
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.statistics.estimate import Estimate
+from crossgrad_plugins.compare.statistics.verdict import UNCORRECTED, Verdict
+from crossgrad_plugins.compare.targets import Reached
 
 Row = dict[str, str | int | float]
 #: Files of all tables.
@@ -19,153 +28,371 @@ TABLES: Final = (
     *("runs.csv", "arms.csv", "comparisons.csv", "pairs.csv", "time_to_quality.csv"),
     *("curves.csv", "lengths.csv", "noise.csv", "phases.csv", "views.csv"),
 )
+_NONE: Final = "\u2013"
 
 
-def tables_of(
-    comparison: Comparison, views: Mapping[str, Sequence[WorstView]]
-) -> dict[str, list[Row]]:
-    """File name -> rows, for each of `TABLES`."""
-    everything = (
-        *comparison.ends, *comparison.equal, *comparison.regimes, *comparison.others,
-    )  # fmt: skip
+class Column(NamedTuple):
+    """A column of a table of the page and the terminal.
+
+    Attributes:
+        title: Its heading.
+        kind: How the page sets it: `number`, `text`, `arm`, `verdict` or `note`.
+        in_terminal: Whether the terminal has room for it.
+    """
+
+    title: str
+    kind: str = "number"
+    in_terminal: bool = True
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page and the terminal.
+
+    Attributes:
+        columns: Its columns.
+        rows: A text for each column, in each row.
+        title: What it is called.
+        caption: What it shows.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str]]
+    title: str = ""
+    caption: str = ""
+
+
+_ARM: Final = Column("arm", "arm")
+
+
+def standing_table(c: Comparison) -> Table:
+    """Return the arms from the best to the worst, with their figures and differences."""
+    reference = c.baseline or c.ranking[0]
+    unit = f", {c.quantity.unit}" if c.quantity.unit else ""
+    return Table(
+        [
+            *(_ARM, *map(Column, c.scenes)),
+            *(Column(f"against {reference}"), Column("verdict", "verdict", in_terminal=False)),
+        ],
+        [
+            [arm, *(_standing(c, arm, scene) for scene in c.scenes), *_against(c, arm, reference)]
+            for arm in c.ranking
+        ],
+        caption=f"{c.quantity.label} at the end of the runs, mean \u00b1 standard deviation over "
+        f"seeds{unit}; arms from the best to the worst; differences are paired by scene and seed, "
+        "with 95 % intervals.",
+    )
+
+
+def _standing(c: Comparison, arm: str, scene: str) -> str:
+    standing = c.standing[arm].get(scene)
+    if standing is None:
+        return _NONE
+    spread = f" \u00b1 {standing.spread:.{c.quantity.decimals}f}"
+    return c.quantity.shown(standing.mean) + ("" if isnan(standing.spread) else spread)
+
+
+def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
+    """Return the difference to the reference, from the arm's side, and the verdict."""
+    for each in c.ends:
+        if each.estimate is not None and {each.first, each.second} == {arm, reference}:
+            sign = 1.0 if each.first == arm else -1.0
+            low, high = sorted(sign * limit for limit in each.estimate.wide)
+            interval = interval_text(each, (low, high)).removesuffix(each.quantity.unit)
+            text = c.quantity.difference(sign * each.estimate.center)
+            return f"{text} [{interval.strip()}]", str(each.verdict)
+    return ("reference" if arm == reference else "no pair"), ""
+
+
+def cost_table(c: Comparison) -> Table:
+    """Return the mean costs of the arms, over the scenes and seeds that all arms have."""
+    problems = [by.keys() for by in c.main.values() if by]
+    shared = set.intersection(*map(set, problems)) if problems else set()
+    rows = []
+    for arm in c.ranking:
+        runs = [run for problem, run in c.main[arm].items() if problem in shared]
+        runs = runs or list(c.main[arm].values())
+        failed = next(len(each.failed) for each in c.arms if each.name == arm)
+        row = [arm, *(_mean([run.spent(cost) for run in runs], cost) for cost in c.costs)]
+        row += [
+            _mean([run.number("primitives") for run in runs]),
+            _mean([run.number("peak_primitives") for run in runs]),
+            _mean([run.number("peak_memory_mib") for run in runs]),
+            f"{len(c.main[arm])}" + (f" + {failed} failed" if failed else ""),
+        ]
+        rows.append(row)
+    columns = [_ARM, *(Column(cost.title) for cost in c.costs), Column("primitives at the end")]
+    columns += [Column(name, in_terminal=False) for name in ("at most", "memory, MiB", "runs")]
+    caption = "What a run costs, in the mean. Seconds are those of training."
+    return Table(columns, rows, caption=caption)
+
+
+def _mean(values: Sequence[float | None], cost: Cost | None = None) -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return _NONE
+    mean = float(np.mean(known))
+    return f"{mean:,.0f}" if cost is None else cost.shown(mean).removesuffix(f" {cost.unit}")
+
+
+def contrast_tables(c: Comparison) -> tuple[Table, ...]:
+    """Return the tables of contrasts that have rows."""
+    tables = (
+        contrast_table(c.ends, "At the ends of the runs", "The primary comparison."),
+        contrast_table(
+            c.equal,
+            "At equal cost",
+            "Read where the run that spent least had its last evaluation, by scene; costs that are "
+            "the same at the ends of all runs have no row. * : runs were read before their ends, "
+            "where a schedule stretched to more had not come to its end; only runs of that length "
+            "show what they reach.",
+            {"equal": where_text},
+        ),
+        contrast_table(
+            c.regimes,
+            "By regime",
+            "At the ends of the runs, over all held-out views and over those of each regime.",
+            {"views": where_text},
+        ),
+        contrast_table(
+            c.others,
+            "Other figures",
+            "At the ends of the runs, over all held-out views.",
+            {"figure": lambda each: each.quantity.label},
+        ),
+        contrast_table(
+            c.gains,
+            "What longer runs gain",
+            "Within an arm, runs of one length against those of the next shorter one, paired by "
+            "scene and seed.",
+            {"arm": where_text},
+        ),
+    )
+    return tuple(table for table in tables if table.rows)
+
+
+def contrast_table(
+    contrasts: Sequence[Contrast],
+    title: str = "",
+    caption: str = "",
+    first: Mapping[str, Callable[[Contrast], str]] = MappingProxyType({}),
+) -> Table:
+    """Return contrasts as a table.
+
+    Args:
+        contrasts: The contrasts.
+        title: What the table is called.
+        caption: What it shows.
+        first: Heading -> text, of columns before all others.
+    """
+    if len(contrasts) > UNCORRECTED:
+        caption += (
+            f" Verdicts are corrected with Holm's method over the {len(contrasts)} comparisons of "
+            "this table; intervals are not."
+        )
+    columns = [
+        *(Column(name, "text") for name in (*first, "first", "second")),
+        *(Column("first \u2212 second"), Column("95 % interval")),
+        *(Column("90 % interval", in_terminal=False), Column("verdict", "verdict")),
+        *(Column("pairs"), Column("first better"), Column("", "note", in_terminal=False)),
+    ]
+    rows = [
+        [*(text(each) for text in first.values()), *_contrast_texts(each, each.estimate)]
+        for each in contrasts
+        if each.estimate is not None
+    ]
+    return Table(columns, rows, title, caption)
+
+
+def _contrast_texts(contrast: Contrast, estimate: Estimate) -> list[str]:
+    inconclusive = contrast.verdict is Verdict.INCONCLUSIVE
+    small = contrast.verdict is Verdict.DIFFERENT and contrast.is_small
+    qualified = " (below the margin)" * small + ", scenes differ" * bool(contrast.opposed)
+    note = narrative.needed_text if inconclusive else narrative.opposed_text
+    return [
+        contrast.first,
+        contrast.second,
+        contrast.quantity.difference(estimate.center),
+        interval_text(contrast, estimate.wide),
+        interval_text(contrast, estimate.narrow),
+        f"{contrast.verdict}{qualified}",
+        str(estimate.pairs),
+        str(contrast.ahead),
+        note(contrast),
+    ]
+
+
+def reached_table(c: Comparison) -> Table:
+    """Return how soon a quality is reached: a row for each scene and arm, a cell for each cost."""
+    groups: dict[tuple[str, str], list[Reached]] = {}
+    for each in c.reached:
+        groups.setdefault((each.scene, each.arm), []).append(each)
+    rows = [
+        [
+            *(scene, c.quantity.shown(own[0].target), arm),
+            *(each.cost.shown(each.median) if isfinite(each.median) else "never (\u221e)"
+              for each in own),
+            f"{own[-1].reached} of {len(own[-1].amounts)}",
+        ]
+        for (scene, arm), own in groups.items()
+    ]  # fmt: skip
+    columns = [Column("scene", "text"), Column(c.quantity.with_unit), _ARM]
+    columns += [Column(cost.title) for cost in c.costs]
+    return Table(
+        [*columns, Column("reached")],
+        rows,
+        "Time to a quality",
+        "Median over runs of what had been spent when the quality was first reached. A run that "
+        "never got there counts as infinite and stays in the denominator.",
+    )
+
+
+def settings_table(c: Comparison) -> Table:
+    """Return the settings that differ between the arms, a row for each."""
+    settings = dict.fromkeys(key for arm in c.arms for key in arm.settings)
+    return Table(
+        [Column("setting", "text"), *(Column(arm.name, "text") for arm in c.arms)],
+        [[key, *(arm.settings[key] for arm in c.arms)] for key in settings],
+        "What differs between the arms",
+    )
+
+
+def runs_table(c: Comparison) -> Table:
+    """Return the runs that stand for an arm, a scene and a seed."""
+
+    def text(value: float | None, shown: Callable[[float], str]) -> str:
+        return _NONE if value is None else shown(value)
+
+    columns = [Column("run", "text"), _ARM, Column("scene", "text"), Column("seed")]
+    columns += map(Column, ("length", *(cost.title for cost in c.costs)))
+    rows = [
+        [
+            *(run.name, arm, scene, str(seed), run.length_text),
+            *(text(run.spent(cost), cost.shown) for cost in c.costs),
+            text(run.final(c.quantity.name), c.quantity.shown),
+            text(run.number("primitives"), "{:,.0f}".format),
+        ]
+        for arm, by in c.main.items()
+        for (scene, seed), run in by.items()
+    ]
+    columns += [Column(c.quantity.with_unit), Column("primitives")]
+    return Table(columns, rows, count(len(rows), "run"))
+
+
+def views_table(c: Comparison, scene: str, views: Sequence[WorstView]) -> Table:
+    """Return held-out views of a scene."""
+    return Table(
+        [Column("view", "text"), Column("regime", "text"), *map(Column, c.ranking)],
+        [
+            [
+                *(view.name, view.regime),
+                *(
+                    c.quantity.shown(view.by_arm[arm]) if arm in view.by_arm else _NONE
+                    for arm in c.ranking
+                ),
+            ]
+            for view in views
+        ],
+        f"{scene}: the {len(views)} worst views",
+    )
+
+
+def csv_tables(c: Comparison, views: Mapping[str, Sequence[WorstView]]) -> dict[str, list[Row]]:
+    """Return file name -> rows, for each of `TABLES`."""
+    contrasts = list(dict.fromkeys((*c.ends, *c.equal, *c.regimes, *c.others)))
     return {
-        "runs.csv": _runs(comparison),
-        "arms.csv": [{"arm": arm.name, **arm.settings} for arm in comparison.arms],
-        "comparisons.csv": [_contrast(each) for each in dict.fromkeys(everything)],
-        "pairs.csv": _pairs(dict.fromkeys(everything)),
-        "time_to_quality.csv": _reached(comparison),
-        "curves.csv": _curves(comparison),
-        "lengths.csv": _lengths(comparison),
+        "runs.csv": [_run(c, arm.name, run) for arm in c.arms for run in arm.runs],
+        "arms.csv": [{"arm": arm.name, **arm.settings} for arm in c.arms],
+        "comparisons.csv": [_contrast(each) for each in contrasts],
+        "pairs.csv": [
+            {**_named(each), "scene": pair.scene, "seed": pair.seed, "of_first": pair.first,
+             "of_second": pair.second, "difference": pair.difference}
+            for each in contrasts
+            for pair in each.pairs
+        ],
+        "time_to_quality.csv": [
+            {"cost": row.cost.name, "scene": row.scene, "target": row.target, "arm": row.arm,
+             "seed": seed, "amount": amount}
+            for row in c.reached
+            for seed, amount in row.amounts.items()
+        ],
+        "curves.csv": _curves(c),
+        "lengths.csv": [
+            {"arm": point.arm, "scene": point.scene, "length": point.length, "seeds": point.seeds,
+             "mean": point.mean, "deviation": point.spread, **point.spent}
+            for point in c.points
+        ],
         "noise.csv": [
             {"scene": scene, "deviation": deviation, "degrees_of_freedom": freedom}
-            for scene, (deviation, freedom) in comparison.noise.items()
+            for scene, (deviation, freedom) in c.noise.items()
         ],
-        "phases.csv": [{"arm": arm, **own} for arm, own in phases_of(comparison).items()],
+        "phases.csv": [{"arm": arm, **own} for arm, own in phases_of(c).items()],
         "views.csv": [
             {"scene": v.scene, "view": v.name, "regime": v.regime, "mean": v.mean, **v.by_arm}
             for own in views.values()
             for v in own
         ],
+    }  # fmt: skip
+
+
+def _run(c: Comparison, arm: str, run: Run) -> Row:
+    row: Row = {"arm": arm, "scene": run.scene, "seed": run.seed}
+    row |= {"length": run.length_text, "run": run.name}
+    numbers = {cost.name: run.spent(cost) for cost in COSTS}
+    numbers |= {q.name: run.final(q.name) for q in c.quantities}
+    numbers |= {
+        f"{q.name} {regime}": run.final(q.name, regime)
+        for q in c.quantities
+        for regime in run.results.regimes
     }
+    numbers["primitives"] = run.number("primitives")
+    numbers["peak_primitives"] = run.number("peak_primitives")
+    numbers["peak_memory_mib"] = run.number("peak_memory_mib")
+    row |= {key: nan if number is None else number for key, number in numbers.items()}
+    return row | {key: str(run.environment.get(key) or "") for key in ("crossgrad", "commit")}
 
 
-def _runs(comparison: Comparison) -> list[Row]:
-    rows: list[Row] = []
-    for arm in comparison.arms:
-        for run in arm.runs:
-            row: Row = {"arm": arm.name, "scene": run.scene, "seed": run.seed}
-            row |= {"length": run.length_text, "run": run.name}
-            row |= {cost.name: _known(run.spent(cost)) for cost in COSTS}
-            row |= {q.name: _known(run.final(q.name)) for q in comparison.quantities}
-            row |= {
-                f"{q.name} {regime}": _known(run.final(q.name, regime))
-                for q in comparison.quantities
-                for regime in run.results.regimes
-            }
-            row["primitives"] = _known(run.number("primitives"))
-            row["peak_primitives"] = _known(run.peak_primitives)
-            row["peak_memory_mib"] = _known(run.number("peak_memory_mib"))
-            made_with = run.summary.get("environment") or {}
-            row |= {name: str(made_with.get(name) or "") for name in ("crossgrad", "commit")}
-            rows.append(row)
-    return rows
-
-
-def _known(value: float | None) -> float:
-    return nan if value is None else value
-
-
-def _contrast(contrast: Contrast) -> Row:
-    row: Row = {
+def _named(contrast: Contrast) -> Row:
+    return {
         "figure": contrast.quantity.name,
         "where": contrast.where,
         "first": contrast.first,
         "second": contrast.second,
     }
-    found = contrast.estimate
-    if found is None:
-        return row
-    return row | {
-        "difference": found.center,
-        "low_95": found.wide[0],
-        "high_95": found.wide[1],
-        "low_90": found.narrow[0],
-        "high_90": found.narrow[1],
+
+
+def _contrast(contrast: Contrast) -> Row:
+    estimate = contrast.estimate
+    if estimate is None:
+        return _named(contrast)
+    return _named(contrast) | {
+        "difference": estimate.center,
+        "low_95": estimate.wide[0],
+        "high_95": estimate.wide[1],
+        "low_90": estimate.narrow[0],
+        "high_90": estimate.narrow[1],
         "verdict": str(contrast.verdict),
         "opposed": " ".join(each.scene for each in contrast.opposed),
         "margin": contrast.quantity.margin,
-        "pairs": found.pairs,
+        "pairs": estimate.pairs,
         "first_better": contrast.ahead,
-        "scenes": found.scenes,
-        "deviation": found.deviation,
-        "p_different": found.p_different,
-        "p_equivalent": found.p_equivalent,
-        "pairs_needed": nan if found.needed is None else found.needed,
-        "method": found.method,
+        "scenes": estimate.scenes,
+        "deviation": estimate.deviation,
+        "p_different": estimate.p_different,
+        "p_equivalent": estimate.p_equivalent,
+        "pairs_needed": nan if estimate.needed is None else estimate.needed,
+        "method": estimate.method,
         "before_the_end": "yes" if contrast.inside else "no",
     }
 
 
-def _pairs(contrasts: Mapping[Contrast, None]) -> list[Row]:
-    return [
-        {
-            "figure": each.quantity.name,
-            "where": each.where,
-            "first": each.first,
-            "second": each.second,
-            "scene": pair.scene,
-            "seed": pair.seed,
-            "of_first": pair.first,
-            "of_second": pair.second,
-            "difference": pair.difference,
-        }
-        for each in contrasts
-        for pair in each.pairs
-    ]
-
-
-def _reached(comparison: Comparison) -> list[Row]:
-    return [
-        {
-            "cost": row.cost.name,
-            "scene": row.scene,
-            "target": row.target,
-            "arm": row.arm,
-            "seed": seed,
-            "amount": amount,
-        }
-        for row in comparison.reached
-        for seed, amount in row.amounts.items()
-    ]
-
-
-def _curves(comparison: Comparison) -> list[Row]:
-    rows: list[Row] = []
-    for cost in comparison.costs:
-        for scene in comparison.scenes:
-            for arm, by in comparison.main.items():
-                runs = [run for (at, _), run in by.items() if at == scene]
-                found = band(runs, comparison.quantity, cost)
-                if found is None:
-                    continue
-                at: Row = {"cost": cost.name, "scene": scene, "arm": arm}
-                rows += [
-                    {**at, "amount": x, "lowest": low, "mean": mean, "highest": high}
-                    for x, low, mean, high in np.stack(found, axis=1).tolist()
-                ]
+def _curves(c: Comparison) -> list[Row]:
+    rows: list[dict[str, Any]] = []
+    for cost in c.costs:
+        for scene in c.scenes:
+            for arm in c.main:
+                at = {"cost": cost.name, "scene": scene, "arm": arm}
+                points = np.stack(band(c, arm, scene, c.quantity, cost), axis=1).tolist()
+                names = ("amount", "lowest", "mean", "highest")
+                rows += [{**at, **dict(zip(names, point, strict=True))} for point in points]
     return rows
-
-
-def _lengths(comparison: Comparison) -> list[Row]:
-    return [
-        {
-            "arm": point.arm,
-            "scene": point.scene,
-            "length": point.length,
-            "seeds": point.seeds,
-            "mean": point.mean,
-            "deviation": point.spread,
-            **point.spent,
-        }
-        for point in comparison.points
-    ]

@@ -1,99 +1,56 @@
 """`crossgrad plan`: what a scene needs, and what it does not, before a run."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from crossgrad_core.commands import announce
+from crossgrad_core.commands import announce, argument, command_of, option
 
 _RUN = "Run (what you set here is not decided)"
 _RESULTS = "Results"
 
 
-def plan(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
-    scene: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="SCENE",
-            help="Scene folder. Default: the bundled example scene.",
-            show_default=False,
-        ),
-    ] = None,
-    probe: Annotated[
-        float | None,
-        typer.Option(
-            "--probe",
-            min=1.0,
-            metavar="SECONDS",
-            help="Also train so many seconds and measure gradients: noise scale, variance between "
-            "near and far, conflict.",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config",
-            metavar="FILE",
-            help="YAML file with settings of the run.",
-            rich_help_panel=_RUN,
-        ),
-    ] = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="One setting of the run, repeatable: exposure=none, backbone.sh_degree=3.",
-            rich_help_panel=_RUN,
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, metavar="S", help="Training seconds of the run.", rich_help_panel=_RUN
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Steps of the run.", rich_help_panel=_RUN),
-    ] = None,
-    max_size: Annotated[
-        int | None,
-        typer.Option(
-            metavar="PIXELS",
-            help="Longest image side; larger photos are resized.",
-            rich_help_panel=_RUN,
-        ),
-    ] = None,
-    device: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|cpu|cuda|cuda:N",
-            help="Where tensors live. Default: auto.",
-            rich_help_panel=_RUN,
-        ),
-    ] = None,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", help="CPU threads. Default: all there are.", rich_help_panel=_RUN
-        ),
-    ] = None,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="Print JSON, with all figures.", rich_help_panel=_RESULTS),
-    ] = False,
-    write: Annotated[
-        Path | None,
-        typer.Option(
-            "--write",
-            metavar="FILE",
-            help="Write the settings to this file, for `crossgrad run --config FILE`.",
-            rich_help_panel=_RESULTS,
-        ),
-    ] = None,
-) -> None:
+@dataclass(frozen=True)
+class Options:
+    """The options of the command."""
+
+    scene: Path | None = argument(
+        "SCENE", "Scene folder. Default: the bundled example scene.", default=None
+    )
+    probe: float | None = option(
+        None,
+        "Also train so many seconds and measure gradients: noise scale, variance between near and "
+        "far, conflict.",
+        "SECONDS",
+        min=1.0,
+    )
+    config: Path | None = option(None, "YAML file with settings of the run.", "FILE", heading=_RUN)
+    assignments: list[str] | None = option(
+        None,
+        "One setting of the run, repeatable: exposure=none, backbone.sh_degree=3.",
+        "KEY=VALUE",
+        heading=_RUN,
+        flag="--set",
+    )
+    seconds: float | None = option(None, "Training seconds of the run.", "S", heading=_RUN, min=0.0)
+    steps: int | None = option(None, "Steps of the run.", "N", heading=_RUN, min=1)
+    max_size: int | None = option(
+        None, "Longest image side; larger photos are resized.", "PIXELS", heading=_RUN
+    )
+    device: str | None = option(
+        None, "Where tensors live. Default: auto.", "auto|cpu|cuda|cuda:N", heading=_RUN
+    )
+    threads: int | None = option(None, "CPU threads. Default: all there are.", "N", heading=_RUN)
+    as_json: bool = option(False, "Print JSON, with all figures.", heading=_RESULTS, flag="--json")
+    write: Path | None = option(
+        None,
+        "Write the settings to this file, for `crossgrad run --config FILE`.",
+        "FILE",
+        heading=_RESULTS,
+    )
+
+
+@command_of(Options)
+def plan(given: Options) -> None:
     """Decide on evidence what a run on a scene needs.
 
     Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
@@ -101,16 +58,16 @@ def plan(  # noqa: PLR0913, PLR0917 - one parameter per option of the command li
     overrules it. Where evidence is missing the default stays. `crossgrad run --plan auto` decides
     likewise and trains; `--plan turns` only decides how often far and near views come.
     """
-    announce(quiet=as_json)
+    announce(quiet=given.as_json)
     from crossgrad_plugins.planner import app
 
     options = {
-        "scene": None if scene is None else str(scene),
-        "seconds": seconds,
-        "steps": steps,
-        "max_size": max_size,
-        "device": device,
-        "threads": threads,
+        "scene": None if given.scene is None else str(given.scene),
+        "seconds": given.seconds,
+        "steps": given.steps,
+        "max_size": given.max_size,
+        "device": given.device,
+        "threads": given.threads,
     }
-    made, way = app.plan(config, options, assignments or [], probe, write)
-    app.show(made, way, as_json=as_json)
+    made, way = app.plan(given.config, options, given.assignments or [], given.probe, given.write)
+    app.show(made, way, as_json=given.as_json)

@@ -1,11 +1,10 @@
 """The command `crossgrad prepare`."""
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Final
 
-import typer
-
-from crossgrad_core.commands import UserError, announce
+from crossgrad_core.commands import UserError, announce, argument, command_of, option
 
 _HOW = "How cameras are found"
 _COSTS = "What it may take"
@@ -17,112 +16,85 @@ _CHOICES: Final[dict[str, tuple[str, ...]]] = {
 }
 
 
-def prepare(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
-    photos: Annotated[
-        Path,
-        typer.Argument(
-            metavar="PHOTOS",
-            help="Folder of photos; those of different regimes in folders of their own.",
-            show_default=False,
-        ),
-    ],
-    scene: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SCENE",
-            help="Folder of the scene; the same command goes on there after any interruption.",
-            show_default=False,
-        ),
-    ],
-    features: Annotated[
-        str, typer.Option(metavar="sift", help="Kind of features.", rich_help_panel=_HOW)
-    ] = "sift",
-    matching: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|exhaustive|spatial|retrieval|sequential",
-            help="Which photos are compared: all, neighbours by GPS, those that look alike, or "
-            "neighbours by name. auto decides by the number of photos and their GPS.",
-            rich_help_panel=_HOW,
-        ),
-    ] = "auto",
-    mapper: Annotated[
-        str,
-        typer.Option(
-            metavar="auto|incremental|global",
-            help="auto is incremental below 100 photos, and below 1000 in several folders.",
-            rich_help_panel=_HOW,
-        ),
-    ] = "auto",
-    cameras: Annotated[
-        str,
-        typer.Option(
-            metavar="folder|photo",
-            help="Calibrates the photos of a folder together that come from one camera (EXIF), or "
-            "each photo by itself.",
-            rich_help_panel=_HOW,
-        ),
-    ] = "folder",
-    lens: Annotated[
-        str,
-        typer.Option(
-            metavar="MODEL",
-            help="Camera model of COLMAP: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.",
-            rich_help_panel=_HOW,
-        ),
-    ] = "SIMPLE_RADIAL",
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, "
-            "masks/ beside photos, NAME_mask.png.",
-            rich_help_panel=_HOW,
-        ),
-    ] = None,
-    max_size: Annotated[
-        int | None,
-        typer.Option(
-            min=64,
-            metavar="PIXELS",
-            help="Longest side of the scene's photos. Default: as they are. Features are found at "
-            "3200 pixels at most.",
-            rich_help_panel=_COSTS,
-        ),
-    ] = None,
-    max_features: Annotated[
-        int,
-        typer.Option(
-            min=64, metavar="N", help="Features of a photo, at most.", rich_help_panel=_COSTS
-        ),
-    ] = 8192,
-    threads: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="CPU threads. Default: all there are; fewer where memory is short.",
-            rich_help_panel=_COSTS,
-        ),
-    ] = None,
-) -> None:
+@dataclass(frozen=True)
+class Options:
+    """The options of the command."""
+
+    photos: Path = argument(
+        "PHOTOS", "Folder of photos; those of different regimes in folders of their own."
+    )
+    scene: Path = argument(
+        "SCENE", "Folder of the scene; the same command goes on there after any interruption."
+    )
+    features: str = option("sift", "Kind of features.", "sift", heading=_HOW)
+    matching: str = option(
+        "auto",
+        "Which photos are compared: all, neighbours by GPS, those that look alike, or "
+        "neighbours by name. auto decides by the number of photos and their GPS.",
+        "auto|exhaustive|spatial|retrieval|sequential",
+        heading=_HOW,
+    )
+    mapper: str = option(
+        "auto",
+        "auto is incremental below 100 photos, and below 1000 in several folders.",
+        "auto|incremental|global",
+        heading=_HOW,
+    )
+    cameras: str = option(
+        "folder",
+        "Calibrates the photos of a folder together that come from one camera (EXIF), or each "
+        "photo by itself.",
+        "folder|photo",
+        heading=_HOW,
+    )
+    lens: str = option(
+        "SIMPLE_RADIAL",
+        "Camera model of COLMAP: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.",
+        "MODEL",
+        heading=_HOW,
+    )
+    masks: Path | None = option(
+        None,
+        "Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, masks/ beside "
+        "photos, NAME_mask.png.",
+        "DIR",
+        heading=_HOW,
+    )
+    max_size: int | None = option(
+        None,
+        "Longest side of the scene's photos. Default: as they are. Features are found at 3200 "
+        "pixels at most.",
+        "PIXELS",
+        heading=_COSTS,
+        min=64,
+    )
+    max_features: int = option(8192, "Features of a photo, at most.", "N", heading=_COSTS, min=64)
+    threads: int | None = option(
+        None,
+        "CPU threads. Default: all there are; fewer where memory is short.",
+        "N",
+        heading=_COSTS,
+        min=1,
+    )
+
+
+@command_of(Options)
+def prepare(given: Options) -> None:
     """Find the cameras of a folder of photos: from photos to a scene for `crossgrad run`.
 
     Features, matches, poses, undistorted photos, place on Earth where photos have GPS, and a report
     (report.md, report.png) of what is in the scene, what is not, and why.
     """
     announce(quiet=True)
-    given = {"features": features, "matching": matching, "mapper": mapper, "cameras": cameras}
-    for name, value in given.items():
-        _check_choice(name, value)
+    for name in _CHOICES:
+        _check_choice(name, getattr(given, name))
     from crossgrad_plugins.prepare.app import prepare_scene
     from crossgrad_plugins.prepare.plan import Settings
 
-    wanted: dict[str, Any] = {
-        **given, "lens": lens.upper(), "max_size": max_size, "max_features": max_features
-    }  # fmt: skip
-    wanted["masks"] = None if masks is None else str(masks.absolute())
-    prepare_scene(photos, scene, Settings(**wanted), threads)
+    wanted = {name: value for name, value in asdict(given).items() if name in Settings.model_fields}
+    wanted["lens"] = given.lens.upper()
+    wanted["masks"] = None if given.masks is None else str(given.masks.absolute())
+    prepare_scene(given.photos, given.scene, Settings(**wanted), given.threads)
 
 
 def _check_choice(name: str, value: str) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crossgrad_core.commands import UserError
 from crossgrad_core.plugin import is_file
 from crossgrad_core.scene.decode import decode_mask, decode_photo, turn
-from crossgrad_core.scene.mask_files import mask_names
+from crossgrad_core.scene.mask_files import mask_names, pair_masks
 from crossgrad_core.scene.photo_files import PhotoFolder
 from crossgrad_core.scene.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
@@ -68,9 +68,9 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
     beside = [name for name in rest if PurePosixPath(name).stem.lower().endswith(_ENDS)]
     photos = [name for name in rest if name not in frozenset(beside)]
     if wanted is None:
-        masks = _first(root, {name: _usual(root, name, folders) for name in photos})
+        masks = _usual(root, photos, folders)
     else:
-        masks = _first(root, {name: _in(wanted, name) for name in photos})
+        masks = _wanted(root, photos, wanted)
         # The folder may be that of the photos.
         taken = frozenset(map(os.path.realpath, masks.values()))
         photos = [name for name in photos if os.path.realpath(root / name) not in taken]
@@ -103,7 +103,7 @@ def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str,
         for folder, inside in found.items()
         if folder == _MASKS
         or is_asked(folder)
-        or 2 * len(_of_photos(folder, inside, others)) > len(inside)
+        or 2 * len(_of_photos(root, folder, inside, others)) > len(inside)
     }
 
 
@@ -121,25 +121,40 @@ def _below(folder: str, name: str) -> str | None:
     return name.removeprefix(f"{base}/") if name.startswith(f"{base}/") else None
 
 
-def _of_photos(folder: str, inside: Iterable[str], photos: Iterable[str]) -> set[str]:
+def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[str]) -> set[str]:
     """Those files of a folder of masks that are named after photos."""
     below = (_below(folder, name) for name in photos)
-    named = {each for name in below if name is not None for each in mask_names(name)}
-    return {name for name in inside if name.removeprefix(f"{folder}/") in named}
+    named = {f"{folder}/{each}" for name in below if name is not None for each in mask_names(name)}
+    named |= {path.relative_to(root).as_posix() for path in _paired(root, folder, photos).values()}
+    return named.intersection(inside)
 
 
-def _in(folder: Path, name: str) -> Iterator[Path]:
-    return (folder / each for each in mask_names(name))
+def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
+    """The masks in a folder below `root`, of the photos beside it: photo -> mask."""
+    below = {name: each for name in photos if (each := _below(folder, name)) is not None}
+    found = pair_masks(root / folder, [*below.values()])
+    return {name: found[each] for name, each in below.items() if each in found}
 
 
-def _usual(root: Path, name: str, folders: Iterable[str]) -> Iterator[Path]:
-    """Where the mask of a photo may be without being asked for."""
-    for folder in sorted(folders, key=lambda each: (each != _MASKS, each)):
-        below = _below(folder, name)
-        if below is not None:
-            yield from _in(root / folder, below)
-    stem = str(PurePosixPath(name).with_suffix(""))
-    yield from (root / f"{stem}{end}.png" for end in _ENDS)
+def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
+    """The masks that are found without being asked for: in `masks`, other folders, or beside."""
+    stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
+    beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
+    masks = _first(root, beside)
+    for folder in sorted(folders, key=lambda each: (each != _MASKS, each), reverse=True):
+        pairs = _paired(root, folder, photos)
+        masks |= {name: path.absolute() for name, path in pairs.items()}
+    return masks
+
+
+def _wanted(root: Path, photos: Sequence[str], folder: Path) -> dict[str, Path]:
+    """The masks in the folder that was asked for."""
+    masks = _first(root, {name: [folder / each for each in mask_names(name)] for name in photos})
+    if os.path.realpath(folder) == os.path.realpath(root):
+        return masks
+    own = frozenset(os.path.realpath(root / name) for name in photos)
+    pairs = pair_masks(folder, photos)
+    return {n: p.absolute() for n, p in pairs.items() if os.path.realpath(p) not in own} | masks
 
 
 def _first(root: Path, places: Mapping[str, Iterable[Path]]) -> dict[str, Path]:
@@ -173,7 +188,7 @@ def _tell_folders(
     """What is said of folders of masks: not of `masks` itself, unless it holds other files."""
     asked = _asked(root, wanted)
     for folder, inside in sorted(folders.items()):
-        named = _of_photos(folder, inside, photos)
+        named = _of_photos(root, folder, inside, photos)
         strays = [name for name in inside if name not in named]
         if asked is not None and os.path.realpath(root / folder) == asked:
             yield LeftOut(

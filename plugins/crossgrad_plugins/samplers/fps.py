@@ -16,9 +16,10 @@ class FarthestPoint(Sampler):
     """Every training view once per epoch, each as far in pose space as possible from those before.
 
     An epoch starts at a uniform view; a step takes the next K views of the order. Pose space joins
-    the camera centre, in units of the root mean square distance from the mean centre, and the unit
-    viewing direction times `direction_weight`; distances in it are Euclidean. (Steps that each
-    began anew would render the outermost cameras far more often than the others.)
+    the camera centre and the unit viewing direction times `direction_weight`; distances in it are
+    Euclidean. The unit of the centre is the root mean square distance from the mean centre, both
+    without stray cameras. (Steps that each began anew would render the outermost cameras far more
+    often than the others.)
 
     Source: farthest-point sampling, Eldar et al. 1997; the pose space is ours.
     """
@@ -46,9 +47,11 @@ class FarthestPoint(Sampler):
 
     def _poses(self, context: SampleContext) -> NDArray[np.float64]:
         """[N, 6] the training cameras in pose space."""
-        centers = context.centers - context.centers.mean(axis=0)
-        radius = float(np.sqrt((centers**2).sum(axis=1).mean()))
-        rows = [view.camera.world_to_camera[2, :3].numpy() for view in context.scene.train_views]
+        scene = context.scene
+        centers = context.centers - scene.middle
+        usual = scene.usual_centers - scene.middle
+        radius = float(np.sqrt((usual**2).sum(axis=1).mean()))
+        rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         directions = np.stack(rows).astype(np.float64)
         # Cameras at one place differ in direction only.
         scaled = centers / radius if radius > 0.0 else np.zeros_like(centers)

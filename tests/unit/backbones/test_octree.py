@@ -266,3 +266,13 @@ def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_roun
 def test_what_is_left_out_is_told():
     assert "plant_everywhere=true" in Octree().fitted_to(sample_scene())[1][0]
     assert Octree(plant_everywhere=True).fitted_to(sample_scene())[1] == ()
+
+
+def test_a_stray_camera_does_not_set_the_levels():
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3))
+    distances = np.linspace(1.0, 4.0, 10)
+    lattices = [
+        Octree().create(scene_of(each, points), np.random.default_rng(0))["lattice"]
+        for each in (distances, [*distances, 1e5])
+    ]
+    assert torch.equal(*lattices)

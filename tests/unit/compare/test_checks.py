@@ -10,9 +10,10 @@ from support.run_folders import RunFolder
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.checks.code import differing_code
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 
 LOADED = {"load": {"mean": 5.0, "max": 9.0}}
 

@@ -1,13 +1,9 @@
-"""What figures are drawn with: letters of a small font, legends that a page has room for."""
+"""Legends and titles fit into figures; arms look different."""
 
-import tempfile
 import warnings
 
-import matplotlib
 import pytest
-from matplotlib.font_manager import fontManager
 
-from crossgrad_plugins.compare.figures.fonts import FULL, SMALL, family
 from crossgrad_plugins.compare.figures.style import (
     PAGE,
     drawn,
@@ -17,63 +13,6 @@ from crossgrad_plugins.compare.figures.style import (
     panel_title,
     styled,
 )
-
-
-def text_of(figure, word):
-    return next(text for text in figure.texts if text.get_text() == word)
-
-
-def test_signs_that_the_small_font_lacks_come_from_the_full_one():
-    with styled(), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        figure = new_figure(3.0, 1.0)
-        figure.text(0.1, 0.1, "Zażółć ±3 dB")
-        figure.text(0.1, 0.5, "Ωμέγα")
-        made = drawn(figure, "name", "title", "caption")
-    assert not [warning for warning in caught if "Glyph" in str(warning.message)]
-    assert text_of(figure, "Zażółć ±3 dB").get_fontfamily() == [SMALL]
-    assert text_of(figure, "Ωμέγα").get_fontfamily() == [SMALL, FULL]
-    assert "Ωμέγα" in made.svg
-
-
-@pytest.fixture
-def cached(tmp_path, monkeypatch):
-    """The folder that a process which has no font yet finds them in."""
-    monkeypatch.setattr(matplotlib, "get_cachedir", lambda: str(tmp_path))
-    monkeypatch.setattr(fontManager, "ttflist", list(fontManager.ttflist))
-    family.cache_clear()
-    yield tmp_path
-    family.cache_clear()
-
-
-def test_the_small_font_is_made_once_and_nothing_else_is_left(cached, monkeypatch):
-    elsewhere = cached / "temporary"
-    elsewhere.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
-    assert family() == SMALL
-    made = {path: path.stat().st_mtime_ns for path in cached.glob("*.ttf")}
-    family.cache_clear()
-    assert family() == SMALL
-    assert {path: path.stat().st_mtime_ns for path in cached.iterdir()} == {
-        **made,
-        elsewhere: elsewhere.stat().st_mtime_ns,
-    }
-    assert len(made) == 2
-    assert not list(elsewhere.iterdir())
-
-
-def test_where_it_cannot_be_kept_figures_are_drawn_in_the_full_font(cached, monkeypatch):
-    monkeypatch.setattr(matplotlib, "get_cachedir", lambda: str(cached / "missing"))
-    assert family() == FULL
-
-
-@pytest.mark.parametrize("weight", ["normal", "bold"])
-def test_a_file_that_is_no_font_is_not_drawn_with(cached, weight):
-    family()
-    for path in cached.glob(f"*{weight}.ttf"):
-        path.write_bytes(b"no font")
-    family.cache_clear()
-    assert family() == FULL
 
 
 @pytest.mark.parametrize("share", [1.0, 0.62])

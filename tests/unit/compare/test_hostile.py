@@ -1,4 +1,4 @@
-"""Folders that are damaged, unfinished, old, or alone."""
+"""Folders that are damaged, unfinished, or alone."""
 
 import json
 import shutil
@@ -10,13 +10,12 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.targets import ratios
-
-OLD = Path(__file__).parents[2] / "integration" / "data" / "run-0.1"
 
 
 def headlines(folder: Path) -> str:
@@ -194,7 +193,7 @@ def test_three_seeds_say_how_many_would_do(tmp_path):
 
 
 def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
-    shutil.copytree(OLD, tmp_path / "runs" / "old")
+    RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
     assert "One arm: there is nothing to compare it with" in page
@@ -210,17 +209,12 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
     assert "share no scene with the same seed" in headlines(tmp_path)
 
 
-def test_an_old_run_beside_a_new_one(tmp_path):
-    shutil.copytree(OLD, tmp_path / "old")
-    RunFolder(
-        scene="tiny",
-        steps=20,
-        held_out=("0000.png", "0008.png"),
-        regimes={"far": 0.0},
-        photos="photos: 32 x 24 px (9) from images/, not resized",
-    ).write(tmp_path / "new")
+def test_a_figure_that_one_run_did_not_measure_is_not_compared(tmp_path):
+    more = RunFolder(views_per_step=2).write(tmp_path / "more")
+    changed(more / "summary.json", lambda summary: summary["overall"].update(sharpness=0.3))
+    RunFolder().write(tmp_path / "less")
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
-    assert "ssim_skimage is not compared: new did not measure it" in found.notes
+    assert "sharpness is not compared: less did not measure it" in found.notes
     assert len(found.arms) == 2
 
 

@@ -9,12 +9,13 @@ from support.run_folders import RunFolder
 
 from crossgrad_plugins.compare.arms import arms_of
 from crossgrad_plugins.compare.cells import Cells
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.cost import SECONDS, STEPS, VIEWS
 from crossgrad_plugins.compare.interpolate import cost_to, value_at
 from crossgrad_plugins.compare.load_runs import read_runs
+from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.quantity import Quantity
-from crossgrad_plugins.compare.tables import tables_of
+from crossgrad_plugins.compare.tables import csv_tables
 from crossgrad_plugins.compare.targets import ratios, targets_of
 
 
@@ -152,7 +153,7 @@ def test_each_table_has_a_place_of_its_own(tmp_path):
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     assert [each.where for each in found.ends] == ["at the end"]
     assert [each.where for each in found.regimes] == ["overall", *"abcdef"]
-    rows = tables_of(found, {})["comparisons.csv"]
+    rows = csv_tables(found, {})["comparisons.csv"]
     kinds = [(row["figure"], row["where"], row["first"], row["second"]) for row in rows]
     assert len(set(kinds)) == len(kinds)
 

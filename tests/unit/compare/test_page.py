@@ -12,14 +12,14 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.cli.main import main
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.figures import differences
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases, phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
-from crossgrad_plugins.compare.page import arm_rows
-from crossgrad_plugins.compare.tables import TABLES, tables_of
+from crossgrad_plugins.compare.options import Options
+from crossgrad_plugins.compare.tables import TABLES, cost_table, csv_tables
 
 SCENE = '<b>&"x"$y_$'
 VIEW = "a/<script>alert(1)</script>.jpg"
@@ -75,7 +75,7 @@ def test_phases_are_seconds_of_the_clock_and_shown_only_where_these_are_compared
     assert len(phases_of(found)) == 2
     of_cpu = compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.CPU))
     assert draw_phases(of_cpu) is None
-    assert tables_of(of_cpu, {})["phases.csv"] == []
+    assert csv_tables(of_cpu, {})["phases.csv"] == []
 
 
 def test_an_interval_that_goes_on_beyond_the_axis_ends_in_an_arrowhead(tmp_path, monkeypatch):
@@ -169,9 +169,9 @@ def test_all_that_is_written_is_known_to_the_next_comparison(written):
     files = {path.relative_to(written).as_posix() for path in written.rglob("*.*")}
     assert files <= {"index.html", *app.OWNED}
     modules = {path.stem for path in Path(app.__file__).parent.glob("figures/*.py")}
-    assert modules - {"__init__", "style", "fonts", "curves"} <= set(app.DRAWINGS)
+    assert modules - {"__init__", "style", "panels", "curves"} <= set(app.DRAWINGS)
     found = compared(read_runs([written.parent], skip_broken=False), Options())
-    assert set(tables_of(found, {})) == set(TABLES)
+    assert set(csv_tables(found, {})) == set(TABLES)
 
 
 def test_tables_hold_the_same_as_the_page(written):
@@ -220,10 +220,13 @@ def test_costs_are_those_of_the_scenes_that_all_arms_have(tmp_path):
             run = RunFolder(scene, views_per_step=views, primitives=primitives)
             run.write(tmp_path / f"{scene}-{views}")
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
-    assert {row.name: (row.primitives, row.runs) for row in arm_rows(found)} == {
-        "views=1": ("1,000", 2),
-        "views=2": ("1,000", 1),
-    }
+    table = cost_table(found)
+    titles = [column.title for column in table.columns]
+    shown = [titles.index(title) for title in ("arm", "primitives at the end", "runs")]
+    assert [[row[index] for index in shown] for row in table.rows] == [
+        ["views=1", "1,000", "2"],
+        ["views=2", "1,000", "1"],
+    ]
 
 
 EVIL = "<img src=x onerror=alert(1)>\"'\n\x1b[31m</title></style><script>alert(1)</script>"
@@ -257,7 +260,7 @@ def page_with(folder, capsys, name):
                 regimes={name: 1.0, "near": -1.0},
             )
             run.write(folder / f"{views}-{seed}")
-    options = Options(names=(f"views=1:{name}",))
+    options = Options(name=[f"views=1:{name}"])
     app.compare([folder], options, folder / "out", skip_broken=False)
     said = capsys.readouterr()
     return (folder / "out" / "index.html").read_text(), said.out + said.err

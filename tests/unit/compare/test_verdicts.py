@@ -8,14 +8,12 @@ import pytest
 from scipy.stats import trim_mean, ttest_1samp
 from support.run_folders import RunFolder
 
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
-from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
-from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate
-from crossgrad_plugins.compare.statistics.holm import holm
-from crossgrad_plugins.compare.statistics.iqm import iqm
-from crossgrad_plugins.compare.statistics.student import pairs_needed
-from crossgrad_plugins.compare.statistics.verdict import Verdict, opposed, verdicts
+from crossgrad_plugins.compare.options import Options
+from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap, iqm
+from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate, pairs_needed
+from crossgrad_plugins.compare.statistics.verdict import Verdict, holm, opposed, verdicts
 
 RNG = np.random.default_rng(0)
 
@@ -61,8 +59,8 @@ def test_from_ten_pairs_on_it_is_a_bootstrap_wider_than_the_plain_one():
 def test_p_values_and_intervals_of_the_bootstrap_agree():
     law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
     low, high = law.interval(0.95)
-    assert law.lower_tail(low) == pytest.approx(0.025, abs=0.002)
-    assert law.upper_tail(high) == pytest.approx(0.025, abs=0.002)
+    assert law.cdf(low) == pytest.approx(0.025, abs=0.002)
+    assert law.sf(high) == pytest.approx(0.025, abs=0.002)
 
 
 @pytest.mark.parametrize("shift", [5.0, -5.0])
@@ -77,8 +75,8 @@ def test_what_is_far_above_the_noise_is_different_beside_any_number_of_others(sh
 def test_p_values_fall_steadily_beyond_all_draws():
     law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
     borders = np.linspace(1.0, 9.0, 33)
-    above = [law.upper_tail(border) for border in borders]
-    below = [law.lower_tail(-border) for border in borders]
+    above = [law.sf(border) for border in borders]
+    below = [law.cdf(-border) for border in borders]
     for values in (above, below):
         assert values == sorted(values, reverse=True)
         assert values[-1] < 0.1 * values[0]

@@ -2,9 +2,10 @@
 
 from support.run_folders import RunFolder
 
-from crossgrad_plugins.compare.comparison import Options, compared
+from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
+from crossgrad_plugins.compare.options import Options
 
 
 def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_path):

@@ -113,6 +113,21 @@ def test_masks_are_found_by_all_their_names_and_are_no_photos(tmp_path):
     assert [photo.mask is not None for _, photo in sorted(used.items())] == [True] * 4 + [False]
 
 
+@pytest.mark.parametrize("wanted", [False, True])
+def test_masks_are_paired_by_the_rule_of_the_readers(wanted, tmp_path):
+    """Letter case, suffix, and words such as `mask` at either end may differ."""
+    for number, mask in enumerate(("Mask_1.png", "2_SEG.png", "3.tif"), 1):
+        save(tmp_path / f"{number}.JPG")
+        save(tmp_path / "masks" / mask)
+    used, left_out = found(tmp_path, masks=str(tmp_path / "masks") if wanted else None)
+    assert [Path(used[f"{i}.JPG"].mask).name for i in (1, 2, 3)] == [
+        "Mask_1.png",
+        "2_SEG.png",
+        "3.tif",
+    ]
+    assert not any("of no photo" in why for why in left_out.values())
+
+
 def test_a_folder_of_masks_that_is_named_has_to_be_there(tmp_path):
     save(tmp_path / "1.jpg")
     with pytest.raises(UserError, match="mask folder"):

@@ -1,12 +1,20 @@
 """Which views of another capture the run was trained on."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
-from crossgrad_core.run.cross_capture import SAME_DIRECTION, SAME_PLACE, _are_trained
-from crossgrad_core.testing.posed import posed_view
+from crossgrad_core.errors import UserError
+from crossgrad_core.run.cross_capture import (
+    SAME_DIRECTION,
+    SAME_PLACE,
+    _are_trained,
+    _check_place,
+)
+from crossgrad_core.testing.posed import posed_scene, posed_view
 
 
 def moved(view, shift, angle, rng):
@@ -41,3 +49,13 @@ def test_place_and_direction_are_those_of_one_view():
     here, there = posed_view((0, 0, 0)), posed_view((1, 0, 0), forward=(1, 0, 0))
     mixed = posed_view((1, 0, 0))
     assert _are_trained([here, mixed, there], [here, there]) == [True, False, True]
+
+
+def test_a_stray_camera_does_not_let_a_capture_of_another_place_in():
+    rng = np.random.default_rng(2)
+    centers = [*rng.normal(size=(20, 3)), np.array([1e4, 1e4, 1e4])]
+    points = rng.normal(size=(300, 3))
+    scene = posed_scene([posed_view(c, f"{i:03}.png") for i, c in enumerate(centers)], points)
+    _check_place(scene, points, points[:5], Path("same"))
+    with pytest.raises(UserError, match="lies elsewhere"):
+        _check_place(scene, points + 50.0, points[:5] + 50.0, Path("other"))

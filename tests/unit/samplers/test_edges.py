@@ -1,5 +1,7 @@
 """Numbers of views, missing groups, tiny scenes, identical cameras."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.selections import selection_of
@@ -155,3 +157,11 @@ def test_cameras_at_one_place_differ_by_direction():
 def test_every_built_in_sampler_is_covered_here():
     ours = {n for n, e in entries("samplers").items() if "crossgrad_plugins" in e.value}
     assert ours == set(ADMITTED)
+
+
+def test_a_stray_camera_does_not_set_the_unit_of_pose_space():
+    def poses(places):
+        cameras = posed_scene([posed_view((x, 0, 0), f"{x}.png") for x in places])
+        return FarthestPoint()._poses(SimpleNamespace(scene=cameras, centers=cameras.centers))
+
+    np.testing.assert_array_equal(poses(range(8)), poses([*range(8), 1e6])[:8])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.scenes import write_tiny_scene
 from support.scripts import BENCHMARKS
 
@@ -12,6 +13,7 @@ from crossgrad_core.commands import configured
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_and_check, read_scene
 from crossgrad_core.scene.self_check.check import checked
+from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import verdict_of
 
 KINDS = (
@@ -63,7 +65,7 @@ def without_tracks(model):
 
 def found(model):
     scene = model.scene()
-    return verdict_of(scene, range(len(scene.views)))
+    return verdict_of(scene, range(len(scene.views)), pixels_of(scene))
 
 
 def causes(verdict):
@@ -100,6 +102,26 @@ def test_each_kind_is_reported_with_its_cause_or_its_photos(contradictions, mode
 def test_the_cause_is_found_without_tracks(contradictions, model, kind):
     wrong = contradictions.KINDS[kind](without_tracks(model), np.random.default_rng(0))
     assert any(word in cause for word in wrong.causes for cause in causes(found(wrong.model)))
+
+
+@pytest.mark.parametrize("axis", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+def test_a_turned_camera_without_tracks_is_named(model, axis):
+    rotations = model.rotations.copy()
+    rotations[5] = (
+        Rotation.from_rotvec(np.radians(170.0) * np.array(axis)).as_matrix() @ rotations[5]
+    )
+    turned = without_tracks(model).posed(rotations, model.centers)
+    (cause,) = found(turned).some_wrong
+    assert cause.views == (5,)
+
+
+def test_the_cause_is_found_if_the_colours_of_the_points_are_noisy(contradictions, model):
+    noise = np.random.default_rng(0).normal(0.0, 130.0, model.colors.shape)
+    colors = np.clip(model.colors + noise, 0, 255).astype(np.uint8)
+    right = replace(without_tracks(model), colors=colors)
+    assert 0.35 < found(right).correlation < 0.45
+    wrong = contradictions.KINDS["OpenGL axes"](right, np.random.default_rng(0))
+    assert any("OpenGL" in cause for cause in causes(found(wrong.model)))
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -146,7 +168,8 @@ def test_masked_pixels_are_no_contradiction(model):
 
     scene = model.scene()
     views = tuple(replace(view, photo=Half(view.photo)) for view in scene.views)
-    verdict = verdict_of(replace(scene, views=views), range(len(views)))
+    masked = replace(scene, views=views)
+    verdict = verdict_of(masked, range(len(views)), pixels_of(masked))
     assert not causes(verdict)
     assert verdict.in_frame > 0.95
 

@@ -246,8 +246,7 @@ def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
         refuse_settings_for_nothing(config, setup)
 
 
-def test_runs_of_before_go_on_as_they_began():
-    # A setting that a checkpoint does not know yet is none that was changed.
+def test_a_setting_that_a_checkpoint_does_not_know_counts_as_unchanged():
     config = setup_of().config
     stored = settings_of(config)
     del stored["position_lr"]

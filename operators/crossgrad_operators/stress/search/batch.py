@@ -1,17 +1,14 @@
 """Many short gradients at once: the rows of a block under granularity `gaussian`."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from crossgrad_core.plugin import EMPTY_STATE, Block, GramianOperator, LearningRate, Operator
 from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import context_of
 from crossgrad_operators.stress.search.families import Rows
-from crossgrad_operators.stress.search.numba_kernels.measure import directions_of
 
 #: The block whose rows are gradients of their own.
 BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
@@ -35,21 +32,6 @@ class Batch:
     def views(self) -> int:
         """K."""
         return int(self.rows.shape[1])
-
-    @property
-    def unit(self) -> float:
-        """Unit roundoff of the gradients' type."""
-        return float(torch.finfo(self.dtype).eps) / 2
-
-    @cached_property
-    def present(self) -> NDArray[np.bool_]:
-        """[B, K] which gradients are not zero."""
-        return np.asarray((self.rows != 0).any(axis=2))
-
-    @cached_property
-    def directions(self) -> tuple[Rows, Rows]:
-        """Norms [B, K, 2] and cosines [B, K, K, 2] in 32 digits."""
-        return directions_of(self.rows, self.present)
 
 
 def search_views(count: int, seed: int = 0) -> Views:

@@ -17,6 +17,18 @@ VIEWS, ELEMENTS = 20, 50
 USUAL: Final = "random"
 
 
+#: Numbers of views, and how often each is drawn: 50 digits take 1 ms for two views, 1 s for 20.
+_VIEWS: Final = np.arange(2, VIEWS + 1)
+_SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
+#: Cases of a batch, times K^2.
+_CASES: Final = 256
+
+
+def cases_of(views: int) -> int:
+    """The number of cases of a batch: fewer for more views, which take longer in 50 digits."""
+    return max(1, _CASES // views**2)
+
+
 def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
     """The rows in a type of gradients, as float64 numbers."""
     # Adding zero leaves no zero with a sign.
@@ -25,10 +37,10 @@ def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
 
 
 def sizes(rng: np.random.Generator, family: str) -> tuple[int, int]:
-    """K from 2 to 20 and P from 1 to 50; few of both half of the time, but for `USUAL`."""
-    few = family != USUAL and rng.random() < 0.5  # noqa: PLR2004
-    views, elements = (6, 8) if few else (VIEWS, ELEMENTS)
-    return int(rng.integers(2, views + 1)), int(rng.integers(1, elements + 1))
+    """K from 2 to 20, mostly few, and P: from 1 to 50 for `USUAL`, else at most about twice K."""
+    views = int(rng.choice(_VIEWS, p=_SHARES))
+    elements = ELEMENTS if family == USUAL else 2 * views + 3
+    return views, int(rng.integers(1, elements + 1))
 
 
 def _normal(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:

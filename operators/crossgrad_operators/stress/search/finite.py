@@ -14,7 +14,7 @@ from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_operators.stress.search.batch import Batch, results
 from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, rounded
 from crossgrad_operators.stress.search.samples import Sample
-from crossgrad_operators.stress.search.subject import Subject
+from crossgrad_operators.stress.suite import Subject
 
 #: Types of gradients.
 BOTH: Final = (torch.float32, torch.float64)

@@ -9,24 +9,18 @@ import numpy as np
 import torch
 
 from crossgrad_core.numerics.threads import on_one_thread
-from crossgrad_operators.stress.case import short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.runner import UNPROVEN, judged
 from crossgrad_operators.stress.search.batch import Batch, search_views
-from crossgrad_operators.stress.search.examine import Examined, examine, jumps
-from crossgrad_operators.stress.search.families import FAMILIES, rounded, sizes
+from crossgrad_operators.stress.search.examine import exact_case, examine, largest_jump
+from crossgrad_operators.stress.search.families import FAMILIES, cases_of, rounded, sizes
 from crossgrad_operators.stress.search.samples import mutants
 from crossgrad_operators.stress.search.shrink import shrunk
-from crossgrad_operators.stress.search.subject import Subject
 from crossgrad_operators.stress.search.worst_cases import WorstCases, specimen
-from crossgrad_operators.stress.verdict import ExactCase
+from crossgrad_operators.stress.suite import Subject
 
-#: Cases of a batch.
-BATCH = 64
-#: Cases that slow checks make do with.
-FEW = 16
-#: Views up to which a case of each round is also held against 50 digits, which take long for more.
-SAMPLED_VIEWS = 5
+#: Cases of a round that are moved by a little, which needs no exact arithmetic.
+JUMPS = 64
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,8 @@ def fresh(extent: Extent, turn: int) -> Batch:
     family = list(FAMILIES)[index % len(FAMILIES)]
     views, elements = sizes(rng, family)
     dtype = extent.dtypes[place]
-    return Batch(rounded(FAMILIES[family](rng, BATCH, views, elements), dtype), dtype, family)
+    rows = FAMILIES[family](rng, max(JUMPS, cases_of(views)), views, elements)
+    return Batch(rounded(rows, dtype), dtype, family)
 
 
 def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int]) -> None:
@@ -100,29 +95,21 @@ def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int
         return
     seed, turn = at
     rng = np.random.default_rng([seed, turn, crc32(subject.name.encode())])
-    size = BATCH
-    if subject.quick is None and subject.reference.rule is None:
-        # Held against laws alone, by running it again and again; it may be slow.
-        size = FEW
-        batch = Batch(batch.rows[:size], batch.dtype, batch.family)
-    examined = examine(subject, batch)
-    tally.add(examined, turn)
-    _sample(subject, tally, examined, turn)
-    if subject.quick is not None:
-        few = Batch(batch.rows[:FEW], batch.dtype, batch.family)
-        tally.jumped(few, jumps(subject, few, rng), turn)
+    examined = Batch(batch.rows[: cases_of(batch.views)], batch.dtype, batch.family)
+    tally.add(examined, examine(subject, examined), turn)
+    if subject.reference.oracle is not None:
+        _over_steps(subject, tally, batch, turn)
+        moved = Batch(batch.rows[:JUMPS], batch.dtype, batch.family)
+        jump = largest_jump(subject, moved, rng)
+        if jump is not None:
+            tally.jumped(specimen(moved, jump[0], turn, jump[1]))
     if tally.pool:
-        tally.add(examine(subject, mutants(rng, tally.pool, admitted, size)), turn)
+        variants = mutants(rng, tally.pool, admitted)
+        tally.add(variants, examine(subject, variants), turn)
 
 
-def _sample(subject: Subject, tally: WorstCases, examined: Examined, turn: int) -> None:
-    """Holds one case, over several steps, against the 50-digit oracle."""
-    batch = examined.batch
-    if batch.views > SAMPLED_VIEWS or subject.reference.oracle is None or examined.broken[0]:
-        return
-    case = ExactCase(short("sample", batch.rows[0], batch.dtype))
-    finding, _ = judged(subject.operator, case, subject.reference, search_views)
-    tally.sampled += finding.reason != UNPROVEN
+def _over_steps(subject: Subject, tally: WorstCases, batch: Batch, turn: int) -> None:
+    """Runs one case over several steps, for operators that remember."""
+    finding, _ = judged(subject.operator, exact_case(batch, 0), subject.reference, search_views)
     if finding.verdict == "failed" and finding.reason != UNPROVEN:
-        tally.broken += 1
-        tally.failures.append((specimen(examined, 0, turn), f"50 digits: {finding.reason}"))
+        tally.fail(specimen(batch, 0, turn), f"over several steps: {finding.reason}")

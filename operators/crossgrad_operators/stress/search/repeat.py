@@ -11,7 +11,7 @@ from crossgrad_operators.stress.case import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.runner import Cell, judged
 from crossgrad_operators.stress.search.batch import search_views
-from crossgrad_operators.stress.search.subject import Subject
+from crossgrad_operators.stress.suite import Subject
 from crossgrad_operators.stress.verdict import ExactCase, Finding
 
 

@@ -18,22 +18,20 @@ COUNTS = (
     "usual_outside",
     "unproven",
     "not_finite",
-    "sampled",
     "broken",
 )
 
 _HEAD = (
     f"{'operator':<16}{'type':<9}{'matrices':>9}{'outside':>9}{'usual':>8}{'error':>10}"
-    f"{'|u|':>10}{'jump':>10}{'infinite':>9}{'unproven':>9}{'sampled':>8}{'broken':>8}"
+    f"{'|u|':>10}{'jump':>10}{'infinite':>9}{'unproven':>9}{'broken':>8}"
 )
 LEGEND = (
     "outside: share outside the operator's set (docs/operators.md); usual: the same of gradients\n"
-    "  with K 2 to 20, P 1 to 50 and norms over seven decades; 1 % of these is allowed.\n"
+    "  with K 2 to 20 (mostly few), P 1 to 50, norms over seven decades; 1 % of these is allowed.\n"
     "error: the worst inside the set, in units of u kappa; |u|: the longest outside it, over the\n"
     "  longest gradient; jump: how far a result moves, over the longest gradient, where gradients\n"
     "  move by 1e-12 of themselves and the method is continuous.\n"
-    "infinite: results that are not finite; unproven: cases without a proven 32-digit answer;\n"
-    "  sampled: cases that were also held against 50 digits, over several steps."
+    "infinite: results that are not finite; unproven: cases without a proven 50-digit answer."
 )
 
 
@@ -78,7 +76,7 @@ def _line(tally: WorstCases) -> str:
     return (
         f"{tally.operator:<16}{tally.precision:<9}{tally.matrices:>9}{outside:>9.2%}"
         f"{tally.usual_share:>8.2%}{error:>10}{ratio:>10}{jump:>10}{tally.not_finite:>9}"
-        f"{tally.unproven:>9}{tally.sampled:>8}{tally.broken:>8}"
+        f"{tally.unproven:>9}{tally.broken:>8}"
     )
 
 

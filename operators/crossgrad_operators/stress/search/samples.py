@@ -8,7 +8,7 @@ import torch
 
 from crossgrad_core.plugin import ViewCounts
 from crossgrad_operators.stress.search.batch import Batch
-from crossgrad_operators.stress.search.families import ELEMENTS, VIEWS, Rows, rounded
+from crossgrad_operators.stress.search.families import ELEMENTS, VIEWS, Rows, cases_of, rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,18 +54,18 @@ MUTATED = ", mutated"
 Mutation = Callable[[np.random.Generator, Rows], Rows]
 
 
-def mutants(
-    rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewCounts, count: int
-) -> Batch:
-    """`count` variants of one of the parents, with a row or element less or more now and then."""
+def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewCounts) -> Batch:
+    """Variants of one of the parents, with a row or element less or more now and then."""
     parent = parents[int(rng.integers(len(parents)))]
     rows = parent.rows
     if rng.random() < 0.2:  # noqa: PLR2004
         reshaped = SHAPES[int(rng.integers(len(SHAPES)))](rng, rows)
         rows = reshaped if admitted.admits(len(reshaped)) else rows
-    batch = np.repeat(rows[None], count, axis=0)
+    batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    found = [change(rng, piece) for change, piece in zip(MUTATIONS, pieces, strict=True)]
+    # In any order, because the last pieces of a small batch are empty.
+    order = rng.permutation(len(MUTATIONS)).tolist()
+    found = [MUTATIONS[place](rng, piece) for place, piece in zip(order, pieces, strict=True)]
     result = rounded(np.nan_to_num(np.concatenate(found)), parent.dtype)
     return Batch(result, parent.dtype, parent.family.removesuffix(MUTATED) + MUTATED)
 

@@ -4,12 +4,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from crossgrad_operators.stress.search.batch import Batch
-from crossgrad_operators.stress.search.examine import Examined, examine
+from crossgrad_operators.stress.search.examine import examine
 from crossgrad_operators.stress.search.families import Rows, rounded
 from crossgrad_operators.stress.search.samples import Sample
-from crossgrad_operators.stress.search.subject import Subject
+from crossgrad_operators.stress.search.worst_cases import severity
+from crossgrad_operators.stress.suite import Subject
 
 #: What a smaller case must keep of the value.
 KEPT = 0.7
@@ -27,36 +29,38 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
     """
     least = KEPT * specimen.value
     while True:
-        for candidates in _smaller(subject, specimen):
-            batch = Batch(candidates, specimen.dtype, specimen.family)
-            values = _values(examine(subject, batch), inside=inside)
-            place = int(np.argmax(values))
-            if values[place] >= least:
-                rows, value = candidates[place], float(values[place])
+        for rows in _smaller(subject, specimen.rows, specimen.dtype):
+            batch = Batch(rows[None], specimen.dtype, specimen.family)
+            value = severity(examine(subject, batch)[0], inside=inside)
+            if value >= least:
                 specimen = replace(specimen, rows=rows, value=value)
                 break
         else:
             return specimen
 
 
-def _values(examined: Examined, *, inside: bool) -> np.ndarray:
-    of_kind = examined.inside if inside else ~examined.inside
-    value = examined.error if inside else examined.ratio
-    return np.where(of_kind & examined.finite, value, -1.0)
-
-
-def _smaller(subject: Subject, specimen: Sample) -> Iterator[Rows]:
-    """[B, K', P'] cases with one row or element less, then with fewer digits."""
-    rows = specimen.rows
-    views, elements = rows.shape
-    if views > 2 and subject.operator.views.admits(views - 1):  # noqa: PLR2004
-        yield np.stack([np.delete(rows, k, axis=0) for k in range(views)])
-    if elements > 1:
-        yield np.stack([np.delete(rows, p, axis=1) for p in range(elements)])
+def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]:
+    """Cases with fewer rows or elements (half of them, a quarter, ... one), then fewer digits."""
+    for part in _parts(len(rows), least=2):
+        if subject.operator.views.admits(len(rows) - len(part)):
+            yield np.delete(rows, part, axis=0)
+    for part in _parts(rows.shape[1], least=1):
+        yield np.delete(rows, part, axis=1)
     for digits in DIGITS:
-        short = rounded(_to_digits(rows, digits), specimen.dtype)
+        short = rounded(_to_digits(rows, digits), dtype)
         if not np.array_equal(short, rows):
-            yield short[None]
+            yield short
+
+
+def _parts(count: int, least: int) -> Iterator[range]:
+    """Ranges of places to leave out, the longest first; at least `least` places are left."""
+    size = count // 2
+    while size:
+        for first in range(0, count, size):
+            part = range(first, min(first + size, count))
+            if count - len(part) >= least:
+                yield part
+        size //= 2
 
 
 def _to_digits(rows: Rows, digits: int) -> Rows:

@@ -1,18 +1,21 @@
 """Findings of a search for one operator in one precision."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import isnan
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from crossgrad_operators.stress.runner import UNPROVEN
 from crossgrad_operators.stress.search.batch import Batch
-from crossgrad_operators.stress.search.examine import Examined
 from crossgrad_operators.stress.search.families import USUAL
 from crossgrad_operators.stress.search.samples import Sample
+from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 
 #: Cases that mutants are made from, of either kind.
 POOL = 8
+#: Views of these cases at most: 50 digits take long for more.
+MUTATED_VIEWS = 8
 #: Share of the longest gradient by which a continuous method moves at most.
 JUMP = 1e-3
 #: Cases that break a promise, kept for the report.
@@ -33,7 +36,6 @@ class WorstCases:
         unproven: Cases without a proven reference.
         not_finite: Cases with a result that is not finite.
         broken: Cases that break a promise.
-        sampled: Cases that were also held against 50 digits.
         inside_pool: Cases of the largest error inside the set, the worst first.
         outside_pool: Cases of the largest |u| outside it, over the longest gradient.
         jump: The case whose result moves most where the method is continuous.
@@ -49,7 +51,6 @@ class WorstCases:
     unproven: int = 0
     not_finite: int = 0
     broken: int = 0
-    sampled: int = 0
     inside_pool: list[Sample] = field(default_factory=list)
     outside_pool: list[Sample] = field(default_factory=list)
     jump: Sample | None = None
@@ -57,8 +58,9 @@ class WorstCases:
 
     @property
     def pool(self) -> list[Sample]:
-        """What mutants are made from."""
-        return [*self.inside_pool, *self.outside_pool]
+        """The cases that mutants are made from."""
+        worst = [*self.inside_pool, *self.outside_pool]
+        return [sample for sample in worst if len(sample.rows) <= MUTATED_VIEWS]
 
     @property
     def precision(self) -> str:
@@ -70,59 +72,62 @@ class WorstCases:
         """Share of usual cases outside the set."""
         return self.usual_outside / max(self.usual, 1)
 
-    def add(self, examined: Examined, turn: int) -> None:
+    def add(self, batch: Batch, findings: Sequence[Finding], turn: int) -> None:
         """Counts a batch and keeps its worst cases."""
-        outside = ~examined.inside
-        self.matrices += len(outside)
-        self.outside += int(outside.sum())
-        if examined.batch.family == USUAL:
-            self.usual += len(outside)
-            self.usual_outside += int(outside.sum())
-        self.unproven += int((examined.finite & ~examined.known).sum())
-        self.not_finite += int((~examined.finite).sum())
-        self.broken += int(examined.broken.sum())
-        inside_error = np.where(examined.inside & examined.finite, examined.error, 0.0)
-        self.inside_pool = _worst(self.inside_pool, examined, inside_error, turn)
-        ratio = np.where(outside & examined.finite, examined.ratio, 0.0)
-        self.outside_pool = _worst(self.outside_pool, examined, ratio, turn)
-        for place in np.flatnonzero(examined.broken)[: KEPT - len(self.failures)]:
-            self.failures.append((specimen(examined, place, turn), _reason(examined, place)))
+        outside = sum(finding.is_outside for finding in findings)
+        self.matrices += len(findings)
+        self.outside += outside
+        if batch.family == USUAL:
+            self.usual += len(findings)
+            self.usual_outside += outside
+        errors = [severity(finding, inside=True) for finding in findings]
+        self.inside_pool = _worst(self.inside_pool, batch, errors, turn)
+        ratios = [severity(finding, inside=False) for finding in findings]
+        self.outside_pool = _worst(self.outside_pool, batch, ratios, turn)
+        for place, finding in enumerate(findings):
+            self.unproven += finding.reason == UNPROVEN
+            self.not_finite += finding.reason == NOT_FINITE
+            if finding.verdict == "failed" and finding.reason != UNPROVEN:
+                self.fail(specimen(batch, place, turn), finding.reason)
 
-    def jumped(self, batch: Batch, jumps: NDArray[np.float64], turn: int) -> None:
-        """Counts results that move too much, and keeps the worst."""
-        place = int(np.argmax(jumps))
-        value = float(jumps[place])
-        found = Sample(batch.rows[place].copy(), batch.dtype, batch.family, turn, value)
-        if self.jump is None or value > self.jump.value:
+    def fail(self, sample: Sample, reason: str) -> None:
+        """Counts a case that breaks a promise; the first ones are kept for the report."""
+        self.broken += 1
+        if len(self.failures) < KEPT:
+            self.failures.append((sample, reason))
+
+    def jumped(self, found: Sample) -> None:
+        """Counts a result that moves too much, and keeps the worst."""
+        if self.jump is None or found.value > self.jump.value:
             self.jump = found
-        if value > JUMP:
-            self.broken += int((jumps > JUMP).sum())
-            reason = f"moves by {value:.3g} of the longest gradient where the gradients do by 1e-12"
+        if found.value > JUMP:
+            self.broken += 1
+            moved = f"moves by {found.value:.3g} of the longest gradient"
             # Before the others, which are many more and would leave no place.
-            self.failures = [(found, reason), *self.failures][:KEPT]
+            jump = (found, f"{moved} where the gradients do by 1e-12")
+            self.failures = [jump, *self.failures][:KEPT]
 
 
-def specimen(examined: Examined, place: int, turn: int, value: float = 0.0) -> Sample:
+def severity(finding: Finding, *, inside: bool) -> float:
+    """The error inside the set, or |u| over the longest gradient outside; 0 if there is none."""
+    if not inside:
+        return finding.ratio if finding.is_outside else 0.0
+    excused = finding.is_outside or finding.verdict == "undetermined"
+    known = not (excused or isnan(finding.error) or finding.reason == NOT_FINITE)
+    return finding.error if known else 0.0
+
+
+def specimen(batch: Batch, place: int, turn: int, value: float = 0.0) -> Sample:
     """A case of a batch by itself."""
-    batch = examined.batch
     return Sample(batch.rows[place].copy(), batch.dtype, batch.family, turn, value)
 
 
-def _worst(
-    pool: list[Sample], examined: Examined, values: NDArray[np.float64], turn: int
-) -> list[Sample]:
+def _worst(pool: list[Sample], batch: Batch, values: Sequence[float], turn: int) -> list[Sample]:
     """The worst cases of a pool and a batch together."""
     last = pool[-1].value if len(pool) == POOL else 0.0
-    places = [int(i) for i in np.argsort(-values, kind="stable")[:2] if values[i] > last]
+    ranked = sorted(range(len(values)), key=lambda place: -values[place])
+    places = [place for place in ranked[:2] if values[place] > last]
     if not places:
         return pool
-    found = [specimen(examined, place, turn, float(values[place])) for place in places]
+    found = [specimen(batch, place, turn, values[place]) for place in places]
     return sorted([*pool, *found], key=lambda each: -each.value)[:POOL]
-
-
-def _reason(examined: Examined, place: int) -> str:
-    if not examined.finite[place]:
-        return "not finite"
-    if examined.inside[place]:
-        return f"error {examined.error[place]:.3g} u kappa inside the set"
-    return f"{examined.ratio[place]:.3g} times the longest gradient outside the set"

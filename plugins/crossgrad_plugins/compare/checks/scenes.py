@@ -124,7 +124,7 @@ def _photos(run: Run) -> str:
 
 
 def _mark(file: object) -> object:
-    """Return what runs of all versions know a file by: its size and the digest of its ends."""
+    """Return what a file is known by: its size and the digest of its ends."""
     return [file.get("bytes"), file.get("sha256")] if isinstance(file, dict) else file
 
 

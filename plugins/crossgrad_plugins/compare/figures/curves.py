@@ -1,125 +1,131 @@
-"""Quality over what was spent, a panel for each scene, with bands over seeds."""
+"""Figures with a panel for each scene: quality and primitives over a cost, frontier, regimes."""
 
-from collections.abc import Sequence
-from math import ceil
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crossgrad_plugins.compare.comparison import Comparison
+from crossgrad_plugins.compare.comparison import OVERALL, Comparison
 from crossgrad_plugins.compare.cost import Cost
-from crossgrad_plugins.compare.figures.style import (
-    PAGE,
-    Drawn,
-    Look,
-    drawn,
-    legend,
-    literal,
-    looks,
-    new_figure,
-    panel_title,
-    styled,
-)
+from crossgrad_plugins.compare.figures.panels import Grid, draw_bands
+from crossgrad_plugins.compare.figures.style import Drawn, literal, looks
 from crossgrad_plugins.compare.quantity import Quantity
-from crossgrad_plugins.compare.run import Array, Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_IN_A_ROW = 4
-#: A line of so few points has markers; on others they would hide it.
-_MOST_MARKERS = 4
-#: Points of a line; seeds that are evaluated at other seconds would give too many.
-_MOST_POINTS = 60
 #: The first evaluations, far below the others, may be cut off: lower quantile that stays.
-_KEPT = 0.22
+_KEPT: Final = 0.22
+_COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
+#: Room that the signs of all arms take beside each other, of the distance between two groups.
+_SPREAD: Final = 0.62
 
 
-def draw_curves(comparison: Comparison, cost: Cost) -> Drawn:
-    """The curves of all arms over one cost."""
-    scenes = comparison.scenes
-    columns = min(_IN_A_ROW, len(scenes))
-    rows = ceil(len(scenes) / columns)
-    look = looks([arm.name for arm in comparison.arms])
-    with styled():
-        wide = PAGE if columns > 1 else PAGE * 0.62
-        figure = new_figure(wide, 0.45 + 1.95 * rows)
-        axes = figure.subplots(rows, columns, squeeze=False)
-        for index, scene in enumerate(scenes):
-            ax = axes.flat[index]
-            _panel(ax, comparison, cost, scene, look)
-            panel_title(ax, scene)
-            if index % columns == 0:
-                ax.set_ylabel(comparison.quantity.with_unit)
-            if index + columns >= len(scenes):
-                ax.set_xlabel(cost.axis)
-        for ax in axes.flat[len(scenes) :]:
-            ax.set_axis_off()
-        legend(figure, axes.flat[0], list(look))
-        return drawn(
-            figure,
-            f"curves_{cost.name}",
-            f"{comparison.quantity.label} over {cost.title}",
-            "Held-out views; lines are means over seeds, bands reach from the lowest to the "
-            "highest seed. Seconds leave out compiling, loading and evaluating.",
-        )
+def draw_curves(c: Comparison, cost: Cost) -> Drawn:
+    """Draw the figure of all arms over one cost."""
+
+    def panel(ax: "Axes", scene: str) -> None:
+        limits = draw_bands(ax, c, scene, c.quantity, cost)
+        low = min((np.quantile(each, _KEPT) for each in limits[::2]), default=0.0)
+        high = max((each.max() for each in limits[1::2]), default=0.0)
+        if high > low:
+            ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+
+    return Grid(
+        f"curves_{cost.name}",
+        f"{c.quantity.label} over {cost.title}",
+        "Held-out views; lines are means over seeds, bands reach from the lowest to the "
+        "highest seed. Seconds leave out compiling, loading and evaluating.",
+        y=c.quantity.with_unit,
+        x=cost.axis,
+    ).by_scene(c, panel)
 
 
-def _panel(
-    ax: "Axes", comparison: Comparison, cost: Cost, scene: str, look: dict[str, Look]
-) -> None:
-    lows, highs = [], []
-    for arm, by in comparison.main.items():
-        runs = [run for (at, _), run in by.items() if at == scene]
-        found = band(runs, comparison.quantity, cost)
-        # An arm without a run on this scene still stands in the legend.
-        x, low, middle, high = found if found is not None else (np.empty(0),) * 4
-        marks = look[arm].marker if 0 < len(x) <= _MOST_MARKERS else ""
-        ax.fill_between(x, low, high, color=look[arm].color, alpha=0.18, linewidth=0)
-        ax.plot(
-            x,
-            middle,
-            color=look[arm].color,
-            linestyle=look[arm].dash,
-            marker=marks,
-            label=literal(arm),
-        )
-        if len(x):
-            lows.append(np.quantile(low, _KEPT))
-            highs.append(high.max())
-    _limit(ax, lows, highs)
-    ax.set_xlim(left=0.0)
-    ax.locator_params(axis="x", nbins=5)
+def draw_primitives(c: Comparison, cost: Cost) -> Drawn:
+    """Draw the number of primitives of all arms over one cost, in thousands."""
+
+    def panel(ax: "Axes", scene: str) -> None:
+        draw_bands(ax, c, scene, _COUNT, cost, 1e3)
+        ax.set_ylim(bottom=0.0)
+
+    return Grid(
+        "primitives",
+        "Primitives over the run",
+        "At each evaluation; bands reach from the lowest to the highest seed.",
+        y="thousand primitives",
+        x=cost.axis,
+        height=1.6,
+    ).by_scene(c, panel)
 
 
-def _limit(ax: "Axes", lows: Sequence[float], highs: Sequence[float]) -> None:
-    """Shows where the arms differ: the first, steep part of the curves would flatten the rest."""
-    if lows and max(highs) > min(lows):
-        room = 0.06 * (max(highs) - min(lows))
-        ax.set_ylim(min(lows) - room, max(highs) + room)
-
-
-def band(
-    runs: Sequence[Run], quantity: Quantity, cost: Cost
-) -> tuple[Array, Array, Array, Array] | None:
-    """What was spent, and the lowest, mean and highest figure over seeds there.
-
-    Between its evaluations a run's figure is interpolated; outside of what all runs have there is
-    nothing.
-
-    Returns:
-        Four arrays [n]; None where no run has a curve.
-    """
-    series = [run.series(quantity.name, cost) for run in runs]
-    known = [(x, y) for x, y in series if len(x)]
-    if not known:
+def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
+    """Draw final quality over what whole runs spent; None if all runs have one length."""
+    if not c.cells.several:
         return None
-    first, last = max(x[0] for x, _ in known), min(x[-1] for x, _ in known)
-    grid = np.unique(np.concatenate([x for x, _ in known]))
-    grid = grid[(grid >= first) & (grid <= last)]
-    if not len(grid):
-        return None
-    if len(grid) > _MOST_POINTS:
-        grid = np.unique(np.append(np.linspace(first, last, _MOST_POINTS), last))
-    values = np.stack([np.interp(grid, x, y) for x, y in known])
-    return grid, values.min(axis=0), values.mean(axis=0), values.max(axis=0)
+    look = looks([arm.name for arm in c.arms])
+
+    def panel(ax: "Axes", scene: str) -> None:
+        from matplotlib.ticker import LogLocator, NullLocator
+
+        for arm in c.main:
+            own = [p for p in c.points if (p.arm, p.scene) == (arm, scene) and cost.name in p.spent]
+            own = sorted(own, key=lambda p: p.spent[cost.name])
+            ax.errorbar(
+                [point.spent[cost.name] for point in own],
+                [point.mean for point in own],
+                yerr=np.nan_to_num([point.spread for point in own]),
+                color=look[arm].color,
+                marker=look[arm].marker,
+                linestyle=look[arm].dash,
+                capsize=2.0,
+                label=literal(arm),
+            )
+        ax.set_xscale("log")
+        # Numbers as people write them: 300 and 600 instead of powers of ten.
+        ax.xaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter("{x:,g}")
+        ax.xaxis.set_minor_locator(NullLocator())
+
+    return Grid(
+        "frontier",
+        "The frontier: final quality over the length of the run",
+        "Each point is the end of runs of one length, their schedules stretched to it; error "
+        "bars are standard deviations over seeds.",
+        y=f"final {c.quantity.with_unit}",
+        x=f"{cost.axis}, whole run",
+    ).by_scene(c, panel)
+
+
+def draw_regimes(c: Comparison) -> Drawn:
+    """Draw the final figure of each arm, overall and by regime."""
+    look = looks([arm.name for arm in c.arms])
+
+    def panel(ax: "Axes", scene: str) -> None:
+        on_scene = [run for run in c.runs if run.scene == scene]
+        regimes = list(dict.fromkeys(regime for run in on_scene for regime in run.results.regimes))
+        groups: list[str | None] = [None, *(regimes if len(regimes) > 1 else [])]
+        gaps = max(1, len(c.main) - 1)
+        for index, (arm, by) in enumerate(c.main.items()):
+            shift = _SPREAD * (index / gaps - 0.5) if len(c.main) > 1 else 0.0
+            runs = [run for (at, _), run in by.items() if at == scene]
+            for place, regime in enumerate(groups):
+                at = place + shift
+                values = [v for run in runs if (v := run.final(c.quantity.name, regime))
+                          is not None]  # fmt: skip
+                ax.plot([at] * len(values), values, look[arm].marker, markersize=3.2,
+                        color=look[arm].color, alpha=0.75, markeredgewidth=0,
+                        label=None if regime else literal(arm))  # fmt: skip
+                if values:
+                    half = 0.4 * _SPREAD / gaps
+                    ax.plot([at - half, at + half], [np.mean(values)] * 2,
+                            color=look[arm].color, linewidth=1.6)  # fmt: skip
+        ax.set_xticks(range(len(groups)), [literal(group or OVERALL) for group in groups])
+        ax.set_xlim(-0.6, len(groups) - 0.4)
+        ax.grid(visible=False, axis="x")
+
+    return Grid(
+        "regimes",
+        "Each regime beside all views",
+        "At the ends of the runs. A small sign is a run, the bar the mean over its seeds.",
+        y=c.quantity.with_unit,
+        height=1.75,
+    ).by_scene(c, panel)

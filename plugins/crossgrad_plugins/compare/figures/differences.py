@@ -1,11 +1,11 @@
 """Paired differences with their intervals, beside the margin."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from itertools import groupby
+from typing import TYPE_CHECKING, Final
 
 from crossgrad_plugins.compare.comparison import OVERALL, Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
-from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.style import (
     FAINT,
     INK,
@@ -19,49 +19,54 @@ from crossgrad_plugins.compare.figures.style import (
     styled,
     wrapped,
 )
+from crossgrad_plugins.compare.narrative import where_text
 from crossgrad_plugins.compare.statistics.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 #: More rows than these would not fit on a page.
-MOST_ROWS = 24
+_MOST_ROWS: Final = 24
 #: How far intervals are above the middle of their row; the signs of pairs are below it.
-_ABOVE = 0.12
+_ABOVE: Final = 0.12
 #: Letters of a line of a heading, and the height of each further line in rows.
 _LETTERS, _LINE = 70, 0.6
-_COLORS = {
+_COLORS: Final = {
     Verdict.DIFFERENT: "#D55E00",
     Verdict.EQUIVALENT: "#009E73",
     Verdict.INCONCLUSIVE: "#666666",
 }
-_TITLES = {cost.name: f"equal {cost.title}" for cost in COSTS}
 
 
-def draw_differences(comparison: Comparison) -> Drawn | None:
-    """All contrasts of the main figure; None with a single arm."""
-    rows = [*comparison.ends, *comparison.equal, *_by_regime(comparison)][:MOST_ROWS]
+def draw_differences(c: Comparison) -> Drawn | None:
+    """Draw all contrasts of the main figure; None with a single arm."""
+    by_regime = (each for each in c.regimes if each.where != OVERALL)
+    rows = [*c.ends, *c.equal, *by_regime][:_MOST_ROWS]
     if not rows:
         return None
-    rows = [row for arms in _headings(rows) for row in rows if _arms(row) == arms]
-    scenes = comparison.scenes
+    order = list(dict.fromkeys(map(_heading, rows)))
+    rows.sort(key=lambda row: order.index(_heading(row)))
+    margin = c.quantity.margin
     with styled():
-        headings = [_heading(*arms) for arms in _headings(rows)]
-        lines = sum(1.0 + _LINE * text.count("\n") for text in headings)
+        lines = sum(1.0 + _LINE * text.count("\n") for text in order)
         figure = new_figure(PAGE, 0.75 + 0.24 * (len(rows) + lines))
         ax = figure.subplots()
-        _margin(ax, comparison.quantity.margin)
-        ticks = _draw(ax, rows, scenes)
-        ax.set_yticks([place for place, _ in ticks], [text for _, text in ticks])
-        ax.set_ylim(ticks[-1][0] + 0.6, -0.6)
+        ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
+        ax.axvline(0.0, color=FAINT, linewidth=0.8)
+        # The axis ends with the pairs: a row of two pairs may have an interval of many dB.
+        dots = [pair.difference for row in rows for pair in row.pairs]
+        low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
+        ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+        places = _draw(ax, rows, c.scenes)
+        ax.set_yticks(places, [literal(where_text(row)) for row in rows])
+        ax.set_ylim(places[-1] + 0.6, -0.6)
         ax.grid(visible=False, axis="y")
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
-        ax.set_xlabel(f"difference in {comparison.quantity.with_unit}, first minus second arm")
-        _key(figure, rows, scenes)
-        _limit(ax, rows)
-        _mark_cut(ax, rows, [place for place, _ in ticks])
+        ax.set_xlabel(f"difference in {c.quantity.with_unit}, first minus second arm")
+        handles = _key(rows, c.scenes)
+        legend_above(figure, handles, [str(handle.get_label()) for handle in handles], 6)
         return drawn(
             figure,
             "differences",
@@ -69,108 +74,61 @@ def draw_differences(comparison: Comparison) -> Drawn | None:
             "Each small sign is a pair of runs on one scene with one seed. The bar is the 95 % "
             "interval, its thick part the 90 % interval, the large sign the estimate; an "
             "arrowhead says that the interval goes on beyond the axis; the grey "
-            f"band is the margin of {comparison.quantity.margin:g} "
-            f"{comparison.quantity.unit}.".replace(" .", "."),
+            f"band is the margin of {f'{margin:g} {c.quantity.unit}'.strip()}.",
         )
 
 
-def where_text(contrast: Contrast) -> str:
-    """Where a contrast was taken, as a row is called."""
-    text = _TITLES.get(contrast.where, contrast.where)
-    return f"{text} *" if contrast.inside else text
-
-
-def _by_regime(comparison: Comparison) -> list[Contrast]:
-    return [each for each in comparison.regimes if each.where != OVERALL]
-
-
-def _headings(rows: Sequence[Contrast]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys(map(_arms, rows)))
-
-
-def _heading(first: str, second: str) -> str:
+def _heading(row: Contrast) -> str:
     """Return the names of two arms, on several lines if one line is too short for them."""
-    return wrapped(literal(f"{first}  \u2212  {second}"), _LETTERS)
+    return wrapped(literal(f"{row.first}  \u2212  {row.second}"), _LETTERS)
 
 
-def _arms(row: Contrast) -> tuple[str, str]:
-    return row.first, row.second
-
-
-def _margin(ax: "Axes", margin: float) -> None:
-    ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
-    ax.axvline(0.0, color=FAINT, linewidth=0.8)
-
-
-def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[tuple[float, str]]:
-    """Draws the rows below headings; answers the labels of the axis with their places."""
-    ticks: list[tuple[float, str]] = []
+def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[float]:
+    """Draw the rows below the headings of their arms, and return the place of each row."""
+    places: list[float] = []
     place = 0.0
-    for first, second in _headings(rows):
-        text = _heading(first, second)
-        place += _LINE * text.count("\n")
-        ax.text(0.0, place + 0.25, text, fontweight="bold",
+    for heading, own in groupby(rows, _heading):
+        place += _LINE * heading.count("\n")
+        ax.text(0.0, place + 0.25, heading, fontweight="bold",
                 transform=ax.get_yaxis_transform())  # fmt: skip
+        for row in own:
+            place += 1.0
+            _row(ax, row, place, scenes)
+            places.append(place)
         place += 1.0
-        for row in rows:
-            if _arms(row) == (first, second):
-                _row(ax, row, place, scenes)
-                ticks.append((place, f"{literal(where_text(row))}"))
-                place += 1.0
-    return ticks
+    return places
 
 
 def _row(ax: "Axes", row: Contrast, place: float, scenes: Sequence[str]) -> None:
-    color = _COLORS[row.verdict]
-    for scene in scenes:
+    color, estimate = _COLORS[row.verdict], row.estimate
+    for index, scene in enumerate(scenes):
         own = [pair.difference for pair in row.pairs if pair.scene == scene]
-        marker = MARKERS[scenes.index(scene) % len(MARKERS)]
-        ax.plot(
-            own, [place + 0.2] * len(own), marker, color=FAINT, alpha=0.55, markersize=2.4,
-            markeredgewidth=0,
-        )  # fmt: skip
-    found = row.estimate
-    if found is None:
+        ax.plot(own, [place + 0.2] * len(own), MARKERS[index % len(MARKERS)], color=FAINT,
+                alpha=0.55, markersize=2.4, markeredgewidth=0)  # fmt: skip
+    if estimate is None:
         return
-    if found.pairs > 1:
-        ax.plot(found.wide, [place - _ABOVE] * 2, color=color, linewidth=1.1)
-        ax.plot(found.narrow, [place - _ABOVE] * 2, color=color, linewidth=2.8)
-    ax.plot([found.center], [place - _ABOVE], "o", color=color, markersize=5, markeredgecolor=INK,
+    above = place - _ABOVE
+    if estimate.pairs > 1:
+        ax.plot(estimate.wide, [above] * 2, color=color, linewidth=1.1)
+        ax.plot(estimate.narrow, [above] * 2, color=color, linewidth=2.8)
+        (first, last), (low, high) = estimate.wide, ax.get_xlim()
+        for end, marker, is_cut in ((low, "<", first < low), (high, ">", last > high)):
+            if is_cut:
+                ax.plot([end], [above], marker, color=color, markersize=5, markeredgewidth=0,
+                        clip_on=False)  # fmt: skip
+    ax.plot([estimate.center], [above], "o", color=color, markersize=5, markeredgecolor=INK,
             markeredgewidth=0.5)  # fmt: skip
 
 
-def _mark_cut(ax: "Axes", rows: Sequence[Contrast], places: Sequence[float]) -> None:
-    """Draw an arrowhead where an interval goes on beyond the axis."""
-    low, high = ax.get_xlim()
-    for row, place in zip(rows, places, strict=True):
-        if row.estimate is None or row.estimate.pairs == 1:
-            continue
-        first, last = row.estimate.wide
-        for end, marker, is_cut in ((low, "<", first < low), (high, ">", last > high)):
-            if is_cut:
-                ax.plot([end], [place - _ABOVE], marker, color=_COLORS[row.verdict],
-                        markersize=5, markeredgewidth=0, clip_on=False)  # fmt: skip
-
-
-def _key(figure: "Figure", rows: Sequence[Contrast], scenes: Sequence[str]) -> None:
-    """Put what colours and signs mean above the panel."""
+def _key(rows: Sequence[Contrast], scenes: Sequence[str]) -> list["Line2D"]:
+    """Return what colours and signs mean."""
     from matplotlib.lines import Line2D
 
-    present = [verdict for verdict in Verdict if any(row.verdict == verdict for row in rows)]
-    handles = [Line2D([], [], color=_COLORS[v], linewidth=2.8, label=str(v)) for v in present]
-    handles += [
+    present = {row.verdict for row in rows}
+    verdicts = [Line2D([], [], color=color, linewidth=2.8, label=str(verdict))
+                for verdict, color in _COLORS.items() if verdict in present]  # fmt: skip
+    return verdicts + [
         Line2D([], [], color=FAINT, linestyle="", marker=MARKERS[index % len(MARKERS)],
                markersize=3, label=literal(scene))
         for index, scene in enumerate(scenes)
     ]  # fmt: skip
-    labels = [str(handle.get_label()) for handle in handles]
-    legend_above(figure, handles, labels, 6)
-
-
-def _limit(ax: "Axes", rows: Sequence[Contrast]) -> None:
-    """A row of two pairs has an interval of many dB; it runs out of the figure."""
-    dots = [pair.difference for row in rows for pair in row.pairs]
-    margin = rows[0].quantity.margin
-    low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
-    room = 0.1 * (high - low)
-    ax.set_xlim(low - room, high + room)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from crossgrad_core.commands import one_line, showable
-from crossgrad_plugins.compare.figures.fonts import fall_back, family
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +31,7 @@ _RC: Final[Any] = {
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlesize": 8.5,
+    "font.family": "DejaVu Sans",
     "font.size": 8,
     "grid.color": GRID,
     "grid.linewidth": 0.6,
@@ -113,7 +113,7 @@ def styled() -> Iterator[None]:
     """Figures inside have this style; signs that a font lacks are no warning."""
     from matplotlib import rc_context
 
-    with rc_context({**_RC, "font.family": family()}), warnings.catch_warnings():
+    with rc_context(_RC), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
@@ -134,7 +134,6 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    fall_back(figure)
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)

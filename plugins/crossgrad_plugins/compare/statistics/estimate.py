@@ -1,16 +1,14 @@
 """A difference estimated from pairs of runs, with intervals and p-values."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import ceil, inf, nan
-from typing import Final, TypeAlias
+from dataclasses import dataclass, replace
+from math import ceil, inf, nan, sqrt
+from typing import Final, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.compare.statistics import student
-from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap
-from crossgrad_plugins.compare.statistics.iqm import iqm
+from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap, iqm
 
 #: From so many pairs on the interval comes from the bootstrap.
 BOOTSTRAP_FROM: Final = 10
@@ -20,7 +18,8 @@ MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 
 Interval: TypeAlias = tuple[float, float]
-_Found: TypeAlias = tuple[float, Interval, Interval, float, float, float, int | None]
+#: Nobody trains more pairs than this for one comparison.
+MOST_PAIRS: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -65,13 +64,13 @@ class Estimate:
     margin: float
     center: float
     method: str
-    wide: Interval
-    narrow: Interval
-    deviation: float
-    p_different: float
-    p_equivalent: float
-    p_above: float
-    needed: int | None
+    wide: Interval = _UNKNOWN
+    narrow: Interval = _UNKNOWN
+    deviation: float = nan
+    p_different: float = nan
+    p_equivalent: float = nan
+    p_above: float = nan
+    needed: int | None = None
     by_scene: tuple[SceneEstimate, ...] = ()
 
     @property
@@ -85,8 +84,21 @@ class Estimate:
         return -self.margin < self.narrow[0] and self.narrow[1] < self.margin
 
 
+class Law(Protocol):
+    """The law of an estimate: SciPy's Student's t, or a bootstrap."""
+
+    def interval(self, level: float) -> Interval:
+        """Return the two-sided interval of a level such as 0.95."""
+
+    def cdf(self, border: float) -> float:
+        """Return the p-value of an estimate of at most `border`."""
+
+    def sf(self, border: float) -> float:
+        """Return the p-value of an estimate of at least `border`."""
+
+
 def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
-    """The estimate from differences of pairs.
+    """Estimate a difference from pairs of runs.
 
     Args:
         differences: One per pair, all finite; at least one.
@@ -94,61 +106,77 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
         margin: What counts as no difference in practice.
     """
     values = np.asarray(differences, dtype=np.float64)
-    enough = len(values) >= BOOTSTRAP_FROM
-    found = _by_bootstrap(values, scenes, margin) if enough else _by_student(values, margin)
-    center, wide, narrow, different, equivalent, above, needed = found
-    return Estimate(
+    by_bootstrap = len(values) >= BOOTSTRAP_FROM
+    common = Estimate(
         pairs=len(values),
         scenes=len(set(scenes)),
         margin=margin,
-        center=center,
-        method=IQM if enough else MEAN,
-        wide=wide,
-        narrow=narrow,
-        deviation=_deviation(values),
-        p_different=different,
-        p_equivalent=equivalent,
-        p_above=above,
-        needed=needed,
+        center=float(iqm(values) if by_bootstrap else values.mean()),
+        method=IQM if by_bootstrap else MEAN,
         by_scene=_by_scene(values, scenes),
     )
+    if len(values) == 1:
+        return common
+    law: Law = Bootstrap.of(values, scenes) if by_bootstrap else student(values)
+    deviation, narrow = float(values.std(ddof=1)), _floats(law.interval(NARROW))
+    above, below = float(law.sf(margin)), float(law.cdf(-margin))
+    return replace(
+        common,
+        wide=_floats(law.interval(WIDE)),
+        narrow=narrow,
+        deviation=deviation,
+        p_different=min(1.0, 2.0 * float(min(law.sf(0.0), law.cdf(0.0)))),
+        p_equivalent=max(above, below),
+        p_above=above,
+        needed=_wider(narrow, len(values), margin)
+        if by_bootstrap
+        else pairs_needed(deviation, margin),
+    )
+
+
+def student(values: NDArray[np.float64]) -> Law:
+    """Return Student's law of the mean of two values or more."""
+    from scipy.stats import t
+
+    error = float(values.std(ddof=1)) / sqrt(len(values))
+    if error == 0.0:
+        return Bootstrap(values[:1], len(values) - 1)  # SciPy takes no scale of 0.
+    law: Law = t(len(values) - 1, loc=values.mean(), scale=error)
+    return law
+
+
+def pairs_needed(deviation: float, margin: float) -> int | None:
+    """Return how many pairs make the 90 % interval of a mean at most as wide as the margins.
+
+    Args:
+        deviation: Standard deviation of the pairs' differences.
+        margin: The margin, above 0.
+
+    Returns:
+        The number; None if it is above 1,000.
+    """
+    from scipy.special import stdtrit
+
+    pairs = np.arange(2, MOST_PAIRS + 1)
+    enough = pairs[stdtrit(pairs - 1, 0.5 + NARROW / 2.0) * deviation <= margin * np.sqrt(pairs)]
+    return int(enough[0]) if len(enough) else None
+
+
+def _wider(narrow: Interval, pairs: int, margin: float) -> int | None:
+    """Return the same for an interquartile mean, from the interval that it has with these pairs."""
+    needed = pairs * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
+    return max(2, ceil(needed)) if needed <= MOST_PAIRS else None
 
 
 def _by_scene(values: NDArray[np.float64], scenes: Sequence[str]) -> tuple[SceneEstimate, ...]:
     names = np.asarray(scenes)
-    found = []
-    for scene in dict.fromkeys(scenes):
-        own = values[names == scene]
-        if 1 < len(own) < len(values):
-            law = student.Law.of(own)
-            found.append(SceneEstimate(scene, law.center, law.interval(WIDE)))
-    return tuple(found)
+    of_scene = {scene: values[names == scene] for scene in dict.fromkeys(scenes)}
+    return tuple(
+        SceneEstimate(scene, float(own.mean()), _floats(student(own).interval(WIDE)))
+        for scene, own in of_scene.items()
+        if 1 < len(own) < len(values)
+    )
 
 
-def _deviation(values: NDArray[np.float64]) -> float:
-    return float(values.std(ddof=1)) if len(values) > 1 else nan
-
-
-def _by_student(values: NDArray[np.float64], margin: float) -> _Found:
-    center, noise = float(values.mean()), _deviation(values)
-    if len(values) == 1:
-        return center, _UNKNOWN, _UNKNOWN, nan, nan, nan, None
-    law = student.Law.of(values)
-    above = law.upper_tail(margin)
-    equivalent = max(above, law.lower_tail(-margin))
-    different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    needed = student.pairs_needed(noise, margin)
-    return center, law.interval(WIDE), law.interval(NARROW), different, equivalent, above, needed
-
-
-def _by_bootstrap(values: NDArray[np.float64], scenes: Sequence[str], margin: float) -> _Found:
-    law = Bootstrap.of(values, scenes)
-    above = law.upper_tail(margin)
-    equivalent = max(above, law.lower_tail(-margin))
-    different = min(1.0, 2.0 * min(law.upper_tail(0.0), law.lower_tail(0.0)))
-    wide, narrow = law.interval(WIDE), law.interval(NARROW)
-    # The interquartile mean has an interval of another width than the mean, and fewer degrees of
-    # freedom: its own one tells how many pairs make it narrow enough.
-    pairs = len(values) * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
-    needed = max(2, ceil(pairs)) if pairs <= student.MOST_PAIRS else None
-    return float(iqm(values)), wide, narrow, different, equivalent, above, needed
+def _floats(interval: Interval) -> Interval:
+    return float(interval[0]), float(interval[1])

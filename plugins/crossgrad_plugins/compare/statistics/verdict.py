@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
+from math import isnan
 from typing import Final
 
 from crossgrad_plugins.compare.statistics.estimate import NARROW, WIDE, Estimate, SceneEstimate
-from crossgrad_plugins.compare.statistics.holm import holm
 
 #: Up to so many comparisons are judged one by one.
 UNCORRECTED: Final = 5
@@ -39,6 +39,19 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 def corrected(values: Sequence[float]) -> list[float]:
     """The p-values of one test of comparisons that are shown together: Holm's above five."""
     return holm(values) if len(values) > UNCORRECTED else list(values)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted by Holm's method (Scandinavian Journal of Statistics 6, 1979).
+
+    NaN is the p-value of a test that was not made: it stays NaN and is not counted.
+    """
+    known = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
+    adjusted, largest = list(values), 0.0
+    for rank, (value, index) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * value))
+        adjusted[index] = largest
+    return adjusted
 
 
 def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:

@@ -1,4 +1,4 @@
-"""The key of a configuration file that says which version of crossgrad wrote it."""
+"""The version of crossgrad that a configuration file names."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,10 +7,10 @@ from typing import Any, Final
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.version import VERSION
 
-#: The key, and the version of this crossgrad.
+#: The key that names the version that wrote a configuration, and the version of this one.
 KEY: Final = "crossgrad"
 CURRENT: Final = ".".join(VERSION.split(".")[:2])
-#: The key of the notes that are written next to the settings.
+#: The key of the notes, which are written with the settings.
 NOTES: Final = "notes"
 
 
@@ -20,10 +20,10 @@ def marked(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unmarked(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the settings of a file without version and notes.
+    """Return the settings of a file without version and notes; a file by hand names no version.
 
     Args:
-        settings: The content of the file, choices of components in their long form.
+        settings: The content of the file.
         path: The file.
 
     Raises:
