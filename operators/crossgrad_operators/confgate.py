@@ -27,16 +27,16 @@ class ConfGate(GramianOperator):
     """
 
     idle_at_one: ClassVar[bool] = True
-    preset: Literal["v2", "low"] = Field("v2", description="v2: tau 0.9; low: tau 0.6")
+    variant: Literal["v2", "low"] = Field("v2", description="v2: tau 0.9; low: tau 0.6")
     tau: float | None = Field(
-        None, gt=0, lt=1, description="probability of conflict from which to project; over preset"
+        None, gt=0, lt=1, description="probability of conflict from which to project; over variant"
     )
     beta: float = Field(0.99, ge=0, lt=1, description="decay of the averages per step")
     warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """See `HasUnusedOptions`."""
-        return {} if self.tau is None else {"preset": "tau wins over it; leave one of the two out"}
+        return {} if self.tau is None else {"variant": "tau wins over it; leave one of the two out"}
 
     @override
     def transform(
@@ -49,7 +49,7 @@ class ConfGate(GramianOperator):
         from crossgrad_operators.numba_kernels.gates import confident
 
         views = gramians.shape[1]
-        tau = _THRESHOLDS[self.preset] if self.tau is None else self.tau
+        tau = _THRESHOLDS[self.variant] if self.tau is None else self.tau
         score = NormalDist().inv_cdf(tau)
         moments = recall(state, context, "moments", (3, views, views))
         gates = confident(moments, gramians, context.present, self.beta, score, self.warmup)

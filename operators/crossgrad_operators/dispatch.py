@@ -57,13 +57,13 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 
 
 class Dispatch(GramianOperator):
-    """Each block goes to the operator of its own rule, else of its kind's, else of the preset.
+    """Each block goes to the operator of its own rule, else of its kind's, else of the variant.
 
     Presets (the paper's two variants): `geometry-confgate` gates the geometry and adds the
     appearance; `geometry-projection` projects the geometry and gates the appearance.
     """
 
-    preset: Literal["geometry-confgate", "geometry-projection"] = Field(
+    variant: Literal["geometry-confgate", "geometry-projection"] = Field(
         "geometry-confgate", description="what serves blocks without a rule"
     )
     rules: Annotated[tuple[Rule, ...], BeforeValidator(_rules), PlainSerializer(_as_mapping)] = (
@@ -73,7 +73,7 @@ class Dispatch(GramianOperator):
         "appearance", description="which kind the opacity block is of"
     )
     neutral: Literal["appearance", "geometry"] = Field(
-        "appearance", description="the kind whose preset serves blocks of neither kind"
+        "appearance", description="the kind whose variant serves blocks of neither kind"
     )
 
     @override
@@ -104,11 +104,11 @@ class Dispatch(GramianOperator):
         keys = {self._key(name, kind, ruled) for name, kind in given}
         idle: dict[str, str] = {}
         if not keys - ruled:
-            idle["preset"] = "the rules serve every block; leave it out"
+            idle["variant"] = "the rules serve every block; leave it out"
         if not any(name in _OPACITY and name not in ruled for name, _ in given):
             idle["opacity"] = "no block of opacities is left to a kind; leave it out"
         if "neutral" not in keys - ruled:
-            idle["neutral"] = "the preset serves no block of neither kind; leave it out"
+            idle["neutral"] = "the variant serves no block of neither kind; leave it out"
         if ruled - keys:
             names = ", ".join(sorted(ruled - keys))
             idle["rules"] = (
@@ -168,11 +168,11 @@ class Dispatch(GramianOperator):
 
     def _operators(self) -> dict[str, MatrixOperator]:
         """Key of a rule -> operator."""
-        presets: dict[str, dict[str, MatrixOperator]] = {
+        variants: dict[str, dict[str, MatrixOperator]] = {
             "geometry-confgate": {"geometry": ConfGate(), "appearance": Sum()},
             "geometry-projection": {"geometry": Symmetric(), "appearance": ConfGate()},
         }
-        chosen = presets[self.preset]
+        chosen = variants[self.variant]
         chosen["neutral"] = chosen[self.neutral]
         return chosen | {rule.block: rule.operator for rule in self.rules}
 

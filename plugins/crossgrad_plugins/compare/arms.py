@@ -13,7 +13,7 @@ from crossgrad_plugins.compare.settings import ABSENT, Settings
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
     *("rate_factor", "densify_views", "schedule", "reference", "events"),
-    *("exposure", "loss", "resolution", "preset", "backward"),
+    *("exposure", "loss", "resolution", "recipe", "backward"),
 )
 #: Settings that people know by another name.
 _SPOKEN: Final = {"views_per_step": "views"}

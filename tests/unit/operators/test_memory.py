@@ -62,7 +62,7 @@ def test_confgate_low_believes_sooner_than_v2(ask):
     signs = np.where(np.random.default_rng(0).random(600) < 0.54, -1.0, 1.0)
     gates = {}
     for preset in ("v2", "low"):
-        operator, state = build("operators", "confgate", {"preset": preset}), EMPTY_STATE
+        operator, state = build("operators", "confgate", {"variant": preset}), EMPTY_STATE
         projected = 0
         for sign in signs:
             rows = np.array([[1.0, 0.0], [0.95 * sign, 0.3]])

@@ -80,9 +80,9 @@ def test_dispatch_serves_each_kind_by_its_own_operator(context_of):
         .sum(axis=1)[0],
     )
     np.testing.assert_allclose(weights(), [plain, plain, plain])
-    found = weights(preset="geometry-projection")
+    found = weights(variant="geometry-projection")
     np.testing.assert_allclose(found, [projected, plain, plain])
-    found = weights(preset="geometry-projection", opacity="geometry")
+    found = weights(variant="geometry-projection", opacity="geometry")
     np.testing.assert_allclose(found, [projected, projected, plain])
     found = weights(rules={"f_dc": "mean", "appearance": {"name": "cagrad", "c": 0.0}})
     np.testing.assert_allclose(found, [plain, plain / 2, plain / 2])

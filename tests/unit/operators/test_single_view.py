@@ -18,7 +18,7 @@ OPTIONS = {
     "cagrad": {"c": 0.9, "rescale": "1+c^2"},
     "chain": {"links": ["symmetric", "pcgrad"]},
     "confgate": {"warmup": 0, "tau": 0.01},
-    "dispatch": {"preset": "geometry-projection"},
+    "dispatch": {"variant": "geometry-projection"},
     "soft": {"threshold": 0.5, "strength": 0.5},
 }
 

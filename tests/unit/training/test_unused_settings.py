@@ -27,7 +27,7 @@ IDLE = [
     ({"operator": {"name": "cagrad", "c": 0, "granularity": "kind"}}, "operator.granularity"),
     ({"operator": {"name": "cagrad", "c": 0, "rescale": "1+c"}}, "operator.rescale"),
     ({"operator": {"name": "soft", "strength": 0, "threshold": 0.5}}, "operator.threshold"),
-    ({"operator": {"name": "confgate", "tau": 0.8, "preset": "low"}}, "operator.preset"),
+    ({"operator": {"name": "confgate", "tau": 0.8, "variant": "low"}}, "operator.variant"),
     (
         {
             "operator": {"name": "gradnorm", "alpha": 0, "decay": 0.5},
@@ -49,10 +49,10 @@ IDLE = [
             "operator": {
                 "name": "dispatch",
                 "rules": {"geometry": "symmetric", "appearance": "sum"},
-                "preset": "geometry-projection",
+                "variant": "geometry-projection",
             }
         },
-        "operator.preset",
+        "operator.variant",
     ),
     (
         {"operator": [{"name": "soft", "strength": 0, "threshold": 0.5}, {"name": "mean"}]},
