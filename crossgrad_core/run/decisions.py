@@ -48,7 +48,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
     backbone, _ = pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
     device = with_device(config)[0].device.partition(":")[0]
     rasterizer, _ = choose_rasterizer(config.rasterizer.name, Wanted(device, backbone.response))
-    choice = config.densifier or ComponentChoice(name="")
+    options = {} if config.densifier is None else config.densifier.options
     steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
     planned = steps or DEFAULT_STEPS
     return Facts(
@@ -67,7 +67,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
         scale=scene.similarity.scale,
         start=None,
         backbone=backbone,
-        densifier=lambda name: build(Densifier, name, choice.options),
+        densifier=lambda name: build(Densifier, name, options),
         provides=load(Rasterizer, rasterizer).provides,
         given=given_settings(config),
     )

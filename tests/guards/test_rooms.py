@@ -17,7 +17,7 @@ FLOORS = (
     ("contract",),
     ("gradients", "scene", "config"),
     ("registry",),
-    ("training",),
+    ("training", "recipe"),
     ("evaluation",),
     ("run",),
     ("plugin", "testing", "commands"),

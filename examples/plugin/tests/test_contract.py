@@ -9,6 +9,7 @@ from crossgrad_example.count_views import count_views
 from crossgrad_example.equal_length import EqualLength
 from crossgrad_example.faint import Faint
 from crossgrad_example.gain import Gain
+from crossgrad_example.gentle import Gentle
 from crossgrad_example.largest_error import LargestError
 from crossgrad_example.least_seen import LeastSeen
 from crossgrad_example.median_distance import MedianDistance
@@ -34,6 +35,7 @@ PLUGINS = {
     "exporters": Xyz,
     "metrics": LargestError,
     "observers": Clip,
+    "recipes": Gentle,
     "commands": count_views,
 }
 CASES = [(slot, check) for slot in PLUGINS for check in checks_of(slot)]

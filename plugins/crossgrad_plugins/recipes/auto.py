@@ -56,7 +56,7 @@ SCHEDULES: Final = "docs/schedules.md"
 
 
 class Auto(Recipe):
-    """What was measured to be best for the length and the device, decided from the facts."""
+    """Decides what was measured to be best for the length and the device."""
 
     @override
     def decide(self, facts: Facts) -> list[Decision]:

@@ -1,0 +1,15 @@
+"""A recipe that changes one row of another one."""
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Decision, Facts, Recipe, build_component, with_rows
+
+
+class Gentle(Recipe):
+    """Decides as `auto` does, but at the published learning rates."""
+
+    @override
+    def decide(self, facts: Facts) -> list[Decision]:
+        rows = build_component(Recipe, "auto", {}).decide(facts)
+        slow = Decision("rate_factor", 1.0, "published rates", override="--rate-factor F")
+        return with_rows(rows, [slow])
