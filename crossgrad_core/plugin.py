@@ -88,7 +88,7 @@ from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.evaluation.metrics import psnr
-from crossgrad_core.recipe.lines import full_lines, short_lines
+from crossgrad_core.recipe.lines import full_lines, short_lines, table_lines
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.registry.entries import name_of as component_name
@@ -242,6 +242,7 @@ __all__ = [
     "showable",
     "shows_bar",
     "size_text",
+    "table_lines",
     "to_uint8",
     "transformed",
     "unit_range",

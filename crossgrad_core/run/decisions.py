@@ -1,11 +1,8 @@
 """The facts that a recipe decides from, and the one call that makes the table of decisions."""
 
 from dataclasses import fields, replace
-from typing import cast
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.component import pair
 from crossgrad_core.contract.decision import Decide, Decision, Length, repeats
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.rasterizer import Rasterizer
@@ -20,8 +17,9 @@ from crossgrad_core.recipe.table import (
     open_again,
     rows_of,
 )
-from crossgrad_core.registry.entries import build, load
+from crossgrad_core.registry.entries import load
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
+from crossgrad_core.run.select import chosen, fitted_backbone
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.run.usual_views import views_per_step_of
 from crossgrad_core.training.dropout import photos_per_point
@@ -44,8 +42,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
         UserError: A component is wrong, or no rasterizer runs on the device.
     """
     views, because = views_per_step_of(config)
-    backbone = build(Backbone, config.backbone.name, config.backbone.options)
-    backbone, _ = pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
+    backbone, _ = fitted_backbone(config, scene)
     device = with_device(config)[0].device.partition(":")[0]
     rasterizer, _ = choose_rasterizer(config.rasterizer.name, Wanted(device, backbone.response))
     options = {} if config.densifier is None else config.densifier.options
@@ -67,7 +64,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
         scale=scene.similarity.scale,
         start=None,
         backbone=backbone,
-        densifier=lambda name: build(Densifier, name, options),
+        densifier=lambda name: chosen(Densifier, ComponentChoice(name=name, **options)),
         provides=load(Rasterizer, rasterizer).provides,
         given=given_settings(config),
     )
@@ -119,8 +116,7 @@ def edits_of(config: RunConfig, scene: Scene) -> int:
     config, _, _ = with_decisions(config, scene)
     views, _ = views_per_step_of(config)
     steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
-    choice = cast("ComponentChoice", config.densifier)
-    densifier = build(Densifier, choice.name, choice.options)
+    densifier = chosen(Densifier, config.densifier)
     counting = Counting(views=views, photos=len(scene.train_views), reference=config.reference)
     return schedule_of(config, densifier, steps or DEFAULT_STEPS, counting).edits()
 

@@ -22,7 +22,7 @@ from crossgrad_core.contract.selection import Selection
 from crossgrad_core.contract.start import Start
 from crossgrad_core.defaults import METRICS, START_ALONE
 from crossgrad_core.errors import UserError
-from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.rasterizers import choose_rasterizer, demands
 from crossgrad_core.run.results.metrics_csv import columns_for
@@ -40,26 +40,25 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    start = _chosen(Start, config.start)
+    start = chosen(Start, config.start)
     _require_points(config, scene, start)
     _require_shown_points(config, scene, start)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
     sampler = _built(Sampler, config.sampler)
     operator, operator_name = operator_of(config)
-    backbone = _built(Backbone, config.backbone)
-    fitting = backbone.fitted_to(scene)
-    backbone, left_out = pair(fitting, Backbone, tuple, backbone, "fitted_to")
+    backbone, left_out = fitted_backbone(config, scene)
     notes += left_out
     views, _ = views_per_step_of(config)
-    densifier = _chosen(Densifier, config.densifier)
+    densifier = chosen(Densifier, config.densifier)
     wanted = demands(config, device.type, backbone, densifier)
     rasterizer_name, choosing = choose_rasterizer(config.rasterizer.name, wanted)
     notes += choosing
+    _require_decided_options(config, rasterizer_name)
     rasterizer = build(Rasterizer, rasterizer_name, config.rasterizer.options)
-    resolution = _chosen(Resolution, config.resolution)
+    resolution = chosen(Resolution, config.resolution)
     grouping_choice = _grouping_choice(config, sampler, operator, notes)
-    exposure = _chosen(Exposure, config.exposure)
+    exposure = chosen(Exposure, config.exposure)
     fitted = answered(exposure.fitted_to(scene), Fitted, exposure, "fitted_to")
     notes += fitted.notes
     names = {
@@ -136,7 +135,25 @@ def _built(slot: type[C], choice: ComponentChoice) -> C:
     return build(slot, choice.name, choice.options)
 
 
-def _chosen(slot: type[C], choice: ComponentChoice | None) -> C:
+def _require_decided_options(config: RunConfig, name: str) -> None:
+    """Refuse a rasterizer that lacks an option which the recipe sets."""
+    lacking = config.rasterizer.options.keys() - load(Rasterizer, name).model_fields.keys()
+    if decided := sorted(each for each in lacking if f"rasterizer.{each}" in config.decided):
+        raise UserError(
+            f"rasterizer {name} has no option {listed(decided)}, which the recipe sets",
+            where=f"--recipe {config.recipe.name}",
+            expected=f"a rasterizer with the option {listed(decided)}",
+            todo="leave --rasterizer out: auto takes one that has it; or choose another recipe",
+        )
+
+
+def fitted_backbone(config: RunConfig, scene: Scene) -> tuple[Backbone, tuple[str, ...]]:
+    """The backbone of a run, fitted to its scene, and what was left out."""
+    backbone = _built(Backbone, config.backbone)
+    return pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
+
+
+def chosen(slot: type[C], choice: ComponentChoice | None) -> C:
     """The component that the user or the recipe chose."""
     return build(slot, _name(choice), {} if choice is None else choice.options)
 

@@ -42,6 +42,8 @@ PLACES = {
     "crossgrad_plugins.planner": COMMAND_ROOMS,
     # Reads photos and their headers, which is what comes before a scene.
     "crossgrad_plugins.prepare": (*COMMAND_ROOMS, *READERS),
+    # `crossgrad recipes`.
+    "crossgrad_plugins.recipes.cli": COMMAND_ROOMS,
     "crossgrad_plugins.scene_check": COMMAND_ROOMS,
     "crossgrad_plugins.sweep": COMMAND_ROOMS,
     "crossgrad_operators.stress": COMMAND_ROOMS,

@@ -13,6 +13,7 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import select as selecting
+from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.testing.fixtures import sample_camera, sample_scene
 from crossgrad_plugins.rasterizers.reference.projection import project
 
@@ -131,11 +132,12 @@ def test_what_is_too_faint_to_draw_counts_as_seen(name):
 def options_of(**settings):
     scene = replace(sample_scene(), similarity=replace(sample_scene().similarity, scale=0.01))
     config = RunConfig.model_validate({"steps": 5, "device": "cpu", **settings})
+    config, *_ = with_decisions(config, scene)
     selection, _ = selecting.select(config, scene, "none")
     return selection.rasterizer
 
 
-def test_the_published_recipe_requires_for_it_in_the_units_of_the_scene():
+def test_the_published_recipe_sets_it_in_the_units_of_the_scene():
     published = options_of(recipe={"name": "published"})
     assert published.footprint == "3-sigma"
     assert published.near == pytest.approx(0.2 * 0.01)
@@ -158,5 +160,5 @@ def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
     monkeypatch.setattr(selecting, "load", lambda slot, name: Common)
     with pytest.raises(UserError) as caught:
         options_of(recipe={"name": "published"})
-    assert "footprint of the original code" in str(caught.value)
+    assert "has no option footprint" in str(caught.value)
     assert "leave --rasterizer out" in str(caught.value)
