@@ -45,7 +45,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     _require_shown_points(config, scene, start)
     device = choose_device(config.device)
     notes: list[str] = list(scene.notes)
-    sampler = _built(Sampler, config.sampler)
+    sampler = chosen(Sampler, config.sampler)
     operator, operator_name = operator_of(config)
     backbone, left_out = fitted_backbone(config, scene)
     notes += left_out
@@ -76,7 +76,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     }
     grouping = None
     if grouping_choice is not None:
-        grouping = _built(Grouping, grouping_choice)
+        grouping = chosen(Grouping, grouping_choice)
         names["grouping"] = grouping_choice.name
     selection = Selection(
         backbone=backbone,
@@ -84,11 +84,11 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         operator=operator,
         densifier=densifier,
         rasterizer=rasterizer,
-        loss=_built(Loss, config.loss),
+        loss=chosen(Loss, config.loss),
         exposure=fitted.exposure,
         start=start,
         resolution=resolution.fitted_to(scene),
-        exporter=_built(Exporter, config.exporter),
+        exporter=chosen(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
         names=names,
         views_per_step=max(views.counts),
@@ -131,10 +131,6 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None
         )
 
 
-def _built(slot: type[C], choice: ComponentChoice) -> C:
-    return build(slot, choice.name, choice.options)
-
-
 def _require_decided_options(config: RunConfig, name: str) -> None:
     """Refuse a rasterizer that lacks an option which the recipe sets."""
     lacking = config.rasterizer.options.keys() - load(Rasterizer, name).model_fields.keys()
@@ -149,7 +145,7 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
 
 def fitted_backbone(config: RunConfig, scene: Scene) -> tuple[Backbone, tuple[str, ...]]:
     """The backbone of a run, fitted to its scene, and what was left out."""
-    backbone = _built(Backbone, config.backbone)
+    backbone = chosen(Backbone, config.backbone)
     return pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
 
 
@@ -172,7 +168,7 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
     metrics: dict[str, Metric] = {}
     regimes = sorted({view.regime for view in scene.test_views})
     for name, choice in {each.name: each for each in config.metrics}.items():
-        metric = _built(Metric, choice)
+        metric = chosen(Metric, choice)
         _check_form(name, metric.described().form)
         columns = columns_for(regimes, [each.figure for each in (*metrics.values(), metric)])
         twice = sorted({each for each in columns if columns.count(each) > 1})

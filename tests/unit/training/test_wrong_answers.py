@@ -133,12 +133,12 @@ def test_what_a_start_adds_are_points(answer):
     ],
 )
 def test_what_is_fitted_to_the_scene_is_of_its_kind(monkeypatch, base, slot, name, answer):
-    original, wrong = selecting._built, of_slot(slot, name, "fitted_to", answer)
+    original, wrong = selecting.chosen, of_slot(slot, name, "fitted_to", answer)
 
     def built(kind, choice):
         return wrong if kind is base else original(kind, choice)
 
-    monkeypatch.setattr(selecting, "_built", built)
+    monkeypatch.setattr(selecting, "chosen", built)
     with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
         assemble(RunConfig(steps=10), sample_scene(), "none")
 
