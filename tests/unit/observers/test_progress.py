@@ -27,7 +27,7 @@ def run_with(progress: Progress, steps: int = 20, first: int = 1) -> None:
     schedule = SimpleNamespace(total=steps)
     hook.crossgrad_run_start(
         run=SimpleNamespace(
-            scene=scene, schedule=schedule, folder=Path("runs/x"), notes=("no masks",)
+            scene=scene, schedule=schedule, folder=Path("runs/x"), notes=("no masks",), decisions=()
         )
     )
     for step in range(first, steps + 1):
@@ -119,6 +119,7 @@ def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
         schedule=SimpleNamespace(total=20),
         folder=None,
         notes=(),
+        decisions=(),
     )
     hook.crossgrad_run_start(run=run)
     for step, total in enumerate(totals, 1):

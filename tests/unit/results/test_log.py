@@ -90,6 +90,7 @@ def test_log_holds_what_the_run_says(tmp_path: Path):
         schedule=SimpleNamespace(total=40),
         scene=SimpleNamespace(name="boruszyn"),
         notes=("no masks",),
+        decisions=(),
     )
     hook.crossgrad_run_start(run=run)
     for step in range(1, 5):
