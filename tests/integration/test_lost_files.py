@@ -111,7 +111,7 @@ def test_of_a_shorter_video_no_longer_one_is_left(run):
 
 def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
     files = [path for path in run.rglob("*") if path.is_file() and path.name != "run.lock"]
-    assert any(path.name == "tensors.safetensors" for path in export)
+    assert any(path.name == "tensors.safetensors" for path in files)
     (run / "fresh").touch()
     assert {path.stat().st_mode for path in files} == {(run / "fresh").stat().st_mode}
 
