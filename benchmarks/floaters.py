@@ -17,7 +17,7 @@ from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.export import renderer
 from crossgrad_core.run.load_run import opened
-from crossgrad_core.training.averaging import shown
+from crossgrad_core.training.averaging import eval_parameters
 from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import EMPTY, in_empty_space, rows_without_floaters
 from crossgrad_core.training.setup import Setup
@@ -42,7 +42,7 @@ def row(folder: Path, empty: float) -> Sequence[str]:
     """A run's line: what was removed, how long that took, and what it did to held-out photos."""
     setup, state = opened(folder, {})
     primitives = state.primitives(setup)
-    positions = shown(state)[setup.backbone.positions].detach().double().cpu().numpy()
+    positions = eval_parameters(state)[setup.backbone.positions].detach().double().cpu().numpy()
     near = int(in_empty_space(positions, setup.scene, empty).sum())
     before = measured(setup, state)
     rows_without_floaters(setup, state, empty)  # Compiles what is to be timed.

@@ -84,7 +84,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     from crossgrad_core.scene.photo_check import check_photos, fits
     from crossgrad_core.training.loop import timed_step
     from crossgrad_core.training.start import first_state, warm_up
-    from crossgrad_core.training.view_prefetch import Foresight
+    from crossgrad_core.training.view_prefetch import Prefetcher
 
     settings: dict[str, Any] = {
         "scene": str(scene),
@@ -97,7 +97,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     keep = fits(setup.scene, cache_mib)
     check_photos(setup.scene.views if keep else setup.scene.test_views, keep=keep)
     warm_up(setup)
-    state, foresight = first_state(setup), Foresight(setup)
+    state, foresight = first_state(setup), Prefetcher(setup)
 
     def fail(error: Exception) -> None:
         raise error

@@ -39,7 +39,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         str | None,
         typer.Option(
             metavar="FILE|ladder",
-            help="Draw a film instead: along the cameras of a file, or from the farthest photos "
+            help="Draw a video instead: along the cameras of a file, or from the farthest photos "
             "down to the nearest.",
         ),
     ] = None,
@@ -52,7 +52,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     accept_scene: AcceptScene = False,
 ) -> None:
     """Draw the views of a run as PNG files."""
-    alone = "a film shows what the cameras of its path see"
+    alone = "a video shows what the cameras of its path see"
     _check_together(("--on", on), ("--path", path), alone)
     _check_together(("--split", split), ("--path", path), alone)
     _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")

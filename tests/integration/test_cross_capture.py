@@ -93,20 +93,20 @@ def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
     assert len(list((tmp_path / "own").iterdir())) == 11
 
 
-def test_a_ladder_is_drawn_as_frames_and_a_film(trained, tmp_path, capsys):
+def test_a_ladder_is_drawn_as_frames_and_a_video(trained, tmp_path, capsys):
     folder = tmp_path / "ladder"
     render.render_path(trained, "ladder", frames=3, out=folder)
     assert len(list(folder.glob("*.png"))) == 3
-    (film,) = folder.glob("film.*")
-    assert f"3 frames in {folder}, film {film}" in capsys.readouterr().out
+    (video,) = folder.glob("video.*")
+    assert f"3 frames in {folder}, video {video}" in capsys.readouterr().out
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(UserError, match="the file exists"):
         render.render_path(trained, "ladder", frames=2, out=folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
-    # In the run's own folder a film takes the place of the one before.
+    # In the run's own folder a video takes the place of the one before.
     for frames in (3, 2):
         render.render_path(trained, "ladder", frames=frames, out=None)
-    assert len(list((trained / "renders").glob("*/path_ladder/film.*"))) == 1
+    assert len(list((trained / "renders").glob("*/path_ladder/video.*"))) == 1
     with pytest.raises(UserError, match="frames of a ladder"):
         render.render_path(trained, "path.json", frames=2, out=None)
 

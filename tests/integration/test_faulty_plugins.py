@@ -188,7 +188,7 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
             "in hook crossgrad_validate_selection of observer objecting, from faulty-package 1.0",
         ),
         (("--resolution", "unfit"), "a plugin of faulty-package 1.0 failed"),
-        (("--resolution", "unfit"), "made_up_faulty.py:67"),
+        (("--resolution", "unfit"), "made_up_faulty.py:68"),
         (("--loss", "infinite"), "the photometric loss is not finite"),
         (("--loss", "infinite", "--seconds", "1"), "the photometric loss is not finite"),
         (("--loss", "vector"), "a step that was tried out before the training failed"),

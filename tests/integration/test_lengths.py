@@ -1,7 +1,6 @@
 """Lengths in views, events in views or steps, a K that changes: their schedule and counts."""
 
 import csv
-import json
 
 import pytest
 import torch
@@ -268,17 +267,3 @@ def test_views_that_are_ahead_cost_what_they_cost():
     assert ahead(plain, 200) == 400.0
     assert ahead(changing, 200) == (300 + 1500) * 0.5
     assert ahead(changing, 500) == 1500 * 0.5
-
-
-def test_runs_of_before_go_on_in_steps(scene, tmp_path):
-    out = tmp_path / "run"
-    run(scene, out, steps=12, stop_after=6)
-    config = out / "config.yaml"
-    lines = config.read_text().splitlines(keepends=True)
-    config.write_text("".join(line for line in lines if not line.startswith("events:")))
-    for file in out.glob("checkpoints/*/state.json"):  # Theirs say neither of these two.
-        state = json.loads(file.read_text())
-        del state["state_sha256"], state["scalars"]["settings"]
-        file.write_text(json.dumps(state))
-    assert read_config(out)["events"] == "steps"
-    assert app.run({}, resume=out, verbosity=-1) == 0

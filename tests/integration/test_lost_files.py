@@ -103,7 +103,7 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
     assert app.run({}, resume=tmp_path / "moved", verbosity=-1) == 0
 
 
-def test_of_a_shorter_film_no_longer_one_is_left(run):
+def test_of_a_shorter_video_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
         render.render_path(run, path=LADDER, frames=frames, out=None)
         assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
@@ -111,7 +111,7 @@ def test_of_a_shorter_film_no_longer_one_is_left(run):
 
 def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
     files = [path for path in run.rglob("*") if path.is_file() and path.name != "run.lock"]
-    assert any(path.name == "tensors.safetensors" for path in export)
+    assert any(path.name == "tensors.safetensors" for path in files)
     (run / "fresh").touch()
     assert {path.stat().st_mode for path in files} == {(run / "fresh").stat().st_mode}
 
@@ -168,7 +168,7 @@ def test_what_does_not_train_may_be_changed(run):
     evaluate.evaluate(run)
 
 
-def test_a_film_of_other_frames_does_not_stay(run, monkeypatch, capsys):
+def test_a_video_of_other_frames_does_not_stay(run, monkeypatch, capsys):
     render.render_path(run, path=LADDER, frames=3, out=None)
     (made,) = run.glob("renders/*/path_ladder/video.*")
     monkeypatch.setattr(video, "_LARGEST", 100)

@@ -94,7 +94,7 @@ def test_the_same_export_writes_the_same_file(finished):
 def test_a_backbone_that_is_not_baked_has_no_file_for_a_view(scene, tmp_path):
     run(scene, tmp_path / "run", stop_after=1)
     with pytest.raises(UserError, match="vanilla has nothing to bake"):
-        export(tmp_path / "run", camera="street/0002.png")
+        export_file(tmp_path / "run", camera="street/0002.png")
 
 
 def test_results_of_another_step_than_the_summary_get_names_of_their_own(finished):
@@ -145,7 +145,7 @@ def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp
 
 
 def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
-    for look in (evaluate.evaluate, export):
+    for look in (evaluate.evaluate, export_file):
         with pytest.raises(UserError, match="not the folder of a run"):
             look(tmp_path)
     assert content(tmp_path) == {}

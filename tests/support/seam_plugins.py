@@ -41,10 +41,10 @@ class GainPerPhoto(Exposure):
     def per_photo(self, scene):
         return {"stops": PerPhoto(torch.zeros(len(scene.train_views)), LearningRate(self.lr))}
 
-    def exposed(self, image, values):
+    def apply(self, image, values):
         return image * torch.exp2(values["stops"])
 
-    def projected(self, values):
+    def project(self, values):
         return {"stops": values["stops"] - values["stops"].mean()}
 
 

@@ -9,6 +9,8 @@ from support.run_folders import RunFolder
 from support.scenes import write_tiny_scene
 from support.scripts import printed_by
 
+from crossgrad_core.run.postprocess import evaluate
+
 NAMES = [f"{folder}/{number:04}.png" for folder in ("street", "aerial") for number in range(4)]
 
 
@@ -85,15 +87,15 @@ def evaluated(monkeypatch):
     """Evaluates runs with a stand-in; answers the scenes, and may be told the PSNR."""
     told = SimpleNamespace(psnr=20.0, on=[])
 
-    def evaluate(folder, on, how):
+    def measured(folder, on, how):
         told.on.append(on)
         views = [SimpleNamespace(name=n, regime=n[:6], values={"psnr": told.psnr}) for n in NAMES]
         figure = SimpleNamespace(name="psnr")
         return SimpleNamespace(views=views, figures=[figure]), None
 
-    monkeypatch.setattr(evaluate, "evaluated_on", evaluate)
+    monkeypatch.setattr(evaluate, "evaluated_on", measured)
     monkeypatch.setattr(
-        evaluate, "evaluated_file", lambda run, ply, how, on: evaluate(run, on, how)
+        evaluate, "evaluated_file", lambda run, ply, how, on: measured(run, on, how)
     )
     return told
 

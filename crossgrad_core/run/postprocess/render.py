@@ -1,4 +1,4 @@
-"""Pictures and films of a run that was trained."""
+"""Pictures and videos of a run that was trained."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +19,9 @@ from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.video import (
     ENCODER,
     drop_frames,
-    film_files,
-    write_film,
+    video_files,
     write_frames,
+    write_video,
 )
 from crossgrad_core.system.check_writable import check_folder, check_new
 from crossgrad_core.system.checksums import relisted
@@ -86,7 +86,7 @@ def render_path(
     out: Path | None,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Draws what cameras along a path see, as pictures and, beside them, as a film.
+    """Draws what cameras along a path see, as pictures and, beside them, as a video.
 
     Args:
         folder: The run's folder.
@@ -108,7 +108,7 @@ def render_path(
         )
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
-        check_new(*(() if out is None else film_files(out)))
+        check_new(*(() if out is None else video_files(out)))
         setup, state = how.open(folder)
         along = camera_path(setup.scene, path, frames or FRAMES)
         if out is not None:
@@ -124,11 +124,11 @@ def render_path(
                 files = write_frames(map(draw, along.cameras), out)
             if own:
                 drop_frames(out, len(files))
-            made = write_film(files, along.fps)
-            for film in film_files(out) if own else ():
-                if film != made:  # Of other frames.
-                    film.unlink(missing_ok=True)
-        told = f"film {made}" if made else f"no film: too many or too large without {ENCODER}"
+            made = write_video(files, along.fps)
+            for video in video_files(out) if own else ():
+                if video != made:  # Of other frames.
+                    video.unlink(missing_ok=True)
+        told = f"video {made}" if made else f"no video: too many or too large without {ENCODER}"
         print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
 
 

@@ -1,4 +1,4 @@
-"""Frames as files, and as a film."""
+"""Frames as files, and as a video."""
 
 import io
 import shutil
@@ -14,7 +14,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 from crossgrad_core.system.interrupts import HELPERS
 
-#: A program that writes films; where there is none, Pillow writes an animated picture.
+#: A program that writes videos; where there is none, Pillow writes an animated picture.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
 #: Bytes of all frames of an animated picture, which are in memory at once.
@@ -47,20 +47,20 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
 
 
 def drop_frames(folder: Path, count: int) -> None:
-    """Removes the frames from number `count` on, which a longer film left."""
+    """Removes the frames from number `count` on, which a longer video left."""
     number = count
     while (frame := folder / f"{number:05d}.png").is_file():
         frame.unlink()
         number += 1
 
 
-def film_files(folder: Path) -> tuple[Path, Path]:
-    """The film in a folder of frames: as an encoder writes it, and as Pillow does."""
-    return folder / "film.mp4", folder / "film.webp"
+def video_files(folder: Path) -> tuple[Path, Path]:
+    """The video in a folder of frames: as an encoder writes it, and as Pillow does."""
+    return folder / "video.mp4", folder / "video.webp"
 
 
-def write_film(frames: list[Path], fps: float) -> Path | None:
-    """Writes the frames as film.mp4 beside them where ffmpeg is installed, else as film.webp.
+def write_video(frames: list[Path], fps: float) -> Path | None:
+    """Writes the frames as video.mp4 beside them where ffmpeg is installed, else as video.webp.
 
     Frames that are too many or too large for an animated picture remain frames: None.
 
@@ -71,7 +71,7 @@ def write_film(frames: list[Path], fps: float) -> Path | None:
     Raises:
         UserError: ffmpeg failed, or the disk is full.
     """
-    encoder, (encoded, animated) = shutil.which(ENCODER), film_files(frames[0].parent)
+    encoder, (encoded, animated) = shutil.which(ENCODER), video_files(frames[0].parent)
     if encoder is None:
         return _animated(frames, animated, fps)
     with atomic_file(encoded) as file:
@@ -80,7 +80,7 @@ def write_film(frames: list[Path], fps: float) -> Path | None:
 
 
 def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
-    # The folder may hold more frames, of a longer film.
+    # The folder may hold more frames, of a longer video.
     source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
     count = ["-frames:v", str(len(frames))]
     # Players want even sides and this pixel format.
@@ -96,7 +96,7 @@ def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
         HELPERS.discard(process.pid)
     if process.returncode != 0:
         raise UserError(
-            "the film could not be written",
+            "the video could not be written",
             where=frames[0].parent,
             found=said.strip()[-300:],
             todo="the frames are there",

@@ -1,4 +1,4 @@
-"""Cameras without photos, and films of what they see."""
+"""Cameras without photos, and videos of what they see."""
 
 import json
 from dataclasses import replace
@@ -169,16 +169,16 @@ def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypa
     frames = video.write_frames(images, tmp_path / "frames")
     assert [frame.name for frame in frames] == ["00000.png", "00001.png", "00002.png"]
     assert [Image.open(frame).getpixel((0, 0))[0] for frame in frames] == [0, 128, 255]
-    path = video.write_film(frames, 10.0)
+    path = video.write_video(frames, 10.0)
     assert path == tmp_path / "frames" / "video.webp"
     with Image.open(path) as found:
         assert (found.n_frames, found.size) == (3, (8, 6))
     monkeypatch.setattr(video, "_LARGEST", 100)
-    assert video.write_film(frames, 10.0) is None
+    assert video.write_video(frames, 10.0) is None
     wide = video.write_frames([torch.zeros(1, 16_384, 3)], tmp_path / "wide")
     monkeypatch.undo()
     monkeypatch.setattr(video.shutil, "which", lambda _: None)
-    assert video.write_film(wide, 10.0) is None
+    assert video.write_video(wide, 10.0) is None
 
 
 def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monkeypatch):
@@ -187,14 +187,14 @@ def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monke
     encoder.chmod(0o755)
     monkeypatch.setattr(video.shutil, "which", lambda _: str(encoder))
     frames = video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "frames")
-    (tmp_path / "frames" / "00001.png").write_bytes(b"of a longer film")
-    path = video.write_film(frames, 10.0)
+    (tmp_path / "frames" / "00001.png").write_bytes(b"of a longer video")
+    path = video.write_video(frames, 10.0)
     assert path == tmp_path / "frames" / "video.mp4"
     told = path.read_text()
     assert "-framerate 10 -i" in told and "-frames:v 1 " in told
     encoder.write_text("#!/bin/sh\nfor last; do :; done\necho half > $last\necho bad >&2\nexit 1\n")
     with pytest.raises(UserError, match="bad"):
-        video.write_film(frames, 10.0)
-    # Nothing of the film that failed is left, and the one before is.
+        video.write_video(frames, 10.0)
+    # Nothing of the video that failed is left, and the one before is.
     assert sorted(each.name for each in path.parent.iterdir())[2:] == ["video.mp4"]
     assert path.read_text() == told
