@@ -269,8 +269,9 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
     """
     from crossgrad_core.run.app import with_defaults
     from crossgrad_core.run.load_run import parsed
+    from crossgrad_core.run.settings import with_recipe
 
-    return with_defaults(parsed(settings))
+    return with_defaults(parsed(with_recipe(settings)))
 
 
 def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":

@@ -346,18 +346,6 @@ class RunConfig(BaseModel):
             return value
         return {current_name(key, value): each for key, each in value.items()}
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_the_loss(cls, data: object) -> object:
-        """`ssim_weight` was a setting of its own until 0.1; it is an option of the loss."""
-        if not isinstance(data, Mapping) or "ssim_weight" not in data:
-            return data
-        rest = {name: value for name, value in data.items() if name != "ssim_weight"}
-        loss = rest.get("loss") or {"name": defaults.LOSS}
-        if isinstance(loss, Mapping):
-            rest["loss"] = {"ssim_weight": data["ssim_weight"], **loss}
-        return rest
-
     @field_validator("operator", mode="before")
     @classmethod
     def _chain(cls, value: object) -> object:

@@ -50,7 +50,7 @@ from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import summarised_step
 from crossgrad_core.run.results.table import final_table
 from crossgrad_core.run.session import CLOUD, Session, totals
-from crossgrad_core.run.settings import layered
+from crossgrad_core.run.settings import layered, with_recipe
 from crossgrad_core.run.unused_settings import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
@@ -206,7 +206,7 @@ def _with_remarks(setup: Setup) -> tuple[Setup, float]:
 
 def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     """The setup of a new run, all that can be refused refused, and the seconds of loading."""
-    config = with_defaults(parsed(settings))
+    config = with_defaults(parsed(with_recipe(settings)))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
     setup, load_seconds = set_up(config, way.verbosity)

@@ -12,10 +12,11 @@ import yaml
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.recipe import Recipe
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import without_decided
-from crossgrad_core.registry.entries import installed_as
+from crossgrad_core.registry.entries import installed_as, load
 from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.config_version import unmarked
 from crossgrad_core.run.options import OPTIONS
@@ -100,6 +101,19 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
         settings = _overlaid(settings, _places(_flat(layer)), [])
     settings = _overlaid(settings, {}, list(map(_parsed, assignments)))
     return _named_by_default(settings)
+
+
+def with_recipe(settings: Mapping[str, Any]) -> Settings:
+    """The settings over those that their recipe fixes; what a run wrote down has these already.
+
+    Raises:
+        UserError: There is no such recipe.
+    """
+    choice = settings.get("recipe")
+    if not isinstance(choice, Mapping) or "name" not in choice or settings.get("decided"):
+        return dict(settings)
+    fixed = load(Recipe, choice["name"]).settings
+    return layered([fixed, settings]) if fixed else dict(settings)
 
 
 def _flat(layer: Mapping[str, object]) -> Settings:

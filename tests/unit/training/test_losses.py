@@ -5,7 +5,6 @@ import pytest
 import torch
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.load_run import parsed
@@ -41,13 +40,6 @@ def test_weights_of_another_shape_or_type_are_refused(weights):
         build("losses", "l1-ssim", {}).loss(IMAGE, PHOTO, None, weights)
 
 
-def test_the_former_setting_is_the_option_of_the_loss():
-    assert RunConfig(ssim_weight=0.5).loss.options == {"ssim_weight": 0.5}
-    assert RunConfig().loss.options == {}
-    chosen = RunConfig.model_validate({"ssim_weight": 0.5, "loss": {"name": "other"}})
-    assert chosen.loss.options == {"ssim_weight": 0.5}
-
-
 def test_an_unknown_loss_is_refused_by_name(tmp_path):
     from crossgrad_core.run.assemble import check_names
 
@@ -60,7 +52,10 @@ def test_the_fused_loss_is_what_a_default_run_brings_down(tmp_path):
     from crossgrad_core.run.load_run import set_up
 
     write_tiny_scene(tmp_path / "scene", views=4)
-    setup, _ = set_up(parsed({"scene": str(tmp_path / "scene"), "ssim_weight": 0.4}), -1)
+    setup, _ = set_up(
+        parsed({"scene": str(tmp_path / "scene"), "loss": {"name": "l1-ssim", "ssim_weight": 0.4}}),
+        -1,
+    )
     assert setup.loss == build("losses", "l1-ssim", {"ssim_weight": 0.4})
     assert setup.selection.names["loss"] == "l1-ssim"
     assert setup.selection.names["exporter"] == "ply"

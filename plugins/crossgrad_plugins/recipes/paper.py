@@ -1,0 +1,102 @@
+"""Recipes of the arms of the paper's experiments, as the grids in benchmarks/grids/paper run them.
+
+600 views are the 30,000 steps of the paper. What an arm does not fix, recipe `auto` decides.
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final
+
+from crossgrad_plugins.recipes.auto import Auto
+
+#: Settings of all arms.
+BASE: Final[Mapping[str, Any]] = {
+    "max_views": 1200,
+    "reading.max_size": 400,
+    "exposure": "auto",
+    "plan": "off",
+    "densifier": "adc",
+    "min_refinements": 6,
+    "metrics": ["psnr", "ssim", "psnr-cc"],
+    "eval_from": 100_000,
+}
+#: Settings of the arms that draw a near and a far view in each step.
+PAIRS: Final[Mapping[str, Any]] = {**BASE, "sampler": "near-far", "views_per_step": 2}
+
+
+class Vanilla30k(Auto):
+    """One view per step, for as many views as the paper's run of 30,000 steps."""
+
+    settings: ClassVar[Mapping[str, Any]] = {
+        **BASE,
+        "sampler": "epoch",
+        "views_per_step": 1,
+        "max_views": 600,
+    }
+
+
+class Vanilla60k(Auto):
+    """One view per step, for as many views as two views per step draw."""
+
+    settings: ClassVar[Mapping[str, Any]] = {
+        **BASE,
+        "sampler": "epoch",
+        "views_per_step": 1,
+        "observers": ["diagnostics"],
+    }
+
+
+class TwoRandomViews(Auto):
+    """Two random views per step."""
+
+    settings: ClassVar[Mapping[str, Any]] = {**BASE, "sampler": "random", "views_per_step": 2}
+
+
+class Balanced(Auto):
+    """One view per step, near and far by turns."""
+
+    settings: ClassVar[Mapping[str, Any]] = {
+        **BASE,
+        "sampler": "near-far",
+        "sampler.alternating": True,
+        "views_per_step": 1,
+    }
+
+
+class NearFar(Auto):
+    """A near and a far view per step, whose gradients are added."""
+
+    settings: ClassVar[Mapping[str, Any]] = PAIRS
+
+
+class CrossGrad(Auto):
+    """A near and a far view per step, and the symmetric projection of CrossGrad-GS."""
+
+    settings: ClassVar[Mapping[str, Any]] = {
+        **PAIRS,
+        "operator": "symmetric",
+        "observers": ["diagnostics"],
+    }
+
+
+class CaGrad(Auto):
+    """A near and a far view per step, and CAGrad."""
+
+    settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "cagrad"}
+
+
+class GradNorm(Auto):
+    """A near and a far view per step, and GradNorm."""
+
+    settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "gradnorm"}
+
+
+class ConfGate(Auto):
+    """A near and a far view per step, and the gate by confidence of conflict."""
+
+    settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "confgate"}
+
+
+class Preconditioner(Auto):
+    """A near and a far view per step, and the preconditioner."""
+
+    settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "preconditioner"}
