@@ -10,7 +10,7 @@ from pathlib import Path
 
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.guide import Guide
-from crossgrad_fuzz.law import Bench, Finding
+from crossgrad_fuzz.law import SLOW, Bench, Finding
 from crossgrad_fuzz.mutate import BLIND, exchanger, inserter
 from crossgrad_fuzz.target import Mutator, Target
 
@@ -193,7 +193,7 @@ def _exchange(case: dict[str, bytes], rng: random.Random) -> None:
 def shrunk(bench: Bench, case: Case, finding: Finding, attempts: int) -> Case:
     """A smaller input with the same finding, as far as so many executions lead."""
     small = dict(case)
-    if finding.kind == "slow":
+    if finding.kind == SLOW:
         return small
     for name in sorted(small):
         size = max(1, len(small[name]) // 2)
