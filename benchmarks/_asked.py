@@ -17,7 +17,7 @@ from crossgrad_plugins.sweep.summary import earlier_rows
 #: What a run decides at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
 #: Paths, which a grid may name from its own folder, and what a run replaces by its decisions.
-_OTHERWISE: Final = ("exposure_from", "reading.init", "plan")
+_OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class Capture:
             UserError: It cannot be read.
         """
         reading = {"split": "none", "max_size": max_size}
-        config = configured({"scene": path, "reading": reading})
+        config = configured({"scene": path, "data": reading})
         scene, _ = read_scene(config)
         return cls(path, scene, fingerprint(scene, config))
 

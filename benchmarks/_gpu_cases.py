@@ -79,8 +79,8 @@ class Case:
             "operator": {"name": self.operator},
             "steps": 30_000,
             "schedule": "absolute",
-            "growth": "free",
-            "events": "steps",
+            "growth": "unbounded",
+            "schedule_unit": "steps",
         }
 
 

@@ -119,7 +119,7 @@ def main() -> None:
         parser.error(f"--reps must be at most {REPS_BETWEEN_EDITS}")
     configure_threads(arguments.threads)
     config = RunConfig.model_validate(
-        {"reading": {"max_size": arguments.max_size}, "sampler": {"name": "epoch"}}
+        {"data": {"max_size": arguments.max_size}, "sampler": {"name": "epoch"}}
     )
     scene, _ = read_scene(config, arguments.scene)
     vanilla = assemble(config, scene, "none")

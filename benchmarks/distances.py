@@ -186,7 +186,7 @@ def _runs(
     runs = {arm: own for arm, own in runs.items() if own}
     if given.baseline is not None and given.baseline not in runs:
         parser.error(f"no arm {given.baseline}; there are {', '.join(runs) or 'none'}")
-    sizes = {run.config["reading"]["max_size"] for own in runs.values() for run in own.values()}
+    sizes = {run.config["data"]["max_size"] for own in runs.values() for run in own.values()}
     if len(sizes) != 1:
         parser.error(f"runs of one size of photos are needed; there are {sizes or 'none'}")
     return runs
@@ -205,7 +205,7 @@ def print_tables(
         UserError: The scene cannot be read, there is no such figure, or a run cannot be evaluated.
     """
     every = [run for own in runs.values() for run in own.values()]
-    capture = Capture.read(given.on, every[0].config["reading"]["max_size"])
+    capture = Capture.read(given.on, every[0].config["data"]["max_size"])
     values = figures_of(every, capture, given.figure, file=given.files)
     bands = bands_of(capture, given.folders, given.bands)
     probes = Probes(runs, values, bands, Quantity.of(given.figure))

@@ -17,7 +17,7 @@ from crossgrad_core.commands import configured, photos_per_point, read_scene
 
 def made(scene: Path, out: Path, photos: int, draw: int) -> float:
     """Makes the scene; in how many training photos a point of it lies."""
-    config = configured({"scene": str(scene), "reading": {"max_size": 64}})
+    config = configured({"scene": str(scene), "data": {"max_size": 64}})
     whole, _ = read_scene(config)
     names = [view.name for view in whole.train_views]
     chosen = np.random.default_rng(draw).choice(names, size=photos, replace=False)
@@ -27,7 +27,7 @@ def made(scene: Path, out: Path, photos: int, draw: int) -> float:
     held_out = [view.name for view in whole.test_views]
     for file, listed in (("train_list.txt", sorted(chosen)), ("test_list.txt", held_out)):
         (out / file).write_text("".join(f"{name}\n" for name in listed))
-    few, _ = read_scene(configured({"scene": str(out), "reading": {"max_size": 64}}))
+    few, _ = read_scene(configured({"scene": str(out), "data": {"max_size": 64}}))
     return photos_per_point(few)
 
 

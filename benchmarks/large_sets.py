@@ -91,7 +91,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
         "steps": 30_000,
         "sampler": {"name": "epoch"},
         "densifier": {"name": "none"},
-        "reading": {"max_size": max_size or None, "cache_mib": cache_mib},
+        "data": {"max_size": max_size or None, "cache_mib": cache_mib},
     }
     setup, _ = set_up(parsed(settings), -1)
     keep = fits(setup.scene, cache_mib)
@@ -108,7 +108,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
         for line in sys.stdin:
             start, load = perf_counter(), state.clock.load
             for _ in range(int(line)):
-                foresight.look(state)
+                foresight.update(state)
                 timed_step(setup, state)
             took, waited = perf_counter() - start, state.clock.load - load
             _answer(seconds=took, waited=waited, memory=_resident("VmRSS"), peak=_resident("VmHWM"))
@@ -214,7 +214,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photos", type=int, default=2000)
     parser.add_argument("--max-size", type=int, default=1600, help="0: as they are")
-    parser.add_argument("--cache-mib", type=int, default=1280, help="reading.cache_mib")
+    parser.add_argument("--cache-mib", type=int, default=1280, help="data.cache_mib")
     parser.add_argument("--passes", type=int, default=2)
     parser.add_argument("--block", type=int, default=25, help="steps of a turn")
     parser.add_argument("--distorted", action="store_true")

@@ -67,7 +67,7 @@ def main() -> None:
     given = parser.parse_args()
     configure_threads(1)
     reading = {"max_size": given.max_size}
-    settings = {"steps": given.steps, "threads": 1, "reading": reading}
+    settings = {"steps": given.steps, "threads": 1, "data": reading}
     with tempfile.TemporaryDirectory() as folder:
         scenes = {}
         # Both are written anew, since that may change the order of the points.

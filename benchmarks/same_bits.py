@@ -11,7 +11,7 @@ metrics.csv without its clocks must be equal; the state of slots that only the n
 left out. Exit status 1 where anything differs.
 
 Where a difference is meant, the commit that makes it says why. Where a default changed, `--for-new
-"--events steps"` gives the new version the options that keep what the old one does.
+"--schedule-unit steps"` gives the new version the options that keep what the old one does.
 """
 
 import argparse

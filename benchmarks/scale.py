@@ -216,8 +216,8 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "operator": {"name": cell.operator},
             "densifier": {"name": "adc"},
             "max_gaussians": cell.gaussians,
-            "growth": "free",
-            "events": "steps",
+            "growth": "unbounded",
+            "schedule_unit": "steps",
             "dropout": 0.0,  # Each photo sees all that is in front of it.
             **options,
         }

@@ -74,7 +74,7 @@ class Outcome:
 @cache
 def base(path: Path, size: int) -> Model:
     """A right scene in small photos."""
-    config = configured({"scene": path, "threads": 1, "reading": {"max_size": size}})
+    config = configured({"scene": path, "threads": 1, "data": {"max_size": size}})
     return Model.of(read_scene(config, path)[0])
 
 

@@ -111,7 +111,7 @@ class RunConfig(BaseModel):
         description="exposure.json of another run on these photos: the exposure starts from its "
         "values.",
     )
-    start: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
+    initializer: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
         description="What is added to the points that a run starts from. Default: auto.",
     )
@@ -177,18 +177,18 @@ class RunConfig(BaseModel):
         description="Stretch the published schedule to the run, or keep its numbers. "
         "Default: scaled.",
     )
-    reference: Annotated[int | None, Flag("N", TRAINING)] = Field(
+    schedule_length: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None,
         ge=1,
         description="With --schedule absolute: have the schedule of a run of that length. "
         "Default: 30000.",
     )
-    events: Annotated[Unit | None, Flag("views|steps", TRAINING)] = Field(
+    schedule_unit: Annotated[Unit | None, Flag("views|steps", TRAINING)] = Field(
         None,
         description="What schedules count. Default: auto.",
     )
     densify_from: int | None = Field(
-        None, ge=0, description="density control after this, counted in --events ..."
+        None, ge=0, description="density control after this, counted in --schedule-unit ..."
     )
     densify_until: int | None = Field(None, ge=0, description="... and before this")
     densify_every: int | None = Field(None, ge=1, description="interval of its edits, likewise")
@@ -198,7 +198,9 @@ class RunConfig(BaseModel):
         description="edits that any run has, for which warm-up and interval are shortened",
     )
     reset_every: int | None = Field(
-        None, ge=0, description="interval of opacity resets, counted in --events; 0 for no resets"
+        None,
+        ge=0,
+        description="interval of opacity resets, counted in --schedule-unit; 0 for no resets",
     )
     sh_from: int | None = Field(
         None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
@@ -279,7 +281,7 @@ class RunConfig(BaseModel):
         "Default: auto.",
     )
     lr_tail_factor: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
-    average: Annotated[float, Flag("SHARE", TRAINING)] = Field(
+    weight_averaging: Annotated[float, Flag("SHARE", TRAINING)] = Field(
         0.0,
         ge=0,
         le=1,
@@ -306,7 +308,7 @@ class RunConfig(BaseModel):
     threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
         None, ge=1, description="CPU threads. Default: all there are."
     )
-    reading: SceneOptions = SceneOptions()
+    data: SceneOptions = SceneOptions()
     background: Annotated[str, Flag("COLOR", TRAINING)] = Field(
         "black",
         description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
@@ -318,10 +320,12 @@ class RunConfig(BaseModel):
         description="At most N primitives, 0 for no bound; auto: as suits the length of the run. "
         "Default: auto.",
     )
-    growth: Annotated[Literal["free", "curve"] | None, Flag("free|curve", TRAINING)] = Field(
-        None,
-        description="Growth up to --max-gaussians: as it is asked for, or along a curve that gets "
-        "there with the last edit. Default: auto.",
+    growth: Annotated[Literal["unbounded", "budget"] | None, Flag("unbounded|budget", TRAINING)] = (
+        Field(
+            None,
+            description="Growth up to --max-gaussians: unbounded, or along a budget that reaches it "
+            "with the last edit. Default: auto.",
+        )
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None,

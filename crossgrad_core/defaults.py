@@ -11,7 +11,7 @@ SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
 #: The start of published runs, and of those that begin with points of their own: it adds nothing.
-BARE_START: Final = "sfm"
+BARE_START: Final = "points"
 #: The start that has points for a scene without any: a hint.
 START_ALONE: Final = "triangulated"
 RESOLUTION: Final = "full"

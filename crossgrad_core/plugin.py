@@ -58,6 +58,7 @@ from crossgrad_core.contract.gramian_operator import (
 )
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
 from crossgrad_core.contract.images import masked, to_uint8, unit_range
+from crossgrad_core.contract.initializer import Initializer, MorePoints
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.metric import Compared, Metric
@@ -83,7 +84,6 @@ from crossgrad_core.contract.schedule import (
 )
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
 from crossgrad_core.contract.similarity import Similarity
-from crossgrad_core.contract.start import MorePoints, Start
 from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -146,6 +146,7 @@ __all__ = [
     "Grouping",
     "HasUnusedOptions",
     "IncompatibleSelectionError",
+    "Initializer",
     "Json",
     "LearningRate",
     "Loss",
@@ -194,7 +195,6 @@ __all__ = [
     "Selection",
     "SeparateGradients",
     "Similarity",
-    "Start",
     "StepContext",
     "StepRecord",
     "Unit",

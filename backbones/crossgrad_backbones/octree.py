@@ -106,7 +106,7 @@ class Octree(AnchorBackbone):
 
     @override
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
-        centers = scene.usual_centers
+        centers = scene.robust_centers
         lattice = self._lattice(scene.points, centers)
         anchors = init_anchors(scene.points, lattice, everywhere=self.plant_everywhere)
         shares = lattice.shares(anchors.positions, anchors.levels, torch.from_numpy(centers))

@@ -38,14 +38,14 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     path: Annotated[
         str | None,
         typer.Option(
-            metavar="FILE|ladder",
+            metavar="FILE|zoom",
             help="Draw a video instead: along the cameras of a file, or from the farthest photos "
             "down to the nearest.",
         ),
     ] = None,
     frames: Annotated[
         int | None,
-        typer.Option(metavar="N", min=2, max=100_000, help="Frames of a ladder. Default: 120."),
+        typer.Option(metavar="N", min=2, max=100_000, help="Frames of a zoom path. Default: 120."),
     ] = None,
     device: Device = None,
     threads: Threads = None,
@@ -58,9 +58,9 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")
     if frames is not None and path is None:
         raise UserError(
-            "--frames does nothing without --path ladder",
+            "--frames does nothing without --path zoom",
             where="--frames",
-            todo="leave out --frames, or draw a ladder",
+            todo="leave out --frames, or draw a zoom path",
         )
     announce()
     from crossgrad_core.run.postprocess import render

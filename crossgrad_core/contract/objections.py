@@ -77,7 +77,7 @@ def _of_the_rasterizer(selection: Selection) -> Iterator[str]:
 
 def _of_the_resolution(selection: Selection) -> Iterator[str]:
     backbone, names = selection.backbone, selection.names
-    if selection.resolution.interlaced and backbone.response == "analytic":
+    if selection.resolution.strided and backbone.response == "analytic":
         yield (
             f"resolution {names['resolution']} draws some of the pixels; the pixel response "
             f"analytic of backbone {names['backbone']} is a mean over all of them"

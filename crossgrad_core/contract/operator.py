@@ -23,8 +23,8 @@ class Operator(Component):
         separate: Whether it needs the views' gradients apart. Where not, the backward passes
             accumulate into one gradient: same bits, no copies.
         views: For which K the operator has a meaning.
-        idle_at_one: Whether it leaves the gradient of a single view as it is. A run with K = 1 then
-            says that the operator does nothing.
+        identity_at_one: Whether it leaves the gradient of a single view as it is. A run with K = 1
+            then reports that the operator does nothing.
         default_grouping: Name of the grouping it needs unless the user names another; None where
             it needs no labels.
         sparse_rows: Whether `aggregate` hands on what `total` and `combine` answer as it is, sparse
@@ -35,7 +35,7 @@ class Operator(Component):
     slot: ClassVar[str] = "operators"
     separate: ClassVar[bool] = True
     views: ClassVar[ViewCounts] = ViewCounts()
-    idle_at_one: ClassVar[bool] = False
+    identity_at_one: ClassVar[bool] = False
     default_grouping: ClassVar[str | None] = None
     sparse_rows: ClassVar[bool] = False
 
@@ -51,13 +51,13 @@ class Operator(Component):
         """The grouping it needs with its options as they are, where the user names none."""
         return self.default_grouping
 
-    def does_nothing(self, views: int) -> bool:
+    def is_identity(self, views: int) -> bool:
         """Whether the result is the plain sum, whatever the gradients of that many views are."""
-        return views == 1 and self.idle_at_one
+        return views == 1 and self.identity_at_one
 
-    def wants_more(self, views: int) -> bool:
+    def needs_more_views(self, views: int) -> bool:
         """Whether it, or an operator that it consists of, does nothing with so many views."""
-        return self.does_nothing(views)
+        return self.is_identity(views)
 
     def reads_labels(self) -> bool:
         """Whether the labels of the views make a difference to it."""

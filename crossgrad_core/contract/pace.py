@@ -11,7 +11,7 @@ _FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1.
 
 
 @dataclass(frozen=True)
-class Pace:
+class ViewsPerStep:
     """K of every step of a run of known length.
 
     Attributes:
@@ -41,7 +41,7 @@ class Pace:
             start, count = later, then
         return start + max(0, -((self.views(start) - views) // count))
 
-    def moved(self, wanted: "Pace", step: int) -> "Pace":
+    def moved(self, wanted: "ViewsPerStep", step: int) -> "ViewsPerStep":
         """This pace, changing when another one does, as far as that is still ahead.
 
         Args:
@@ -50,11 +50,11 @@ class Pace:
         """
         pairs = zip(self.starts, wanted.starts, strict=True)
         starts = (old if old < step else max(step, new) for old, new in pairs)
-        return Pace(tuple(starts), self.counts)
+        return ViewsPerStep(tuple(starts), self.counts)
 
 
 #: The pace of one view in every step.
-ONE_BY_ONE: Final = Pace()
+ONE_BY_ONE: Final = ViewsPerStep()
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class ViewsPerStepSpec:
         """The plan as a setting: a plain number where K does not change."""
         return str(self) if self.shares else self.counts[0]
 
-    def paced(self, total: int) -> Pace:
+    def paced(self, total: int) -> ViewsPerStep:
         """The pace of a run of `total` steps."""
-        return Pace((0, *(round(share * total) for share in self.shares)), self.counts)
+        return ViewsPerStep((0, *(round(share * total) for share in self.shares)), self.counts)
 
     def steps_of(self, views: int) -> int:
         """The most steps that draw no more than `views` views."""

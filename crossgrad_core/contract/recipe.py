@@ -49,7 +49,7 @@ class Facts:
     planned: int | None
     total: int
     mode: ScheduleMode
-    reference: int | None
+    schedule_length: int | None
     views_per_step: ViewsPerStepSpec
     views_because: str
     photos: int
@@ -67,12 +67,12 @@ class Facts:
     @property
     def published(self) -> bool:
         """Whether the schedule has the published numbers, whatever the length of the run."""
-        return is_published(self.mode, self.reference)
+        return is_published(self.mode, self.schedule_length)
 
     @property
     def unit(self) -> Unit:
         """What schedules count, unless the recipe says otherwise."""
-        unit: Unit = self.given.get("events") or ("steps" if self.published else "views")
+        unit: Unit = self.given.get("schedule_unit") or ("steps" if self.published else "views")
         return unit
 
     @property
@@ -96,7 +96,7 @@ class Facts:
 
     def schedule(self, unit: Unit) -> Schedule:
         """Return the schedule at the present length of the run, before any decision on it."""
-        counting = Counting(unit, self.views_per_step, self.photos, self.reference)
+        counting = Counting(unit, self.views_per_step, self.photos, self.schedule_length)
         return Schedule.for_run(self.total, self.mode, counting)
 
 

@@ -32,12 +32,12 @@ class Resolution(Component):
     control in units of the full photo.
 
     Attributes:
-        interlaced: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, in
+        strided: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, in
             each step another one, and compared with these pixels of its photo.
     """
 
     slot: ClassVar[str] = "resolutions"
-    interlaced: ClassVar[bool] = False
+    strided: ClassVar[bool] = False
 
     def fitted_to(self, scene: Scene) -> "Resolution":
         """This resolution with what it measures of the scene; by default as it is.

@@ -197,14 +197,14 @@ class Scene:
         return centers_of(self.train_views)
 
     @cached_property
-    def usual_centers(self) -> NDArray[np.float64]:
+    def robust_centers(self) -> NDArray[np.float64]:
         """[M, 3] training camera centres without stray ones, local frame."""
         return self.centers[~stray_rows(self.centers, self.points)]
 
     @cached_property
     def middle(self) -> NDArray[np.float64]:
         """[3] mean of the training camera centres without stray ones, local frame."""
-        return np.asarray(self.usual_centers.mean(axis=0))
+        return np.asarray(self.robust_centers.mean(axis=0))
 
     @cached_property
     def distances(self) -> NDArray[np.float64]:

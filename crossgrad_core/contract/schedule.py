@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from math import log
 from typing import Literal
 
-from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, Pace, ViewsPerStepSpec
+from crossgrad_core.contract.pace import ONE_BY_ONE, ONE_VIEW, ViewsPerStep, ViewsPerStepSpec
 from crossgrad_core.numerics.hashing import hash32
 
 ScheduleMode = Literal["scaled", "absolute"]
@@ -56,7 +56,7 @@ class Counting:
     unit: Unit = "steps"
     views: ViewsPerStepSpec = ONE_VIEW
     photos: int = 1
-    reference: int | None = None
+    schedule_length: int | None = None
     min_refinements: int = 0
 
 
@@ -106,7 +106,7 @@ class Schedule:
     sh_wait: int = 0
     sh_every: int = 1
     counting: Counting = IN_STEPS
-    pace: Pace = ONE_BY_ONE
+    pace: ViewsPerStep = ONE_BY_ONE
     edits_before: int = 0
     min_refinements: int = 0
 
@@ -121,7 +121,7 @@ class Schedule:
         """
         pace = counting.views.paced(total)
         own = pace.views(total) if counting.unit == "views" else total
-        length = own if mode == "scaled" else counting.reference or REFERENCE
+        length = own if mode == "scaled" else counting.schedule_length or REFERENCE
         schedule = cls(
             mode=mode,
             total=total,
@@ -170,7 +170,7 @@ class Schedule:
     @property
     def published(self) -> bool:
         """See `is_published`."""
-        return is_published(self.mode, self.counting.reference)
+        return is_published(self.mode, self.counting.schedule_length)
 
     def counted(self, step: int) -> int:
         """The count after a step: of the views drawn by then, or of the steps."""

@@ -10,6 +10,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.initializer import Initializer
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
@@ -17,7 +18,6 @@ from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.start import Start
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Selection:
     rasterizer: Rasterizer
     loss: Loss
     exposure: Exposure
-    start: Start
+    initializer: Initializer
     resolution: Resolution
     exporter: Exporter
     metrics: Mapping[str, Metric]
@@ -79,7 +79,7 @@ class Selection:
             "rasterizer": self.rasterizer,
             "loss": self.loss,
             "exposure": self.exposure,
-            "start": self.start,
+            "initializer": self.initializer,
             "resolution": self.resolution,
             "exporter": self.exporter,
             "grouping": self.grouping,

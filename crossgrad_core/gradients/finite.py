@@ -67,13 +67,13 @@ def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:
     if not tensors:
         return []
     from crossgrad_core.gradients.numba_kernels.largest import PART, largest_bits
-    from crossgrad_core.numerics.jobs import alone, share
+    from crossgrad_core.numerics.jobs import parallel, serial
 
     sizes = np.array([tensor.numel() for tensor in tensors], np.int64)
     # A tensor without elements has a part, too.
     starts = np.array([0, *np.maximum(1, -(-sizes // PART)).cumsum()], np.int64)
     found = np.empty(starts[-1], np.uint32)
-    call = share if len(found) > _FEW else alone
+    call = parallel if len(found) > _FEW else serial
     call(largest_bits, np.array([t.data_ptr() for t in tensors], np.int64), sizes, starts, found)
     most: list[int] = np.maximum.reduceat(found, starts[:-1]).tolist()
     return most

@@ -25,9 +25,9 @@ def _sizes(columns: Sequence[Column]) -> NDArray[np.int64]:
 
 
 def _run(sizes: NDArray[np.int64]) -> Callable[..., None]:
-    from crossgrad_core.numerics.jobs import alone, share
+    from crossgrad_core.numerics.jobs import parallel, serial
 
-    return share if int(sizes.sum()) > SMALL else alone
+    return parallel if int(sizes.sum()) > SMALL else serial
 
 
 def _size(gradient: Tensor | None) -> int:
@@ -49,13 +49,13 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
 def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
     """[K, K] Gramian of gradients in `rows` of `count` rows, with the bits of dense ones."""
     from crossgrad_core.gradients.numba_kernels import dense
-    from crossgrad_core.numerics.jobs import share
+    from crossgrad_core.numerics.jobs import parallel
 
     width = max(_size(g) for g in column) // max(1, len(rows))
     chunks = -(-count * width // dense.CHUNK)
     partial = np.zeros((chunks, len(column), len(column)))
     addresses = _addresses([column])[0]
-    share(dense.spread_gramian, addresses, rows.numpy(), width, count * width, partial)
+    parallel(dense.spread_gramian, addresses, rows.numpy(), width, count * width, partial)
     (found,) = dense.summed(partial, np.zeros((chunks, 1), np.int64), 1)
     return np.asarray(found)
 
@@ -98,24 +98,24 @@ def overlap(column: Column, first: int, second: int) -> bool:
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
     """[N, K, K] Gramians of the rows of a block's tensors."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
-    from crossgrad_core.numerics.jobs import share
+    from crossgrad_core.numerics.jobs import parallel
 
     sizes = _sizes(columns)
     out = np.zeros((rows, len(columns[0]), len(columns[0])))
-    share(kernels.row_gramians, _addresses(columns), sizes // max(rows, 1), out)
+    parallel(kernels.row_gramians, _addresses(columns), sizes // max(rows, 1), out)
     return out
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
     """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
-    from crossgrad_core.numerics.jobs import share
+    from crossgrad_core.numerics.jobs import parallel
 
     if out.numel():
         width = out.numel() // len(weights)
         addresses = _addresses([column])[0]
         weights = np.ascontiguousarray(weights)
-        share(kernels.row_combine, addresses, weights, out.data_ptr(), width)
+        parallel(kernels.row_combine, addresses, weights, out.data_ptr(), width)
 
 
 def row_overlap(

@@ -55,7 +55,7 @@ _next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
 
 
 @device
-def take(jobs: Jobs, count: int) -> int:
+def next_job(jobs: Jobs, count: int) -> int:
     """Returns the number of a job that nobody has taken, or `count`; only in kernels.
 
     Args:
@@ -84,7 +84,9 @@ def _jobs(threads: int) -> list[Jobs]:
     return [room[: 1 + threads + each] for each in range(threads)]
 
 
-def share(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
+def parallel(
+    kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
+) -> None:
     """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
     Begun(kernel, *args, **kwargs).end()
 
@@ -221,7 +223,7 @@ def _helpers(process: int) -> _Helpers:
     return _Helpers()
 
 
-def alone(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
+def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
     """Calls a kernel on this thread only, for work too small to wake others for; the same bits."""
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

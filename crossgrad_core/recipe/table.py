@@ -16,8 +16,16 @@ from crossgrad_core.wording import listed, plural
 
 #: Settings that training and assembly read and that have no default: a recipe decides each.
 DECIDED: Final = (
-    *("views_per_step", "densifier", "start", "exposure", "resolution", "dropout", "floaters"),
-    *("events", "growth", "max_gaussians", "min_refinements", "reset_every", "sh_start"),
+    *(
+        "views_per_step",
+        "densifier",
+        "initializer",
+        "exposure",
+        "resolution",
+        "dropout",
+        "floaters",
+    ),
+    *("schedule_unit", "growth", "max_gaussians", "min_refinements", "reset_every", "sh_start"),
     *("position_lr", "max_scale_ratio", "rate_factor", "hurried_rates", "beta1", "beta2"),
     *("lr_tail", "step_order"),
 )
@@ -102,7 +110,7 @@ def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
 
 def _long_form(name: str, value: object) -> object:
     """Return the name of a component as a choice of it."""
-    component = name in {"densifier", "start", "exposure", "resolution", "grouping"}
+    component = name in {"densifier", "initializer", "exposure", "resolution", "grouping"}
     return {"name": value} if component and isinstance(value, str) else value
 
 

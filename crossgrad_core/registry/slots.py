@@ -14,7 +14,7 @@ GROUPS: Final[dict[str, str]] = {
         "rasterizers",
         "losses",
         "exposures",
-        "starts",
+        "initializers",
         "resolutions",
         "readers",
         "exporters",

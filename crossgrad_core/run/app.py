@@ -143,7 +143,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
             todo="leave it out, or name the run with --resume",
         )
     if accept_scene:
-        settings = layered([settings, {"reading.accept_scene": True}])
+        settings = layered([settings, {"data.accept_scene": True}])
     if dry_run:
         _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0
@@ -200,7 +200,7 @@ def _with_remarks(setup: Setup) -> tuple[Setup, float]:
     """The setup with what exposure and start say about the scene, and the seconds it took."""
     begun, scene = perf_counter(), setup.scene
     messages = setup.exposure.messages(scene, known_starts(setup))
-    messages += setup.selection.start.messages(scene)
+    messages += setup.selection.initializer.messages(scene)
     return replace(setup, notes=(*setup.notes, *messages)), perf_counter() - begun
 
 
@@ -403,7 +403,7 @@ def resumed(
 def _decoded(setup: Setup, way: Way) -> float:
     """Finds held-out photos, or all, that cannot be decoded; answers the seconds."""
     start = perf_counter()
-    keep = fits(setup.scene, setup.config.reading.cache_mib)
+    keep = fits(setup.scene, setup.config.data.cache_mib)
     views = setup.scene.views if way.check else setup.scene.test_views
     check_photos(views, keep=keep, whole=way.check)
     return perf_counter() - start

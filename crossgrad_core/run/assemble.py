@@ -67,7 +67,7 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
         # If no reader recognises the folder, one of them explains what it misses.
         near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
         name = (*able, *near, READER)[0]
-    return build(Reader, name, config.reader.options).read(path, config.reading), name
+    return build(Reader, name, config.reader.options).read(path, config.data), name
 
 
 def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tuple[Scene, str]:
@@ -82,9 +82,9 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
         UserError: As `read_scene`, or the scene contradicts itself.
     """
     scene, name = read_scene(config, path)
-    reading = config.reading
-    accept = accept or reading.accept_scene
-    return checked(scene, path, cache_mib=reading.cache_mib, accept=accept), name
+    data = config.data
+    accept = accept or data.accept_scene
+    return checked(scene, path, cache_mib=data.cache_mib, accept=accept), name
 
 
 def accepts(name: str, path: Path) -> bool:
@@ -158,7 +158,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     groups = _groups(config, scene, selection, notes)
     config = _with_steps(config, selection.views)
     photos = len(scene.train_views)
-    counting = Counting(views=selection.views, photos=photos, reference=config.reference)
+    counting = Counting(
+        views=selection.views, photos=photos, schedule_length=config.schedule_length
+    )
     steps = config.steps or DEFAULT_STEPS
     setup = Setup(
         config=config,
@@ -190,7 +192,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
     """Where photos are kept besides those that were decoded last."""
-    mib, device = config.reading.cache_mib, choose_device(config.device)
+    mib, device = config.data.cache_mib, choose_device(config.device)
     # At half the size photos take a quarter of the memory.
     scaled = ScaledPhotos(mib // 4)
     return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
@@ -201,7 +203,7 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 
     Written down, so that a run goes on without the file that it started from.
     """
-    path = config.reading.init_file
+    path = config.data.init_file
     if config.sh_from is not None or path is None:
         return config
     degree = build(Exporter, EXPORTER, {}).sh_degree_of(path)

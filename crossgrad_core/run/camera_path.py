@@ -19,13 +19,13 @@ from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
 #: Instead of a file: from the farthest photos down to the nearest.
-LADDER: Final = "ladder"
+ZOOM: Final = "zoom"
 FRAMES_PER_SECOND: Final = 24.0
-#: Of a ladder.
+#: Of a zoom path.
 FRAMES: Final = 120
 #: Views that observe fewer SfM points say too little about what they look at.
 FEWEST_SEEN: Final = 8
-#: Of more views the ends of a ladder are sought among so many, spread over all.
+#: Of more views the ends of a zoom path are sought among so many, spread over all.
 MOST_VIEWS: Final = 500
 _TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
 #: Longer paths are a mistake.
@@ -54,18 +54,18 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 
     Args:
         scene: The scene of the run.
-        path: `ladder`, or a camera path as nerfstudio's viewer writes it, in input coordinates.
-        frames: How many a ladder has.
+        path: `zoom`, or a camera path as nerfstudio's viewer writes it, in input coordinates.
+        frames: How many a zoom path has.
 
     Raises:
-        UserError: There is no such file, it holds no path, or the photos give no ladder.
+        UserError: There is no such file, it holds no path, or the photos give no zoom path.
     """
-    if path == LADDER:
-        return CameraPath(LADDER, ladder(scene.train_views, scene.points, frames))
+    if path == ZOOM:
+        return CameraPath(ZOOM, zoom_path(scene.train_views, scene.points, frames))
     return _read(Path(path), scene.similarity)
 
 
-def ladder(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
+def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
     """Along a line from a far photo to a near one that shows the same, nearer by equal factors.
 
     The ends are one of the farthest fifth of the views and one of the nearest fifth: those that
@@ -83,8 +83,8 @@ def ladder(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera,
     known = known[:: 1 + len(known) // MOST_VIEWS]
     if len(known) < 2:  # noqa: PLR2004 - two ends
         raise UserError(
-            "the photos give no ladder",
-            where=f"--path {LADDER}",
+            "the photos give no zoom path",
+            where=f"--path {ZOOM}",
             expected=f"two photos that observe {FEWEST_SEEN} SfM points or more",
             found=f"{len(known)}",
             todo="give a file of cameras: --path FILE.json",

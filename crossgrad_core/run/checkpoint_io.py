@@ -38,7 +38,7 @@ _LOOSE: Final = frozenset(
         "plan",
         "planned_seconds",
         "planned_views",
-        "reading",
+        "data",
         "revised",
         "revisions",
         "save_every",

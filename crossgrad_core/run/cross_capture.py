@@ -69,7 +69,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     reading = {"split": "none", "masks": None, "init": "random", "points": None}
     config = setup.config.model_copy(
         update={
-            "reading": setup.config.reading.model_copy(update=reading),
+            "data": setup.config.data.model_copy(update=reading),
             "reader": _reader(setup, path),
         }
     )
@@ -132,7 +132,7 @@ def _check_place(
     scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
 ) -> None:
     """Refuses a capture in other coordinates: what it shows is not where the run's scene is."""
-    own = np.concatenate([scene.points, scene.usual_centers])
+    own = np.concatenate([scene.points, scene.robust_centers])
     middle, half = (own.max(axis=0) + own.min(axis=0)) / 2, np.ptp(own, axis=0) / 2
     what = points if len(points) else centers
     share = float(np.mean(np.all(np.abs(what - middle) <= MARGIN * half, axis=1)))

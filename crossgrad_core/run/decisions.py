@@ -53,13 +53,13 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
         planned=None if config.seconds is not None else planned,
         total=DEFAULT_STEPS if config.seconds is not None else planned,
         mode=config.schedule,
-        reference=config.reference,
+        schedule_length=config.schedule_length,
         views_per_step=views,
         views_because=because,
         photos=len(scene.train_views),
         pixels=scene.train_pixels,
         photos_per_point=photos_per_point(scene),
-        own_points=config.reading.init == "points",
+        own_points=config.data.init == "points",
         batched=config.batch_rule != "none",
         scale=scene.similarity.scale,
         start=None,
@@ -117,7 +117,9 @@ def edits_of(config: RunConfig, scene: Scene) -> int:
     views, _ = views_per_step_of(config)
     steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
     densifier = chosen(Densifier, config.densifier)
-    counting = Counting(views=views, photos=len(scene.train_views), reference=config.reference)
+    counting = Counting(
+        views=views, photos=len(scene.train_views), schedule_length=config.schedule_length
+    )
     return schedule_of(config, densifier, steps or DEFAULT_STEPS, counting).edits()
 
 

@@ -103,7 +103,7 @@ class RunLoop:
 
     def _train(self, length: Length) -> None:
         setup = self.setup
-        keep = fits(setup.scene, setup.config.reading.cache_mib)
+        keep = fits(setup.scene, setup.config.data.cache_mib)
         views = (*setup.train_views, *setup.scene.test_views)
         with (
             self.stopper.interruptible(),

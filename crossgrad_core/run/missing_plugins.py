@@ -22,7 +22,7 @@ _PLAIN: Final = {
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
     # It asks for no points, of which the scene may have none.
-    "start": defaults.START_ALONE,
+    "initializer": defaults.START_ALONE,
     "resolution": defaults.RESOLUTION,
 }
 #: Slots (singular words) whose components a run can be looked at without.

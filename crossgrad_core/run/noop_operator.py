@@ -12,7 +12,7 @@ def idle_note(setup: Setup) -> tuple[str, ...]:
     selection = setup.selection
     name, views = selection.names["operator"], selection.views_per_step
     default: ComponentChoice = RunConfig.model_fields["operator"].default
-    if name == default.name or not selection.operator.does_nothing(views):
+    if name == default.name or not selection.operator.is_identity(views):
         return ()
     sampler = selection.names["sampler"]
     more = next((k for k in (2, 3) if selection.sampler.view_counts.admits(k)), None)

@@ -21,7 +21,7 @@ class Option:
     """An option of the command line.
 
     Attributes:
-        path: The setting that it is for, such as `("reading", "split")`.
+        path: The setting that it is for, such as `("data", "split")`.
         flag: How it appears.
         kind: Its type.
         help: Its help.

@@ -11,7 +11,7 @@ from crossgrad_core.training.setup import Setup
 #: Slots that every run fills with one component.
 ALWAYS = (
     *("backbone", "sampler", "densifier", "rasterizer"),
-    *("loss", "exposure", "start", "resolution", "exporter"),
+    *("loss", "exposure", "initializer", "resolution", "exporter"),
 )
 
 
@@ -26,11 +26,11 @@ def resolved(setup: Setup) -> RunConfig:
     if "grouping" in components:
         chosen["grouping"] = _choice(names["grouping"], components["grouping"])
     scene = None if config.scene is None else Path(config.scene).resolve()
-    reading, path = config.reading, config.reading.init_file
+    data, path = config.data, config.data.init_file
     located = {
-        "init": reading.init if path is None else str(path.resolve()),
-        "points": _located(reading.points),
-        "masks": _located(reading.masks),
+        "init": data.init if path is None else str(path.resolve()),
+        "points": _located(data.points),
+        "masks": _located(data.masks),
     }
     known = config.exposure_from
     return config.model_copy(
@@ -41,7 +41,7 @@ def resolved(setup: Setup) -> RunConfig:
             "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
             "scene": scene,
-            "reading": reading.model_copy(update=located),
+            "data": data.model_copy(update=located),
             "exposure_from": None if known is None else known.resolve(),
             "out": None,
             "views_per_step": selection.views.setting,

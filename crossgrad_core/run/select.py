@@ -10,6 +10,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.exposure import Exposure, Fitted
 from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.initializer import Initializer
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
@@ -19,7 +20,6 @@ from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.contract.start import Start
 from crossgrad_core.defaults import METRICS, START_ALONE
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, load
@@ -40,7 +40,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     Raises:
         UserError: A name or option is wrong.
     """
-    start = chosen(Start, config.start)
+    start = chosen(Initializer, config.initializer)
     _require_points(config, scene, start)
     _require_shown_points(config, scene, start)
     device = choose_device(config.device)
@@ -69,7 +69,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         "rasterizer": rasterizer_name,
         "loss": config.loss.name,
         "exposure": fitted.name or _name(config.exposure),
-        "start": _name(config.start),
+        "initializer": _name(config.initializer),
         "resolution": _name(config.resolution),
         "exporter": config.exporter.name,
         "reader": reader,
@@ -86,7 +86,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         rasterizer=rasterizer,
         loss=chosen(Loss, config.loss),
         exposure=fitted.exposure,
-        start=start,
+        initializer=start,
         resolution=resolution.fitted_to(scene),
         exporter=chosen(Exporter, config.exporter),
         metrics=_metrics(config, scene, notes),
@@ -99,15 +99,15 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
     return selection, notes
 
 
-def _require_points(config: RunConfig, scene: Scene, start: Start) -> None:
-    if not len(scene.points) and config.reading.init == "points" and not start.alone:
+def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None:
+    if not len(scene.points) and config.data.init == "points" and not start.alone:
         raise UserError(
             "the scene has no SfM points to start from",
             where=config.scene or scene.name,
             found=_clouds_in(config.scene),
-            todo=f"find some in the photos (--start {START_ALONE}), or start from those of a point "
-            "cloud (--points FILE), from the Gaussians of a file (--init FILE.ply) or from random "
-            "points (--init random)",
+            todo=f"find some in the photos (--initializer {START_ALONE}), or start from those of a "
+            "point cloud (--points FILE), from the Gaussians of a file (--init FILE.ply) or from "
+            "random points (--init random)",
         )
 
 
@@ -118,8 +118,8 @@ def _clouds_in(folder: Path | None) -> str:
     return f"point clouds that are not used: {listed(names)}" if names else "no point cloud"
 
 
-def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None:
-    if not len(scene.points) or config.reading.init != "points" or start.alone:
+def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -> None:
+    if not len(scene.points) or config.data.init != "points" or start.alone:
         return
     if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
         raise UserError(
@@ -127,7 +127,7 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Start) -> None
             where=config.scene or scene.name,
             expected="points and cameras in one frame, with the cameras looking at the points",
             found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
-            todo=f"mend the model, or find points in the photos (--start {START_ALONE})",
+            todo=f"mend the model, or find points in the photos (--initializer {START_ALONE})",
         )
 
 

@@ -40,7 +40,7 @@ LENGTHS: Final = tuple(
 #: Other settings that a recipe decides by, for which it is asked anew.
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
 #: Settings that hold settings.
-GROUPS_OF_SETTINGS: Final = ("reading",)
+GROUPS_OF_SETTINGS: Final = ("data",)
 _FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
 #: Options of the command line -> their setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}

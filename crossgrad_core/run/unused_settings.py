@@ -100,12 +100,12 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
     for setting in _TIMES:
         if getattr(config, setting) is not None and not densifier.edits:
             yield setting, f"densifier {name} never edits"
-    if config.growth == "curve" and not densifier.edits:
+    if config.growth == "budget" and not densifier.edits:
         yield "growth", f"densifier {name} never edits"
     # A number bounds the start of points, too.
     if not densifier.edits and config.max_gaussians == AUTO:
         yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
-    elif not densifier.edits and config.max_gaussians and config.reading.init_file is not None:
+    elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
         yield "max_gaussians", f"densifier {name} never edits, and a PLY is taken as it is"
 
 
@@ -141,8 +141,11 @@ def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if config.reference is not None and config.schedule == "scaled":
-        yield "reference", "--schedule scaled has the run's own length; add --schedule absolute"
+    if config.schedule_length is not None and config.schedule == "scaled":
+        yield (
+            "schedule_length",
+            "--schedule scaled has the run's own length; add --schedule absolute",
+        )
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
@@ -196,22 +199,25 @@ def _of_exposure(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
-    reading = config.reading
-    if reading.test_every == SceneOptions.model_fields["test_every"].default:
+    data = config.data
+    if data.test_every == SceneOptions.model_fields["test_every"].default:
         return
-    if reading.split == "none":
-        yield "reading.test_every", "--split none holds no photo out"
+    if data.split == "none":
+        yield "data.test_every", "--split none holds no photo out"
     lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
-    if reading.split == "auto" and lists:
-        yield "reading.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+    if data.split == "auto" and lists:
+        yield "data.test_every", f"{listed(lists)} decide; --split every leaves them aside"
 
 
 def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
-    asked = config.start is not None and config.start.name != BARE_START
-    if asked and config.reading.init != "points":
-        yield "start", f"--init {config.reading.init} has points of its own; leave one of them out"
-    if config.reading.points is not None and config.reading.init != "points":
-        yield "reading.points", f"--init {config.reading.init} starts from other points"
+    asked = config.initializer is not None and config.initializer.name != BARE_START
+    if asked and config.data.init != "points":
+        yield (
+            "initializer",
+            f"--init {config.data.init} has points of its own; leave one of them out",
+        )
+    if config.data.points is not None and config.data.init != "points":
+        yield "data.points", f"--init {config.data.init} starts from other points"
 
 
 def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:

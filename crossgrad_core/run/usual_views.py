@@ -39,7 +39,7 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     if usual not in both:
         # If no K suits both, the objections say so.
         found, why = next(iter(both), usual), f"the operator needs {operator.views}"
-    elif named and operator.wants_more(usual):
-        found = next((k for k in both if not operator.wants_more(k)), usual)
+    elif named and operator.needs_more_views(usual):
+        found = next((k for k in both if not operator.needs_more_views(k)), usual)
         why = "with fewer views the operator does nothing"
     return ViewsPerStepSpec((found,)), why if found != usual else ""

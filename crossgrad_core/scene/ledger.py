@@ -80,7 +80,7 @@ def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
     if masks is not None and kind in {PHOTO, MASK} and path.is_relative_to(masks):
         return "masks of no photo that is used"
     if kind is MASK:
-        return "named like masks; use them with --set reading.masks=FOLDER"
+        return "named like masks; use them with --set data.masks=FOLDER"
     if kind is POINTS:
         own = "the scene has its own points" if len(raw.points) else "not a name that is looked for"
         return f"{own}; start from such a file with --points FILE"

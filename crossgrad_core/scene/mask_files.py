@@ -64,7 +64,7 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
     raise UserError(
         "the mask folder is not there",
         where=option,
-        todo="name a folder, as it is or within the scene: --set reading.masks=FOLDER",
+        todo="name a folder, as it is or within the scene: --set data.masks=FOLDER",
     )
 
 
@@ -82,7 +82,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
         where=folder,
         expected=f"{' or '.join(dict.fromkeys(mask_names(names[0])))} for the photo {names[0]}",
         found=name_some(there) or "no mask",
-        todo="name the masks after their photos, or leave reading.masks out"
+        todo="name the masks after their photos, or leave data.masks out"
         if option
         else "name the masks after their photos, or rename the folder to train without masks",
     )

@@ -159,6 +159,6 @@ def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
         return []
     return [
         f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
-        "others are decoded again whenever they are drawn (more memory: --set reading.cache_mib=N; "
+        "others are decoded again whenever they are drawn (more memory: --set data.cache_mib=N; "
         "smaller photos: --max-size N)"
     ]

@@ -37,7 +37,7 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
     chosen[rows] = True
     how = f"from each cube with a side of {side:.3g} input units" if side else "of so many"
     kept = f"{len(rows):,} of {count:,} kept, one {how}"
-    return points.selected(chosen), [f"points: {kept} (--set reading.max_points=N keeps more)"]
+    return points.selected(chosen), [f"points: {kept} (--set data.max_points=N keeps more)"]
 
 
 def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64], float]:

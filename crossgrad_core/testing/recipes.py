@@ -32,8 +32,9 @@ def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
 
 def names_settings_that_exist(make: Make[Recipe]) -> None:
     """Each row is about a setting of a run, or about an option of a component."""
-    names = [row.setting.partition(".")[0] for row in make().decide(_facts(3_000))]
-    unknown = sorted({*names, *make().settings} - RunConfig.model_fields.keys())
+    settings = [*(row.setting for row in make().decide(_facts(3_000))), *make().settings]
+    names = {setting.partition(".")[0] for setting in settings}
+    unknown = sorted(names - RunConfig.model_fields.keys())
     require(not unknown, f"no such setting: {listed(unknown)}")
 
 

@@ -39,7 +39,7 @@ def tail_lr_factor(setup: Setup, rate: LearningRate, step: int) -> float:
 
 def update_average(setup: Setup, state: TrainState) -> None:
     """Adds the parameters after a complete step to the average, where they are due."""
-    share = setup.config.average
+    share = setup.config.weight_averaging
     if share == 0.0:
         return
     total = setup.schedule.total

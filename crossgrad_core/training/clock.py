@@ -74,7 +74,7 @@ class PhaseTimer:
         cpu_border: CPU time of the process at the last border.
     """
 
-    border: float = field(default_factory=perf_counter)
+    phase_began: float = field(default_factory=perf_counter)
     total: float = 0.0
     spent: dict[str, float] = field(default_factory=dict)
     cpu: float = 0.0
@@ -83,10 +83,10 @@ class PhaseTimer:
     def lap(self, phase: Phase) -> None:
         """Ends a phase here: the seconds since the last border were spent on it."""
         now = perf_counter()
-        seconds = now - self.border
+        seconds = now - self.phase_began
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
         self.total += seconds
-        self.border = now
+        self.phase_began = now
         cpu = process_time()
         self.cpu += cpu - self.cpu_border
         self.cpu_border = cpu
@@ -98,5 +98,5 @@ class PhaseTimer:
             seconds: Seconds on the wall.
             cpu: Seconds of CPU time in them.
         """
-        self.border += seconds
+        self.phase_began += seconds
         self.cpu_border += cpu

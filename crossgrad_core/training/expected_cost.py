@@ -70,7 +70,7 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
-    if ahead and setup.numbers.growth == "curve":
+    if ahead and setup.numbers.growth == "budget":
         # A budget that no run fills, as that of nearly the published length, bounds nothing.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead

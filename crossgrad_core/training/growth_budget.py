@@ -28,7 +28,7 @@ def _most(setup: Setup, state: TrainState) -> int:
     """The most primitives that there may be after this step's edit."""
     numbers = setup.numbers
     decided = numbers.max_gaussians == AUTO or "max_gaussians" in setup.config.decided
-    if numbers.growth == "free" and not (decided and numbers.max_gaussians):
+    if numbers.growth == "unbounded" and not (decided and numbers.max_gaussians):
         return cast("int", numbers.max_gaussians) or sys.maxsize
     start = started_with(setup, state)
     state.states.setdefault(STATE, PluginState({"start": start}))
@@ -56,7 +56,7 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
     if bound == AUTO:
         bound = setup.following(schedule.total, start)["max_gaussians"]
     budget = cast("int", bound) or sys.maxsize
-    if numbers.growth == "free" or budget == sys.maxsize:
+    if numbers.growth == "unbounded" or budget == sys.maxsize:
         return budget
     events = schedule.edits_before + schedule.edits()
     return min(budget, curve(events - schedule.edits(step), events, start, budget))
@@ -86,5 +86,5 @@ def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
         separate=setup.separate,
         watched=bool(setup.watchers),
         joint=setup.joint or setup.rasterizer.batched,
-        averaged=setup.config.average > 0.0,
+        averaged=setup.config.weight_averaging > 0.0,
     )

@@ -91,11 +91,11 @@ def _steps(
     last = min(total, setup.config.stop_after or total)
     foresight = Prefetcher(setup)
     while state.step < last and not stopper.requested:
-        foresight.look(state)
+        foresight.update(state)
         try:
             record = timed_step(setup, state)
             leaves = state.step == last or stopper.requested
-            keeper.settle(state, look=leaves or looks_after(setup, state.step))
+            keeper.commit(state, look=leaves or looks_after(setup, state.step))
             if copies_after(setup, state.step):
                 keeper.copy(state)
                 use_large_pages()
@@ -137,7 +137,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard) -> bool:
     """Checks a state that is about to be kept; where it is bad, training goes back."""
     try:
-        keeper.look(state)
+        keeper.check(state)
     except NonFiniteError as error:
         _rewind(setup, state, sink, keeper, error)
         return False
@@ -159,7 +159,7 @@ def _rewind(
 
 def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
-    if held_back > 0 and setup.numbers.growth == "free":
+    if held_back > 0 and setup.numbers.growth == "unbounded":
         setup.hook.crossgrad_log(
             text=f"step {record.step}: growth held back by {held_back} primitives "
             "(--max-gaussians or the memory guard)"

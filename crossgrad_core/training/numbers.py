@@ -22,10 +22,10 @@ class Numbers:
     lr_tail: float
     floaters: Literal["keep", "remove"]
     dropout: float
-    growth: Literal["free", "curve"]
+    growth: Literal["unbounded", "budget"]
     max_gaussians: int | Literal["auto"]
     step_order: Literal["optimize-first", "densify-first"]
-    events: Unit
+    schedule_unit: Unit
     min_refinements: int
     reset_every: int
     sh_start: float

@@ -21,18 +21,18 @@ class RollbackGuard:
         self._looked = state.step
         state.touched = False
 
-    def settle(self, state: TrainState, *, look: bool = False) -> None:
+    def commit(self, state: TrainState, *, look: bool = False) -> None:
         """Notes that a step is complete.
 
         Raises:
             NonFiniteError: `look` was asked for, and a parameter is NaN or infinite.
         """
         if look:
-            self.look(state)
+            self.check(state)
         self._mark = StepSnapshot.of(state)
         state.touched = False
 
-    def look(self, state: TrainState) -> None:
+    def check(self, state: TrainState) -> None:
         """Looks at the parameters, unless that was done after this very step.
 
         Raises:
@@ -48,14 +48,14 @@ class RollbackGuard:
         Raises:
             NonFiniteError: A parameter is NaN or infinite.
         """
-        self.look(state)
+        self.check(state)
         self._snapshot = Snapshot.of(state)
 
     def rewind(self, state: TrainState, seed: int) -> None:
         """Puts `state` back to the copy, with fresh random streams."""
         self._snapshot.restore(state, seed)
         self._looked = state.step
-        self.settle(state)
+        self.commit(state)
 
     def restore(self, state: TrainState) -> None:
         """Puts `state` back to the last complete step, or further back to the copy.

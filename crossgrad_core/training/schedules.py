@@ -29,7 +29,9 @@ def schedule_of(
         counting: Views of the steps, and photos.
     """
     numbers = Numbers.of(config)
-    counting = replace(counting, unit=numbers.events, min_refinements=numbers.min_refinements)
+    counting = replace(
+        counting, unit=numbers.schedule_unit, min_refinements=numbers.min_refinements
+    )
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
     edits = _given(config, _EDITS)
     # Another schedule than the run's own may be longer than the run.

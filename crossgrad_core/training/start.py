@@ -78,12 +78,12 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
         The parameters, and the number of primitives that all points would have made where fewer
         were taken.
     """
-    reading, scene = setup.config.reading, setup.scene
-    if reading.init_file is not None:
-        warn_if_changed(reading.init_file)
-        gaussians = build(Exporter, EXPORTER, {}).read(reading.init_file, scene.similarity)
+    data, scene = setup.config.data, setup.scene
+    if data.init_file is not None:
+        warn_if_changed(data.init_file)
+        gaussians = build(Exporter, EXPORTER, {}).read(data.init_file, scene.similarity)
         return _made(setup, setup.backbone.adopt(gaussians, scene, rng), "adopt"), None
-    begun = with_random_points(scene, rng) if reading.init == "random" else _begun(setup)
+    begun = with_random_points(scene, rng) if data.init == "random" else _begun(setup)
     parameters = _made(setup, setup.backbone.create(begun, rng), "create")
     present, bound = primitives_of(setup.blocks, parameters), setup.numbers.max_gaussians
     if not bound or bound == AUTO or present <= bound:
@@ -105,22 +105,22 @@ def _begun(setup: Setup) -> Scene:
     Raises:
         UserError: They are none that primitives can be made of.
     """
-    scene, start = setup.scene, setup.selection.start
+    scene, initializer = setup.scene, setup.selection.initializer
     try:
-        begun = start.begun(scene)
+        begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        start.more_points(scene)  # What the start itself raises comes through.
+        initializer.more_points(scene)  # What the initializer itself raises comes through.
         wrong = in_one_line(error)
     if not wrong:
         return begun
     raise UserError(
-        f"start {setup.selection.names['start']} adds what cannot be points",
-        where=f"{type(start).__name__}.more_points",
+        f"initializer {setup.selection.names['initializer']} adds what cannot be points",
+        where=f"{type(initializer).__name__}.more_points",
         expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0 or NaN, opacities [N] "
         "in (0, 1) or NaN",
         found=wrong,
-        todo="choose another --start, or repair the plugin",
+        todo="choose another --initializer, or repair the plugin",
     )
 
 

@@ -35,7 +35,7 @@ class Prefetcher:
         self._state: PluginState = EMPTY_STATE
         self._blind = False
 
-    def look(self, state: TrainState) -> None:
+    def update(self, state: TrainState) -> None:
         """Names the photos of the steps after `state.step` to those who decode them."""
         setup = self._setup
         if self._blind or not setup.photos_ahead.useful:

@@ -49,7 +49,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: i
         index: The training view.
         scale: The scale.
         slot: The place of the view in the draw, which has a part in the lot that decides on the
-            pixels of an interlaced view.
+            pixels of an strided view.
     """
     view = setup.train_views[index]
     stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)
@@ -66,7 +66,7 @@ def photo_camera(setup: Setup, view: View, scale: float) -> Camera:
 
 
 def _stride_at(setup: Setup, view: View, scale: float) -> int:
-    return stride_of(scale, view.camera) if setup.selection.resolution.interlaced else 1
+    return stride_of(scale, view.camera) if setup.selection.resolution.strided else 1
 
 
 def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> Tensor | None:

@@ -18,7 +18,7 @@ class Aligned(Weighting):
     is the next one.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def weights(

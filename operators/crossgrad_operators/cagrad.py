@@ -21,7 +21,7 @@ class CAGrad(Weighting):
     digits for gradients in float64. A single view is left as it is.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     c: float = Field(0.5, ge=0, description="radius of the search, as a share of |g_0|")
     rescale: Literal["none", "1+c", "1+c^2"] = Field(
         "none", description="what the direction is divided by"

@@ -43,12 +43,12 @@ class Chain(GramianOperator):
     links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
 
     @override
-    def does_nothing(self, views: int) -> bool:
-        return views == 1 and all(link.does_nothing(views) for link in self.links)
+    def is_identity(self, views: int) -> bool:
+        return views == 1 and all(link.is_identity(views) for link in self.links)
 
     @override
-    def wants_more(self, views: int) -> bool:
-        return any(link.wants_more(views) for link in self.links)
+    def needs_more_views(self, views: int) -> bool:
+        return any(link.needs_more_views(views) for link in self.links)
 
     @property
     @override

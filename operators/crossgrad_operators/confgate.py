@@ -26,7 +26,7 @@ class ConfGate(GramianOperator):
     project; pairs with a zero gradient or without a common element (m = 0) are not counted.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     variant: Literal["v2", "low"] = Field("v2", description="v2: tau 0.9; low: tau 0.6")
     tau: float | None = Field(
         None, gt=0, lt=1, description="probability of conflict from which to project; over variant"

@@ -77,12 +77,12 @@ class Dispatch(GramianOperator):
     )
 
     @override
-    def does_nothing(self, views: int) -> bool:
-        return all(operator.does_nothing(views) for operator in self._operators().values())
+    def is_identity(self, views: int) -> bool:
+        return all(operator.is_identity(views) for operator in self._operators().values())
 
     @override
-    def wants_more(self, views: int) -> bool:
-        return any(each.wants_more(views) for each in self._operators().values())
+    def needs_more_views(self, views: int) -> bool:
+        return any(each.needs_more_views(views) for each in self._operators().values())
 
     @property
     @override

@@ -17,7 +17,7 @@ class DualProj(Weighting):
     active sets above, with 32 digits for gradients in float64.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def weights(

@@ -18,7 +18,7 @@ class GradDrop(Operator):
     views. The expectation is `sum`.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def aggregate(

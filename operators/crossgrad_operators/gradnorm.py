@@ -35,7 +35,7 @@ class GradNorm(GramianOperator):
     the views of a group share it. Losses at different octaves of scale are followed apart.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     default_grouping: ClassVar[str | None] = "radial"
     alpha: float = Field(1.5, ge=0, description="how strongly slow groups are favoured")
     lr: float = Field(0.025, gt=0, description="step of log w")

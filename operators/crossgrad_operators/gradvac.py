@@ -21,7 +21,7 @@ class GradVac(GramianOperator):
     +-0.999. The targets start at 0, where the rule is PCGrad's; i and j are slots, not cameras.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     beta: float = Field(0.5, ge=0, le=1, description="weight of the newest cosine in the target")
 
     @override

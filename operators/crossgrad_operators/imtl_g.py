@@ -18,7 +18,7 @@ class IMTLG(Weighting):
     nothing but rounding noise is left, the result is zero.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def weights(

@@ -23,7 +23,7 @@ class Mean(MatrixOperator):
     """
 
     separate: ClassVar[bool] = False
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     sparse_rows: ClassVar[bool] = True
 
     @override

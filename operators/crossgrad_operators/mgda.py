@@ -17,7 +17,7 @@ class MGDA(Weighting):
     in float64. |u| is at most the shortest gradient's length; zero where a convex combination is.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def weights(

@@ -18,7 +18,7 @@ class Nash(Weighting):
     single view stays as it is. Zero where the gradients oppose each other exactly.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def weights(

@@ -18,7 +18,7 @@ class PCGrad(GramianOperator):
     there is nothing to draw.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def transform(

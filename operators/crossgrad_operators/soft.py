@@ -19,7 +19,7 @@ class Soft(GramianOperator):
     `sum`; the rule jumps at a threshold above 0. Pairs in the order of the slots.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     threshold: float = Field(0.0, ge=0, le=1, description="conflicts are cosines below minus this")
     strength: float = Field(1.0, ge=0, le=1, description="share of the component that is removed")
 

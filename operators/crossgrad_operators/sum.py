@@ -22,7 +22,7 @@ class Sum(MatrixOperator):
     """
 
     separate: ClassVar[bool] = False
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
     sparse_rows: ClassVar[bool] = True
 
     @override

@@ -18,7 +18,7 @@ class Symmetric(GramianOperator):
     ordered pair is treated in the order of the slots, always with the original partner.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def transform(

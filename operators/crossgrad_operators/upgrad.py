@@ -18,7 +18,7 @@ class UPGrad(GramianOperator):
     for gradients in float64.
     """
 
-    idle_at_one: ClassVar[bool] = True
+    identity_at_one: ClassVar[bool] = True
 
     @override
     def transform(

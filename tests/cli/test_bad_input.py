@@ -178,13 +178,13 @@ def mask_of_another_shape(scene, tmp):
 
 
 def mask_folder_not_there(scene, tmp):
-    return ["run", str(scene), "--set", "reading.masks=msks", *BASE]
+    return ["run", str(scene), "--set", "data.masks=msks", *BASE]
 
 
 def masks_of_other_photos(scene, tmp):
     (scene / "mine").mkdir()
     Image.new("L", (48, 32)).save(scene / "mine" / "other.png")
-    return ["run", str(scene), "--set", "reading.masks=mine", *BASE]
+    return ["run", str(scene), "--set", "data.masks=mine", *BASE]
 
 
 def scene_not_there(scene, tmp):

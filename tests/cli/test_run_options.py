@@ -60,7 +60,7 @@ def test_types_follow_the_schema(name, kind):
 
 def test_every_setting_of_the_core_has_a_description():
     silent = [name for name, field in RunConfig.model_fields.items() if not field.description]
-    assert silent == ["reading"]
+    assert silent == ["data"]
 
 
 def test_typer_reads_the_made_signature():

@@ -47,7 +47,7 @@ def test_a_file_is_read_with_choices_in_their_long_form(config):
         "steps": 100,
         "operator": {"name": "cagrad", "c": 0.4},
         "observers": [{"name": "progress"}, {"name": "rate", "every": 10}],
-        "reading": {"max_size": 640},
+        "data": {"max_size": 640},
     }
 
 
@@ -101,10 +101,10 @@ def test_unset_options_leave_the_file_alone(config):
 @pytest.mark.parametrize(
     ("name", "value", "place"),
     [
-        ("max_size", 320, ("reading", "max_size")),
-        ("split", "none", ("reading", "split")),
-        ("test_every", 4, ("reading", "test_every")),
-        ("init", "random", ("reading", "init")),
+        ("max_size", 320, ("data", "max_size")),
+        ("split", "none", ("data", "split")),
+        ("test_every", 4, ("data", "test_every")),
+        ("init", "random", ("data", "init")),
     ],
 )
 def test_options_about_the_scene_have_a_group_of_their_own(name, value, place):

@@ -23,7 +23,7 @@ from crossgrad_plugins.sweep.records import read_records
 #: 60 steps with edits, checkpoints and evaluations.
 BASE = {
     "steps": 60,
-    "events": "steps",
+    "schedule_unit": "steps",
     "densify_from": 10,
     "densify_every": 10,
     "densify_until": 55,

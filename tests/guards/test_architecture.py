@@ -50,6 +50,6 @@ def test_both_paths_name_files_of_the_core_and_of_a_shelf():
 
 
 def test_the_picture_shows_the_rooms():
-    picture = (ROOT / "docs" / "rooms.svg").read_text(encoding="utf-8")
+    picture = (ROOT / "docs" / "layers.svg").read_text(encoding="utf-8")
     shown = re.findall(r"<text[^>]*>(\w+)</text>", picture)
     assert sorted(shown) == sorted(rooms() | set(SHELVES))

@@ -53,7 +53,7 @@ def test_the_shown_backbone_trains(shown, monkeypatch):
         operator=ComponentChoice(name="pcgrad"),
         sampler=ComponentChoice(name="random"),
         # Spheres have one size: large ones in front of the rest would be no start.
-        start=ComponentChoice(name="sfm"),
+        initializer=ComponentChoice(name="points"),
     )
     setup = assembling.assemble(config, sample_scene(), "none")
     state = first_state(setup)

@@ -86,4 +86,4 @@ def test_the_table_tells_which_views_are_admitted_and_kept_apart(name):
 def test_the_table_tells_which_operators_leave_a_single_view_as_it_is(name):
     one = rows()[name][0]
     if not one.startswith("as its") and one != "as the weighting":
-        assert (one == "g_1") == build("operators", name, {}).does_nothing(1)
+        assert (one == "g_1") == build("operators", name, {}).is_identity(1)

@@ -11,7 +11,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.scene_options import SceneOptions
 
 PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")
-MODELS = {"run": RunConfig, "reading": SceneOptions}
+MODELS = {"run": RunConfig, "data": SceneOptions}
 FIELDS = [(model, name) for model in MODELS for name in MODELS[model].model_fields]
 
 
@@ -22,7 +22,7 @@ def rows(text):
 
 
 BEFORE, _, AFTER = PAGE.partition("## Reading")
-TABLES = {"run": rows(BEFORE), "reading": rows(AFTER)}
+TABLES = {"run": rows(BEFORE), "data": rows(AFTER)}
 
 
 @pytest.fixture(scope="module")

@@ -35,13 +35,13 @@ def trained(scene, tmp_path_factory):
     """A run of a few steps."""
     out = tmp_path_factory.mktemp("trained") / "run"
     given = {"scene": str(scene), "out": str(out), "steps": 4, "threads": 1}
-    assert app.run({**given, "start": {"name": "sfm"}}, verbosity=-1) == 0
+    assert app.run({**given, "initializer": {"name": "points"}}, verbosity=-1) == 0
     return out
 
 
 def started(scene):
     """The setup of a scene and the state before the first step, with a Gaussian at each point."""
-    config = RunConfig(scene=scene, steps=10, start={"name": "sfm"})
+    config = RunConfig(scene=scene, steps=10, initializer={"name": "points"})
     read, reader = read_scene(config, scene)
     setup = assemble(config, read, reader)
     return setup, first_state(setup)

@@ -94,33 +94,33 @@ def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
 
 
 def test_a_ladder_is_drawn_as_frames_and_a_video(trained, tmp_path, capsys):
-    folder = tmp_path / "ladder"
-    render.render_path(trained, "ladder", frames=3, out=folder)
+    folder = tmp_path / "zoom"
+    render.render_path(trained, "zoom", frames=3, out=folder)
     assert len(list(folder.glob("*.png"))) == 3
     (video,) = folder.glob("video.*")
     assert f"3 frames in {folder}, video {video}" in capsys.readouterr().out
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(UserError, match="the file exists"):
-        render.render_path(trained, "ladder", frames=2, out=folder)
+        render.render_path(trained, "zoom", frames=2, out=folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     # In the run's own folder a video takes the place of the one before.
     for frames in (3, 2):
-        render.render_path(trained, "ladder", frames=frames, out=None)
+        render.render_path(trained, "zoom", frames=frames, out=None)
     assert len(list((trained / "renders").glob("*/path_ladder/video.*"))) == 1
-    with pytest.raises(UserError, match="frames of a ladder"):
+    with pytest.raises(UserError, match="frames of a zoom path"):
         render.render_path(trained, "path.json", frames=2, out=None)
 
 
 @pytest.mark.parametrize(
     ("options", "idle", "other"),
     [
-        (("--on", "scene", "--path", "ladder"), "--on", "--path"),
-        (("--split", "train", "--path", "ladder"), "--split", "--path"),
+        (("--on", "scene", "--path", "zoom"), "--on", "--path"),
+        (("--split", "train", "--path", "zoom"), "--split", "--path"),
         (("--split", "test", "--on", "scene"), "--split", "--on"),
-        (("--frames", "9"), "--frames", "--path ladder"),
-        (("--frames", "100001", "--path", "ladder"), "--frames", "100000"),
-        (("--frames", "9", "--on", "scene"), "--frames", "--path ladder"),
-        (("--frames", "9", "--path", "tour.json"), "--frames", "ladder"),
+        (("--frames", "9"), "--frames", "--path zoom"),
+        (("--frames", "100001", "--path", "zoom"), "--frames", "100000"),
+        (("--frames", "9", "--on", "scene"), "--frames", "--path zoom"),
+        (("--frames", "9", "--path", "tour.json"), "--frames", "zoom"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(trained, options, idle, other, capsys):

@@ -33,7 +33,7 @@ def scene(tmp_path_factory):
 def run(scene, out, **further):
     settings = {"scene": str(scene), "out": str(out), "steps": STEPS, "eval_every": 4, "threads": 1}
     # A filled start would look at all photos before the first step.
-    settings["start"] = {"name": "sfm"}
+    settings["initializer"] = {"name": "points"}
     settings |= {"sampler": {"name": "random"}, "views": 2, **further}
     return app.run(settings, verbosity=-1)
 

@@ -26,7 +26,7 @@ SCENES = Path(os.environ.get("CROSSGRAD_SCENES", "no-such-folder"))
 
 
 def gains_of(path, **reading):
-    scene, _ = read_scene(configured({"scene": path, "threads": 1, "reading": reading}))
+    scene, _ = read_scene(configured({"scene": path, "threads": 1, "data": reading}))
     return track_gains(scene, scene.views)
 
 

@@ -275,7 +275,7 @@ def test_photos_without_tracks_start_at_their_regime(varied, tmp_path, model):
     folder = tmp_path / "scene"
     shutil.copytree(varied, folder)
     (folder / "sparse" / "0" / "points3D.bin").unlink()
-    settings = {"exposure": {"name": model}, "reading": {"init": "random"}}
+    settings = {"exposure": {"name": model}, "data": {"init": "random"}}
     assert run(folder, tmp_path / "run", steps=2, **settings) == 0
     assert finite(tmp_path / "run")
     assert "no SfM tracks tell" in notes(tmp_path / "run")
@@ -314,7 +314,7 @@ def test_exif_starts_photos_and_tells_of_unseen_ones(varied, tmp_path, model):
     shutil.copytree(varied, folder)
     for number, path in enumerate(sorted(folder.glob("images/*.png"))):
         with_exif(path, np.log2(0.35) if number % 2 else 0.0)
-    settings = {"exposure": {"name": model, "start": "exif"}}
+    settings = {"exposure": {"name": model, "initializer": "exif"}}
     # The photos held out are the first and the last, both bright; the others are half and half.
     assert run(folder, tmp_path / "exif", steps=120, **settings) == 0
     told = read_run(tmp_path / "exif").figure("psnr")

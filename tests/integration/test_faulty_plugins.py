@@ -147,7 +147,7 @@ def installed(monkeypatch, folder, plugins, **more):
 
 
 def run(scene, out, *options):
-    given = ("--steps", "4", "--threads", "1", "--start", "sfm", "-q", "--out", out)
+    given = ("--steps", "4", "--threads", "1", "--initializer", "points", "-q", "--out", out)
     return ended("run", scene, *given, *options)
 
 
@@ -201,7 +201,7 @@ def test_it_is_one_message_before_anything_is_written(
 ):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     length = () if "--seconds" in options else ("--steps", "4")
-    given = ("--threads", "1", "--start", "sfm", "-q", "--out", tmp_path / "run")
+    given = ("--threads", "1", "--initializer", "points", "-q", "--out", tmp_path / "run")
     assert ended("run", scene, *length, *given, *options) == 2
     said = capsys.readouterr().err
     assert words in said and "to do:" in said

@@ -20,7 +20,7 @@ def trained(scene, out, *, check=False, **reading):
         "scene": str(scene),
         "steps": 14,
         "views_per_step": 2,
-        "reading": {"max_size": 48, **reading},
+        "data": {"max_size": 48, **reading},
         "out": str(out),
     }
     assert app.run(settings, check=check, verbosity=-1) == 0

@@ -202,10 +202,10 @@ def test_one_view_and_two_edit_after_as_many_views():
 
 
 def test_events_in_steps_are_those_of_before():
-    setup, _, seen = trained(views=2, steps=72, events="steps")
+    setup, _, seen = trained(views=2, steps=72, schedule_unit="steps")
     assert seen.edits == [] and setup.schedule.densify_from == 500
     given = {"densify_from": 10, "densify_every": 20, "densify_until": 60}
-    assert trained(views=2, steps=72, events="steps", **given)[2].edits == [40, 80]
+    assert trained(views=2, steps=72, schedule_unit="steps", **given)[2].edits == [40, 80]
     assert trained(views=2, steps=72, **given)[2].edits == [30, 50]
 
 
@@ -216,7 +216,7 @@ def test_k_follows_its_plan_and_repeats_bit_for_bit(scene, tmp_path):
         ("6", "6"), ("12", "14"), ("18", "26"), ("20", "30"),
     ]  # fmt: skip
     stored = read_config(tmp_path / "whole")
-    assert stored["views_per_step"] == "1..2@0.5" and stored["events"] == "views"
+    assert stored["views_per_step"] == "1..2@0.5" and stored["schedule_unit"] == "views"
     run(scene, tmp_path / "parts", stop_after=8, **settings)
     assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0

@@ -9,7 +9,7 @@ from support.scenes import write_tiny_scene
 import crossgrad_core as cg
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.camera_path import LADDER
+from crossgrad_core.run.camera_path import ZOOM
 from crossgrad_core.run.postprocess import evaluate, export, render
 from crossgrad_core.run.results import video
 from crossgrad_core.run.results.summary import read_summary
@@ -105,7 +105,7 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
 
 def test_of_a_shorter_video_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
-        render.render_path(run, path=LADDER, frames=frames, out=None)
+        render.render_path(run, path=ZOOM, frames=frames, out=None)
         assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
 
 
@@ -169,10 +169,10 @@ def test_what_does_not_train_may_be_changed(run):
 
 
 def test_a_video_of_other_frames_does_not_stay(run, monkeypatch, capsys):
-    render.render_path(run, path=LADDER, frames=3, out=None)
+    render.render_path(run, path=ZOOM, frames=3, out=None)
     (made,) = run.glob("renders/*/path_ladder/video.*")
     monkeypatch.setattr(video, "_LARGEST", 100)
     monkeypatch.setattr(video.shutil, "which", lambda _: None)
-    render.render_path(run, path=LADDER, frames=3, out=None)
+    render.render_path(run, path=ZOOM, frames=3, out=None)
     assert not made.exists()
     assert "no video: too many or too large without ffmpeg" in capsys.readouterr().out

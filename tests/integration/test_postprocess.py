@@ -132,7 +132,7 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
 def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp_path):
     for name, draw in (
         ("street__0001", lambda out: render.render(finished, split="all", out=out)),
-        ("00001", lambda out: render.render_path(finished, "ladder", frames=2, out=out)),
+        ("00001", lambda out: render.render_path(finished, "zoom", frames=2, out=out)),
     ):
         folder = tmp_path / name
         folder.mkdir()

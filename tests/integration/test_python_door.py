@@ -21,7 +21,7 @@ from crossgrad_core.run.session import Session
 OPTIONS = {
     "sampler": "near-far", "operator": "pcgrad", "steps": 12, "eval_every": 6, "seed": 3,
     "operator.granularity": "global", "densify_from": 3, "densify_until": 11, "densify_every": 3,
-    "events": "steps",
+    "schedule_unit": "steps",
 }  # fmt: skip
 #: Steps after which the run is evaluated; one that is stopped is evaluated there, too.
 EVALUATED = {"6", "12"}
@@ -183,7 +183,7 @@ def test_options_are_not_changed_and_may_be_numbers_of_numpy(scene, tmp_path):
     assert backbone == {"name": "vanilla"}
     config = trained.summary["config"]
     assert config["backbone"]["sh_degree"] == 1 and config["steps"] == 2
-    assert config["reading"]["max_size"] == 40
+    assert config["data"]["max_size"] == 40
 
 
 def test_what_a_run_answers(reference, tmp_path, capfd):

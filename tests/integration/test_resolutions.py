@@ -25,8 +25,8 @@ from crossgrad_plugins.resolutions.octaves import Octaves
 
 SPECTRAL = {"name": "spectral", "smallest": 4, "per_regime": "always"}
 OCTAVES = {"name": "octaves", "smallest": 4}
-INTERLACED = {"name": "interlaced", "smallest": 4, "least": 16}
-GROWTH = {"events": "steps", "densify_from": 4, "densify_until": 18, "densify_every": 6}
+STRIDED = {"name": "strided", "smallest": 4, "least": 16}
+GROWTH = {"schedule_unit": "steps", "densify_from": 4, "densify_until": 18, "densify_every": 6}
 
 
 @pytest.fixture(scope="module")
@@ -71,12 +71,12 @@ def notes(out):
 REVISIONS = {"revisions": [[3, 60], [11, 30]]}
 CASES = {
     "spectral": {"resolution": SPECTRAL},
-    "interlaced, a length that changes": {"resolution": INTERLACED, **REVISIONS},
+    "strided, a length that changes": {"resolution": STRIDED, **REVISIONS},
     "octaves, a length that changes": {"resolution": OCTAVES, **REVISIONS},
     "spectral, a length that changes": {"resolution": SPECTRAL, **REVISIONS},
     "running losses, exposure, average": {
         "resolution": SPECTRAL, "sampler": {"name": "active"}, "operator": {"name": "gradnorm"},
-        "exposure": {"name": "gain"}, "average": 0.3,
+        "exposure": {"name": "gain"}, "weight_averaging": 0.3,
     },
     "a further view, anchors": {
         "resolution": SPECTRAL, "backbone": {"name": "scaffold"}, "densify_views": "extra",

@@ -18,7 +18,7 @@ from crossgrad_core.run.results.config_file import read_config
 from crossgrad_plugins.exporters.ply_format.file import read_ply
 
 #: Density control within a few dozen steps; by default a run has to be longer.
-GROWTH = {"events": "steps", "densify_from": 10, "densify_until": 50, "densify_every": 10}
+GROWTH = {"schedule_unit": "steps", "densify_from": 10, "densify_until": 50, "densify_every": 10}
 QUALITY = ("step", "views", "psnr", "ssim", "ssim_skimage", "primitives", "loss")
 
 
@@ -110,8 +110,8 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
 
 
 def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scene, tmp_path):
-    settings = {"steps": 20, "average": 0.5, "lr_tail": 0.5, "eval_every": 4}
-    run(scene, tmp_path / "raw", **{**settings, "average": 0.0})
+    settings = {"steps": 20, "weight_averaging": 0.5, "lr_tail": 0.5, "eval_every": 4}
+    run(scene, tmp_path / "raw", **{**settings, "weight_averaging": 0.0})
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=15, **settings) == 0
     assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
@@ -151,7 +151,7 @@ def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkey
     # The plan is too short for density control (it would end in step 14), the run is not.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps", 0.6))
     each_step_takes(monkeypatch, 0.05)
-    times = {"events": "steps", "densify_from": 13, "densify_every": 1}
+    times = {"schedule_unit": "steps", "densify_from": 13, "densify_every": 1}
     settings = {**times, "steps": None, "seconds": 3.0}
     given = {"scene": str(scene), "out": str(tmp_path / "timed"), "threads": 1, **settings}
     assert app.run(given, verbosity=0) == 0
@@ -180,7 +180,7 @@ def test_a_run_that_started_from_a_file_goes_on_without_it(scene, tmp_path):
     run(scene, tmp_path / "source", steps=3)
     cloud = tmp_path / "cloud.ply"
     cloud.write_bytes((tmp_path / "source" / "point_cloud.ply").read_bytes())
-    settings = {"steps": 12, "reading": {"init": str(cloud)}}
+    settings = {"steps": 12, "data": {"init": str(cloud)}}
     run(scene, tmp_path / "whole", **settings)
     run(scene, tmp_path / "parts", stop_after=5, **settings)
     cloud.unlink()
@@ -244,7 +244,7 @@ def test_published_order_differs_and_runs(scene, tmp_path):
 
 
 def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
-    run(scene, tmp_path / "run", steps=4, start={"name": "sfm"})
+    run(scene, tmp_path / "run", steps=4, initializer={"name": "points"})
     assert quality(tmp_path / "run")[-1]["primitives"] == "200"
     assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
 
@@ -252,13 +252,13 @@ def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
 def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     # Every Gaussian is above a threshold of 1e-12, so the first edit wants to double them all.
     settings = {"steps": 60, **GROWTH, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
-    settings["start"] = {"name": "sfm"}
+    settings["initializer"] = {"name": "points"}
     settings["rate_factor"] = 1.0  # With larger rates some become transparent and are pruned.
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
     assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()
     # On a curve growth is held back at every edit, as it should be.
-    run(scene, tmp_path / "curve", max_gaussians=230, growth="curve", **settings)
+    run(scene, tmp_path / "curve", max_gaussians=230, growth="budget", **settings)
     assert quality(tmp_path / "curve")[-1]["primitives"] == "230"
     assert "growth held back" not in (tmp_path / "curve" / "log.txt").read_text()
     summary = json.loads((tmp_path / "curve/summary.json").read_text())
@@ -266,7 +266,14 @@ def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
 
 
 def test_a_bound_below_the_points_is_kept_and_told(scene, tmp_path):
-    run(scene, tmp_path / "run", steps=60, max_gaussians=90, **GROWTH, start={"name": "sfm"})
+    run(
+        scene,
+        tmp_path / "run",
+        steps=60,
+        max_gaussians=90,
+        **GROWTH,
+        initializer={"name": "points"},
+    )
     counts = [int(row["primitives"]) for row in quality(tmp_path / "run")]
     assert max(counts) <= 90
     told = "start: 60 primitives instead of 200"

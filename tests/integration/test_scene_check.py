@@ -77,7 +77,7 @@ def test_check_prints_the_photos_that_disagree_first_and_the_verdict_last(scenes
 
 
 def test_check_of_a_right_scene_prints_no_warning(scenes):
-    lines = lines_of(scenes / "right", ["reading.max_size=64"])
+    lines = lines_of(scenes / "right", ["data.max_size=64"])
     assert not [line for line in lines if line.startswith("check:")]
     assert lines[-1].startswith("verdict: agrees")
 

@@ -34,7 +34,7 @@ PLUGINS = {
 }
 #: Two edits and a reset in a few steps.
 WINDOW = {"densify_from": 4, "densify_until": 22, "densify_every": 6}
-GROWTH = {"events": "steps", "reset_every": 13, **WINDOW}
+GROWTH = {"schedule_unit": "steps", "reset_every": 13, **WINDOW}
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def _plugins(tmp_path, monkeypatch):
 def run(scene, out, **settings):
     given = {"scene": str(scene), "out": str(out), "steps": 24, "eval_every": 12, "threads": 1}
     reading = {"max_size": 40}
-    return app.run({**given, "reading": reading, **GROWTH, **settings}, verbosity=-1)
+    return app.run({**given, "data": reading, **GROWTH, **settings}, verbosity=-1)
 
 
 def resumed(scene, out, **settings):

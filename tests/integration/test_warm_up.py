@@ -44,7 +44,7 @@ print(json.dumps(sorted(kernels() - before)))
 def test_training_compiles_nothing_behind_the_warm_up(tmp_path, length):
     settings = {
         "scene": str(bundled_scene()),
-        "reading": {"max_size": 48},
+        "data": {"max_size": 48},
         "out": str(tmp_path / "run"),
         "eval_every": 10_000,
         **length,

@@ -17,7 +17,7 @@ TRAINS = {
     "operators": "pcgrad",
     "densifiers": "adc",
     "losses": "l1-ssim",
-    "starts": "filled",
+    "initializers": "fill-gaps",
     "resolutions": "full",
 }
 SOURCE = """
@@ -48,7 +48,7 @@ def run(tmp_path, monkeypatch):
     write_distribution(tmp_path / "site", "gone", plugins, {"made_up_gone": SOURCE})
     scene, out = write_tiny_scene(tmp_path / "tiny", views=9), tmp_path / "run"
     given = ["--steps", "4", "--views", "2", "--threads", "1", "-q", "--out", out]
-    for option in ("sampler", "operator", "densifier", "loss", "start", "resolution"):
+    for option in ("sampler", "operator", "densifier", "loss", "initializer", "resolution"):
         slot = "losses" if option == "loss" else f"{option}s"
         given += [f"--{option}", f"own-{slot}"]
     with monkeypatch.context() as patched:
@@ -123,8 +123,8 @@ def test_an_operator_that_names_one_that_is_gone_is_stood_in():
     operator = {"name": "dispatch", "rules": {"near-far": "own-operators"}}
     config = RunConfig.model_validate({"operator": operator})
     assert [each.name for each in without_missing(config).operators] == ["sum"]
-    start = RunConfig.model_validate({"start": {"name": "own-starts"}})
+    start = RunConfig.model_validate({"initializer": {"name": "own-starts"}})
     # It has to do without points, which the scene may lack.
-    assert load("starts", without_missing(start).start.name).alone
+    assert load("initializers", without_missing(start).initializer.name).alone
     known = RunConfig.model_validate({"operator": {"name": "cagrad"}})
     assert without_missing(known) == known

@@ -21,7 +21,7 @@ from crossgrad_plugins.authoring.matrix.pairwise import pairwise
 
 STEPS = 8
 #: An edit at a small scale, one at a larger one, and one at full size.
-TIMES = {"events": "steps", "densify_from": 1, "densify_every": 2, "densify_until": 8}
+TIMES = {"schedule_unit": "steps", "densify_from": 1, "densify_every": 2, "densify_until": 8}
 
 
 def names(slot):
@@ -29,7 +29,7 @@ def names(slot):
 
 
 OPTIONS = {
-    "interlaced": {"smallest": 4, "least": 16},
+    "strided": {"smallest": 4, "least": 16},
     "octaves": {"smallest": 4},
     "spectral": {"smallest": 4, "per_regime": "always"},
 }
@@ -37,7 +37,7 @@ SMALL = [name for name in names("resolutions") if name != "full"]
 ALL = tuple(
     row
     for row in product(SMALL, names("backbones"), ("1", "2", "3"), ("whole", "masked"))
-    if row[:2] != ("interlaced", "analytic")  # refused: a mean over pixels, of which some are drawn
+    if row[:2] != ("strided", "analytic")  # refused: a mean over pixels, of which some are drawn
 )
 DESIGN = pairwise(ALL)
 

@@ -54,10 +54,10 @@ EXTRAS: tuple[Mapping[str, Any], ...] = (
     {},
     {"recipe": {"name": "published"}},
     {"schedule": "absolute"},
-    {"schedule": "absolute", "reference": 7_000},
+    {"schedule": "absolute", "schedule_length": 7_000},
     {"batch_rule": "sqrt"},
     {"max_gaussians": 50_000},
-    {"growth": "free"},
+    {"growth": "unbounded"},
     {"sh_every": 2},
 )
 DEVICES = ("cpu", "cuda")
@@ -65,8 +65,16 @@ DEVICES = ("cpu", "cuda")
 STARTS = (1_000, 20_000)
 #: The settings of config.yaml that a run decides where the user names nothing.
 DECIDED = (
-    *("densifier", "rasterizer", "start", "resolution", "views_per_step", "steps", "events"),
-    *("sh_every", "lr_tail", "average", "floaters", "dropout", "growth", "max_gaussians"),
+    *(
+        "densifier",
+        "rasterizer",
+        "initializer",
+        "resolution",
+        "views_per_step",
+        "steps",
+        "schedule_unit",
+    ),
+    *("sh_every", "lr_tail", "weight_averaging", "floaters", "dropout", "growth", "max_gaussians"),
 )
 
 
@@ -180,7 +188,7 @@ def _schedule(setup: Setup) -> Mapping[str, Any]:
 
 def _budget(setup: Setup) -> list[int] | None:
     steps = setup.schedule.edit_steps()
-    if not steps or (setup.numbers.growth == "free" and setup.numbers.max_gaussians != "auto"):
+    if not steps or (setup.numbers.growth == "unbounded" and setup.numbers.max_gaussians != "auto"):
         return None
     shown = (steps[0], steps[len(steps) // 2], steps[-1])
     return [most_after(setup, setup.schedule, step, start) for start in STARTS for step in shown]

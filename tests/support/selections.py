@@ -14,7 +14,7 @@ _USUAL = {
     "rasterizer": "torch",
     "loss": "l1-ssim",
     "exposure": "none",
-    "start": "sfm",
+    "initializer": "points",
     "resolution": "full",
     "exporter": "ply",
 }

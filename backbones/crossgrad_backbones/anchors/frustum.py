@@ -69,10 +69,10 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 def _fused(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     from crossgrad_backbones.anchors.numba_kernels import frustum
-    from crossgrad_core.numerics.jobs import share
+    from crossgrad_core.numerics.jobs import parallel
 
     inside = np.empty(len(positions), np.bool_)
-    share(
+    parallel(
         frustum.in_frustum,
         positions.detach().contiguous().numpy(),
         log_scales.detach().contiguous().numpy(),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from crossgrad_core.gradients.numba_kernels.dots import dots_1, dots_2, dots_2x2, dots_3, dots_4
 from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -142,11 +142,11 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
     """
     compact = np.empty(partial.shape[1:])
     chunks = table.shape[0]
-    c = take(jobs, chunks)
+    c = next_job(jobs, chunks)
     while c < chunks:
         t, start = table[c, 0], table[c, 1]
         _chunk_gramian(addresses[t], start, min(CHUNK, sizes[t] - start), compact, partial[c])
-        c = take(jobs, chunks)
+        c = next_job(jobs, chunks)
 
 
 @strict_device
@@ -185,7 +185,7 @@ def spread_gramian(
     views = addresses.size
     dense, compact = np.empty(views * CHUNK, np.float32), np.empty((views, views))
     chunks = partial.shape[0]
-    c = take(jobs, chunks)
+    c = next_job(jobs, chunks)
     while c < chunks:
         length = min(CHUNK, size - c * CHUNK)
         if _spread(addresses, rows, width, c * CHUNK, length, dense):
@@ -196,7 +196,7 @@ def spread_gramian(
             _chunk_gramian(places, 0, length, compact, partial[c])
             # Numba frees an array after the last line that names it, even if its address is held.
             dense[0] = np.float32(0.0)
-        c = take(jobs, chunks)
+        c = next_job(jobs, chunks)
 
 
 @strict_device
@@ -363,12 +363,12 @@ def combine(
         table: From `chunk_table`.
     """
     chunks = table.shape[0]
-    c = take(jobs, chunks)
+    c = next_job(jobs, chunks)
     while c < chunks:
         t, first = table[c, 0], table[c, 1]
         end = min(first + CHUNK, sizes[t])
         _combine_chunk(addresses[t], weights[t], plain[t], divisor, out[t], first, end)
-        c = take(jobs, chunks)
+        c = next_job(jobs, chunks)
 
 
 @strict_kernel

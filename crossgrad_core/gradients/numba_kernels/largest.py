@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 #: Elements that a thread looks at in one go.
 PART = 2**15
@@ -31,7 +31,7 @@ def largest_bits(
         found: [parts] written: the largest in each part.
     """
     parts = len(found)
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         tensor = 0
         while part >= starts[tensor + 1]:
@@ -53,4 +53,4 @@ def largest_bits(
         for i in range(4 * quarter, len(own)):
             most = max(most, own[i] & _ALL_BUT_SIGN)
         found[part] = most
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)

@@ -7,7 +7,7 @@ import numpy as np
 
 from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, row
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 #: Rows that one task works on.
 ROWS = 2048
@@ -47,10 +47,10 @@ def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None
     """
     count = out.shape[0]
     tasks = (count + ROWS - 1) // ROWS
-    task = take(jobs, tasks)
+    task = next_job(jobs, tasks)
     while task < tasks:
         _gramian_task(addresses, widths, task * ROWS, min(task * ROWS + ROWS, count), out)
-        task = take(jobs, tasks)
+        task = next_job(jobs, tasks)
 
 
 @strict_device
@@ -85,11 +85,11 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
     """
     count = weights.shape[0]
     tasks = (count + ROWS - 1) // ROWS
-    task = take(jobs, tasks)
+    task = next_job(jobs, tasks)
     while task < tasks:
         end = min(task * ROWS + ROWS, count)
         _combine_task(addresses, weights, out, width, task * ROWS, end)
-        task = take(jobs, tasks)
+        task = next_job(jobs, tasks)
 
 
 @strict_kernel

@@ -7,7 +7,7 @@ import torch
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured
-from crossgrad_core.run.camera_path import FRAMES, LADDER, camera_path
+from crossgrad_core.run.camera_path import FRAMES, ZOOM, camera_path
 from crossgrad_core.run.cross_capture import elsewhere
 from crossgrad_core.run.export import camera_renderer, plain_renderer, renderer
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
@@ -91,7 +91,7 @@ def render_path(
     Args:
         folder: The run's folder.
         path: See `camera_path`.
-        frames: How many a ladder has, `FRAMES` by default.
+        frames: How many a zoom path has, `FRAMES` by default.
         out: Where the pictures go; by default into the run's folder.
         how: How the run is opened.
 
@@ -100,11 +100,11 @@ def render_path(
             other folder is named, the named one holds a video or such frames, or there are frames
             for a path from a file.
     """
-    if frames is not None and path != LADDER:
+    if frames is not None and path != ZOOM:
         raise UserError(
-            "--frames is the number of frames of a ladder; a camera path has its own",
+            "--frames is the number of frames of a zoom path; a camera path has its own",
             where=f"--path {path}",
-            todo=f"leave out --frames, or draw --path {LADDER}",
+            todo=f"leave out --frames, or draw --path {ZOOM}",
         )
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
@@ -117,7 +117,7 @@ def render_path(
         draw, own = camera_renderer(setup, state), out is None
         if out is None:
             name = ending(along.name)
-            name = name if path == LADDER else name_for(folder, name, Path(path))
+            name = name if path == ZOOM else name_for(folder, name, Path(path))
             out = folder_of(folder, state.step) / f"path_{name}"
         with relisted(folder, *((_below(folder, out),) if own else ())):
             with torch.no_grad():

@@ -13,7 +13,7 @@ from crossgrad_core.system.text_files import read_json
 #: Which name stands for which place.
 FILE: Final = "sources.json"
 #: The path that comes from no file.
-RESERVED: Final = ("ladder",)
+RESERVED: Final = ("zoom",)
 
 
 def name_for(folder: Path, name: str, source: Path) -> str:

@@ -128,5 +128,5 @@ def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
         expected="photos that show the points where their poses put them",
         found=f"{cause.what} ({', '.join(found)})" if found else cause.what,
         todo=f"{cause.todo}; or go on with the scene as it is: --accept-scene, or "
-        "reading.accept_scene: true in a file of settings",
+        "data.accept_scene: true in a file of settings",
     )

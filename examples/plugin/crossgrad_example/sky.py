@@ -3,10 +3,10 @@
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.plugin import Field, MorePoints, Scene, Start
+from crossgrad_core.plugin import Field, Initializer, MorePoints, Scene
 
 
-class Sky(Start):
+class Sky(Initializer):
     """Blue points on the upper half of a sphere around the cameras; z is up."""
 
     radius: float = Field(10.0, gt=0.0, description="of the dome, scene extents")

@@ -29,7 +29,7 @@ PLUGINS = {
     "rasterizers": Borrowed,
     "losses": Charbonnier,
     "exposures": Gain,
-    "starts": Sky,
+    "initializers": Sky,
     "resolutions": CoarseFirst,
     "readers": Poses,
     "exporters": Xyz,

@@ -15,7 +15,7 @@ _NO_ARM: Final = frozenset(
         *("steps", "max_views", "seconds", "revisions", "planned_seconds", "stop_after", "clock"),
         *("eval_every", "eval_from", "save_every", "threads", "max_nonfinite_blocks"),
         *("observers", "metrics", "exporter"),
-        *("reading.cache_mib", "reading.disk_mib", "reading.masks"),
+        *("data.cache_mib", "data.disk_mib", "data.masks"),
     }
 )
 

@@ -111,7 +111,7 @@ def diagnose(given: Given) -> None:
     wanted = {
         "device": given.device,
         "threads": given.threads,
-        "reading": None if given.max_size is None else {"max_size": given.max_size},
+        "data": None if given.max_size is None else {"max_size": given.max_size},
     }
     settings = {name: value for name, value in wanted.items() if value is not None}
     raise typer.Exit(

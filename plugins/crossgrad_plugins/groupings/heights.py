@@ -71,7 +71,7 @@ def _flattest(scene: Scene) -> NDArray[np.float64]:
 
     Its sign puts the cameras above the SfM points or, where there are none, lets them look down.
     """
-    spread = scene.usual_centers - scene.middle
+    spread = scene.robust_centers - scene.middle
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]
     if len(scene.points):
         downward = np.median(scene.points, axis=0) - scene.middle

@@ -32,9 +32,9 @@ class Evidence:
         """Whether the user set any of these settings; None leaves one to the run.
 
         Args:
-            names: Settings, such as `exposure`, `reading.init` or `backbone.sh_degree`.
+            names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
-        known = _set_in(self.config, "") | _set_in(self.config.reading, "reading.")
+        known = _set_in(self.config, "") | _set_in(self.config.data, "reading.")
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
         return not known.isdisjoint(names)
 

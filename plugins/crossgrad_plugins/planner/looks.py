@@ -62,7 +62,7 @@ def degree(evidence: Evidence) -> Decision:
     part, config = "SH degree", evidence.config
     name = config.backbone.name
     of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "sh_every")
-    if evidence.is_given(*of_bands, "reading.init"):
+    if evidence.is_given(*of_bands, "data.init"):
         chosen = config.backbone.options.get("sh_degree", "as you start it")
         return given(part, chosen, "--set backbone.sh_degree=N")
     rule = f"0 where degree 1 explains less than {LEAST_SHARE:.0%} of tracks, its whole interval"

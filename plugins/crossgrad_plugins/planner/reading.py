@@ -15,10 +15,10 @@ _BLENDED: Final = re.compile(r"blended over RGB \(([\d.]+), ([\d.]+), ([\d.]+)\)
 
 def start(evidence: Evidence) -> Decision:
     """Where training starts."""
-    part, config = "start", evidence.config
-    if evidence.is_given("start", "reading.init"):
-        chosen = config.start.name if config.start else config.reading.init
-        return given(part, chosen, "--start NAME or --init")
+    part, config = "initializer", evidence.config
+    if evidence.is_given("initializer", "data.init"):
+        chosen = config.initializer.name if config.initializer else config.data.init
+        return given(part, chosen, "--initializer NAME or --init")
     points, views = len(evidence.scene.points), len(evidence.scene.train_views)
     figures = {"points": points, "views": views}
     plain = Decision(
@@ -27,15 +27,15 @@ def start(evidence: Evidence) -> Decision:
         "default",
         "",
         "points found in photos where there are none; random ones for a single photo",
-        "docs/starts.md",
-        "--start NAME or --init random",
+        "docs/initializers.md",
+        "--initializer NAME or --init random",
     )
     if points:
         return plain.found(f"{points:,} SfM points", figures=figures)
     shown = plain.found(f"no SfM points, {views} training photos", figures=figures)
     if views > _ONE_PHOTO:
-        return shown.changed("triangulated", {"start": "triangulated"}, "--init random")
-    return shown.changed("random points", {"reading.init": "random"}, "--init FILE.ply")
+        return shown.changed("triangulated", {"initializer": "triangulated"}, "--init random")
+    return shown.changed("random points", {"data.init": "random"}, "--init FILE.ply")
 
 
 def held_out(evidence: Evidence) -> Decision:
@@ -43,7 +43,7 @@ def held_out(evidence: Evidence) -> Decision:
     part, scene = "held out", evidence.scene
     photos = Counter(view.regime for view in scene.test_views)
     chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
-    if evidence.is_given("reading.split", "reading.test_every"):
+    if evidence.is_given("data.split", "data.test_every"):
         return given(part, chosen, "--split HOW")
     plain = Decision(
         part,
@@ -80,8 +80,8 @@ def undistortion(evidence: Evidence) -> Decision:
 def masks(evidence: Evidence) -> Decision:
     """Whether pixels are masked."""
     part = "masks"
-    if evidence.is_given("reading.masks"):
-        return given(part, evidence.config.reading.masks, "--set reading.masks=FOLDER")
+    if evidence.is_given("data.masks"):
+        return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")
     note = evidence.scene_note("masks: ") or evidence.scene_note("does not count")
     plain = Decision(
         part,
@@ -90,7 +90,7 @@ def masks(evidence: Evidence) -> Decision:
         "",
         "where the scene has masks, or photos transparency",
         "the scene's folder",
-        "--set reading.masks=FOLDER",
+        "--set data.masks=FOLDER",
     )
     if note:
         return plain.found(note, decided=True)
@@ -108,7 +108,7 @@ def background(evidence: Evidence) -> Decision:
         "default",
         "",
         "the colour that transparent photos were blended over, else black, as viewers draw",
-        "docs/starts.md; docs/readers.md",
+        "docs/initializers.md; docs/readers.md",
         "--background COLOR",
     )
     note = evidence.scene_note("blended over RGB")

@@ -70,7 +70,7 @@ class GswarpRasterizer(Rasterizer):
         if selection.backbone.sets_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]
             reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")
-        if selection.resolution.interlaced:
+        if selection.resolution.strided:
             name = selection.names["resolution"]
             reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, resolution {name} by less")
         return reasons

@@ -12,8 +12,8 @@ from crossgrad_plugins.recipes import budget
 BETA1, BETA2 = 0.9, 0.999
 #: Components of long runs, and the ones that replace them in short runs.
 DENSIFIER, SHORT_DENSIFIER = "adc", "absgrad"
-RESOLUTION, SHORT_RESOLUTION = "full", "interlaced"
-START, BARE_START, EXPOSURE = "filled", "sfm", "auto"
+RESOLUTION, SHORT_RESOLUTION = "full", "strided"
+INITIALIZER, POINTS_ONLY, EXPOSURE = "fill-gaps", "points", "auto"
 #: Training photos from which on a short run grows by absolute gradients; with fewer photos it
 #: overfits.
 MANY_PHOTOS: Final = 100
@@ -107,7 +107,7 @@ class Choice:
         usual = facts.backbone.default_densifier
         suits = usual == DENSIFIER and self.is_plain and facts.photos >= MANY_PHOTOS
         here = suits and facts.short and facts.device == "cpu"
-        if not here or self.usual_growth(budgeted=True) == "free":
+        if not here or self.usual_growth(budgeted=True) == "unbounded":
             return usual
         needs = facts.densifier(SHORT_DENSIFIER).needs
         return SHORT_DENSIFIER if needs <= facts.provides else usual
@@ -117,15 +117,15 @@ class Choice:
         """The densifier."""
         return self.facts.densifier(self.densifier_name)
 
-    def usual_growth(self, *, budgeted: bool) -> Literal["free", "curve"]:
+    def usual_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
         """How primitives grow in a run of any length, as was set or as suits the densifier."""
-        given: Literal["free", "curve"] | None = self.given.get("growth")
+        given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
         # A bound that the user names is a limit and not a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
-        return "curve" if led and not named else "free"
+        return "budget" if led and not named else "unbounded"
 
     @cached_property
     def length(self) -> int:
@@ -133,15 +133,15 @@ class Choice:
         return self.facts.schedule(self.facts.unit).length
 
     @cached_property
-    def growth(self) -> Literal["free", "curve"]:
+    def growth(self) -> Literal["unbounded", "budget"]:
         """How primitives grow in this run: there is no budget at the published length."""
         usual = self.usual_growth(budgeted=self.densifier.budgeted)
-        return usual if self.length < REFERENCE or "growth" in self.given else "free"
+        return usual if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
     def led(self) -> bool:
         """Whether growth follows the curve to a budget that suits the length."""
-        return self.growth == "curve" and self.length < REFERENCE
+        return self.growth == "budget" and self.length < REFERENCE
 
 
 def components(choice: Choice) -> list[Decision]:
@@ -150,9 +150,9 @@ def components(choice: Choice) -> list[Decision]:
     usual = facts.backbone.default_densifier
     swapped = name != usual
     budgeted = choice.densifier.budgeted
-    led = not choice.densifier.edits or choice.usual_growth(budgeted=budgeted) == "curve"
+    led = not choice.densifier.edits or choice.usual_growth(budgeted=budgeted) == "budget"
     first = led and choice.is_plain and facts.device == "cpu" and facts.short
-    start = START if facts.own_points else BARE_START
+    start = INITIALIZER if facts.own_points else POINTS_ONLY
     return [
         Decision(
             "views_per_step",
@@ -175,10 +175,10 @@ def components(choice: Choice) -> list[Decision]:
             f"--resolution {RESOLUTION}" if first else "",
         ),
         Decision(
-            "start",
+            "initializer",
             start,
             "adds points where the scene has few" if facts.own_points else "the points of --init",
-            "docs/starts.md",
+            "docs/initializers.md",
         ),
         Decision("exposure", EXPOSURE, "as the photos need it", "docs/exposure.md"),
         _dropout(facts),
@@ -205,16 +205,16 @@ def growth(choice: Choice) -> list[Decision]:
     long = (
         facts.unit == "views" and not facts.published and choice.length >= SHORTEST_RUN_WITH_EDITS
     )
-    edits = EDITS if usual == "curve" and long else 0
+    edits = EDITS if usual == "budget" and long else 0
     resets = 0 if led else choice.densifier.window(schedule).reset_every or 0
     rows = [
-        Decision("events", facts.unit, "published numbers" if facts.published else "any K"),
+        Decision("schedule_unit", facts.unit, "published numbers" if facts.published else "any K"),
         Decision(
             "growth",
             choice.growth,
             "suits the length of the run" if led else "as density control requests",
             "Taming 3DGS; " + SCHEDULES,
-            "--growth free" if led else "",
+            "--growth unbounded" if led else "",
         ),
         _budget(choice),
         Decision(
@@ -241,8 +241,8 @@ def growth(choice: Choice) -> list[Decision]:
 def _budget(choice: Choice) -> Decision:
     facts = choice.facts
     asked = choice.given["max_gaussians"] == "auto"
-    if choice.growth == "free" and not asked:
-        return Decision("max_gaussians", 0, "growth is free", SCHEDULES)
+    if choice.growth == "unbounded" and not asked:
+        return Decision("max_gaussians", 0, "growth is unbounded", SCHEDULES)
     most: int | str = "auto"
     if facts.start is not None:
         most = budget.budget(facts.start, choice.length, facts.pixels, hurried=choice.hurried)

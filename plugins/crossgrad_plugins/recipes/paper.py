@@ -11,7 +11,7 @@ from crossgrad_plugins.recipes.auto import Auto
 #: Settings of all arms.
 BASE: Final[Mapping[str, Any]] = {
     "max_views": 1200,
-    "reading.max_size": 400,
+    "data.max_size": 400,
     "exposure": "auto",
     "plan": "off",
     "densifier": "adc",

@@ -12,12 +12,12 @@ NEAR: Final = 0.2
 BECAUSE: Final = "as published"
 #: Settings that do not depend on any fact.
 VALUES: Final[Mapping[str, Any]] = {
-    "start": "sfm",
+    "initializer": "points",
     "exposure": "none",
     "resolution": "full",
     "dropout": 0.0,
     "floaters": "keep",
-    "growth": "free",
+    "growth": "unbounded",
     "min_refinements": 0,
     "sh_start": 0.0,
     "position_lr": "extent",
@@ -39,7 +39,7 @@ class Published(Recipe):
 
     @override
     def decide(self, facts: Facts) -> list[Decision]:
-        unit: Unit = facts.given.get("events") or "steps"
+        unit: Unit = facts.given.get("schedule_unit") or "steps"
         named = facts.given.get("densifier")
         name = facts.backbone.default_densifier if named is None else named.name
         resets = facts.densifier(name).window(facts.schedule(unit)).reset_every or 0
@@ -47,7 +47,7 @@ class Published(Recipe):
             **VALUES,
             "views_per_step": facts.views_per_step.setting,
             "densifier": name,
-            "events": unit,
+            "schedule_unit": unit,
             "max_gaussians": 0,
             "reset_every": resets,
             "rasterizer.near": NEAR * facts.scale,

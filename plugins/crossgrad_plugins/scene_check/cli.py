@@ -18,7 +18,7 @@ def check(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="One setting of reading, repeatable: reader=colmap, reading.max_size=800.",
+            help="One setting of data, repeatable: reader=colmap, data.max_size=800.",
         ),
     ] = None,
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 #: Settings that change neither what is trained nor what is reported.
 _OF_NO_CONSEQUENCE: Final = (
-    *("scene", "out", "threads", "stop_after", "save_every"),
+    *("scene", "out", "threads", "stop_after", "save_every", "decided"),
     *("revisions", "planned_seconds", "planned_views"),
 )
 _DIGITS: Final = 12

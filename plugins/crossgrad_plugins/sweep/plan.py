@@ -123,7 +123,7 @@ class _Planner:
 
     def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
         """The scene as the configuration reads it; None where it cannot be read."""
-        key = f"{config.scene} {config.reader} {config.reading}"
+        key = f"{config.scene} {config.reader} {config.data}"
         if key not in self._scenes:
             try:
                 scene, reader = read_scene(config)

@@ -118,7 +118,7 @@ def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(
     backbone, most, scene, tmp_path
 ):
     choice = ComponentChoice(name=backbone)
-    config = RunConfig(scene=str(scene), steps=150, events="steps", backbone=choice)
+    config = RunConfig(scene=str(scene), steps=150, schedule_unit="steps", backbone=choice)
     setup = assemble(config, read_scene(config, scene)[0], "colmap")
     state = first_state(setup)
     for _ in range(60):

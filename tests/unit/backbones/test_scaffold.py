@@ -281,11 +281,11 @@ def test_at_most_so_many_cameras_are_averaged():
 def test_training_lowers_the_loss(options):
     config = RunConfig(
         steps=60,
-        start=ComponentChoice(name="sfm"),
+        initializer=ComponentChoice(name="points"),
         backbone=ComponentChoice(name="scaffold", **options),
         operator=ComponentChoice(name="pcgrad"),
         sampler=ComponentChoice(name="random"),
-        events="steps",
+        schedule_unit="steps",
         densify_from=10,
         densify_until=50,
         densify_every=10,

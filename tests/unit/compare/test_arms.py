@@ -213,7 +213,7 @@ def test_settings_are_flat_texts():
         "backbone": {"name": "vanilla", "lr": 0.0016, "on": True},
         "operator": [{"name": "a"}, {"name": "b", "c": 0.5}],
         "grouping": None,
-        "reading": {"max_size": 400, "cache_mib": 2048},
+        "data": {"max_size": 400, "cache_mib": 2048},
         "background": "black",
     }
     assert settings_of(config) == {
@@ -223,7 +223,7 @@ def test_settings_are_flat_texts():
         "operator": "a+b",
         "operator.1.c": "0.5",
         "grouping": "-",
-        "reading.max_size": "400",
+        "data.max_size": "400",
         "background": "black",
     }
 

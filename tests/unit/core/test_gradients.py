@@ -239,7 +239,7 @@ def test_threads_and_chunks_change_no_bit(views):
 
 def test_one_core_and_all_cores_give_the_same_bits():
     from crossgrad_core.gradients.numba_kernels import dense
-    from crossgrad_core.numerics.jobs import alone, share
+    from crossgrad_core.numerics.jobs import parallel, serial
 
     rows = torch.randn(3, 50_001, generator=torch.Generator().manual_seed(0))
     addresses = np.array([[row.data_ptr() for row in rows]])
@@ -248,7 +248,7 @@ def test_one_core_and_all_cores_give_the_same_bits():
     results = [torch.empty(50_001), torch.empty(50_001)]
     partials = [np.zeros((len(table), 3, 3)) for _ in results]
     weights = np.array([[1.5, -2.0, 0.25]])
-    for run, out, partial in zip((alone, share), results, partials, strict=True):
+    for run, out, partial in zip((serial, parallel), results, partials, strict=True):
         run(dense.gramians, addresses, sizes, table, partial)
         places = np.array([out.data_ptr()])
         run(dense.combine, addresses, weights, np.array([False]), 1.0, places, sizes, table)

@@ -18,10 +18,10 @@ from crossgrad_core.system import cores
 
 @kernel
 def mark(numbers, marks):
-    job = jobs.take(numbers, marks.shape[0])
+    job = jobs.next_job(numbers, marks.shape[0])
     while job < marks.shape[0]:
         marks[job] += 1
-        job = jobs.take(numbers, marks.shape[0])
+        job = jobs.next_job(numbers, marks.shape[0])
 
 
 @pytest.fixture(params=[1, 2])
@@ -35,7 +35,7 @@ def threads(request):
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
-@pytest.mark.parametrize("run", [jobs.share, jobs.alone])
+@pytest.mark.parametrize("run", [jobs.parallel, jobs.serial])
 def test_every_job_is_done_once(threads, run, count):
     marks = np.zeros(count, np.int64)
     run(mark, marks)
@@ -46,7 +46,7 @@ def test_every_job_is_done_once(threads, run, count):
 def taken(numbers, count, most):
     found = np.empty(most, np.int64)
     for place in range(most):
-        found[place] = jobs.take(numbers, count)
+        found[place] = jobs.next_job(numbers, count)
     return found
 
 
@@ -78,7 +78,7 @@ def test_an_error_of_a_helper_is_raised(threads):
             raise ValueError("of a helper")
 
     with pytest.raises(ValueError, match="of a helper"):
-        jobs.share(fails)
+        jobs.parallel(fails)
 
 
 @contextmanager
@@ -102,7 +102,7 @@ def occupied_helper():
 def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
     marks = np.zeros(1000, np.int64)
     with occupied_helper():
-        jobs.share(mark, marks)
+        jobs.parallel(mark, marks)
     assert (marks == 1).all()
 
 
@@ -124,7 +124,7 @@ def test_other_work_goes_on_beside_what_was_begun(threads):
         assert enough.wait(timeout=30)
 
     begun = jobs.Begun(waits)
-    jobs.share(mark, marks)
+    jobs.parallel(mark, marks)
     assert (marks == 1).all()
     enough.set()
     begun.end()
@@ -162,7 +162,7 @@ def test_what_is_left_alone_is_not_worked_on_any_more(threads):
 def test_helpers_keep_nothing_of_what_they_were_given(threads):
     marks = np.zeros(1000, np.int64)
     left = weakref.ref(marks)
-    jobs.share(mark, marks)
+    jobs.parallel(mark, marks)
     del marks
     # A call that was not needed is dropped as soon as its helper comes to it.
     for _ in range(100):
@@ -178,13 +178,13 @@ def test_helpers_end_before_the_interpreter_and_others_take_their_place(threads,
     monkeypatch.setattr(jobs.atexit, "register", at_exit.append)
     jobs._helpers.cache_clear()
     marks = np.zeros(1000, np.int64)
-    jobs.share(mark, marks)
+    jobs.parallel(mark, marks)
     (dismiss,) = at_exit
     (thread,) = [thread for _, thread in jobs._helpers(os.getpid())._helpers]
     assert thread.is_alive()
     dismiss()
     assert not thread.is_alive()
-    jobs.share(mark, marks)
+    jobs.parallel(mark, marks)
     assert (marks == 2).all()
     dismiss()
     jobs._helpers.cache_clear()  # Nobody would end the helpers of these at the exit.
@@ -208,7 +208,7 @@ def test_helpers_run_on_other_cores_than_who_asks_them(threads, monkeypatch):
             both.wait(timeout=30)
             found[threading.current_thread() is threading.main_thread()] = os.sched_getaffinity(0)
 
-        jobs.share(look)
+        jobs.parallel(look)
         assert found == {True: allowed, False: allowed - {core}}
 
 

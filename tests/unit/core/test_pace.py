@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from crossgrad_core.contract.pace import Pace, ViewsPerStepSpec
+from crossgrad_core.contract.pace import ViewsPerStep, ViewsPerStepSpec
 
 PLANS = ["1", "2", "7", "1..2@0.5", "2..1@0.3", "1..2@0.25..4@0.75", "4..3@0.01..12@0.99"]
 
@@ -64,7 +64,7 @@ def test_what_is_no_plan_is_refused(text):
 @pytest.mark.parametrize(("step", "start"), [(10, 40), (19, 40), (20, 40), (21, 20), (30, 20)])
 def test_a_change_that_is_ahead_moves_with_the_length(step, start):
     plan = ViewsPerStepSpec.parsed("1..2@0.5")
-    assert plan.paced(40).moved(plan.paced(80), step) == Pace((0, start), (1, 2))
+    assert plan.paced(40).moved(plan.paced(80), step) == ViewsPerStep((0, start), (1, 2))
 
 
 def test_a_change_that_would_be_behind_comes_at_once_and_rewrites_no_step():

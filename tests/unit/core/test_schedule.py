@@ -248,7 +248,7 @@ def test_edits_in_views_are_counted_without_looking_at_every_step(text, total):
 
 def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
     short = Schedule.for_run(1200, counting=in_views())
-    flat = Schedule.for_run(2400, "absolute", in_views(reference=1200))
+    flat = Schedule.for_run(2400, "absolute", in_views(schedule_length=1200))
     stretched = Schedule.for_run(2400, counting=in_views())
     assert view_counts(flat) == view_counts(short) != view_counts(stretched)
     for step in (1, 300, 1200):
@@ -262,14 +262,14 @@ def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
 @pytest.mark.parametrize("views", [250, 600, 605, 2400])
 def test_edits_of_a_flat_schedule_behind_the_end_of_the_run_do_not_count(text, views):
     total = ViewsPerStepSpec.parsed(text).steps_of(views)
-    schedule = Schedule.for_run(total, "absolute", in_views(text, reference=1200))
+    schedule = Schedule.for_run(total, "absolute", in_views(text, schedule_length=1200))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     for after in (0, total // 2, total):
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
 def test_a_flat_schedule_in_steps_has_the_floors_of_before():
-    flat = Schedule.for_run(4000, "absolute", Counting(reference=2000))
+    flat = Schedule.for_run(4000, "absolute", Counting(schedule_length=2000))
     short = Schedule.for_run(2000)
     assert view_counts(flat) == view_counts(short) == [600, 700, 800, 900]
 
@@ -338,12 +338,12 @@ def test_times_that_the_user_set_stay_whatever_the_length():
     [
         ({}, "views"),
         ({"schedule": "absolute"}, "steps"),
-        ({"schedule": "absolute", "reference": 600}, "views"),
+        ({"schedule": "absolute", "schedule_length": 600}, "views"),
         ({"recipe": {"name": "published"}}, "steps"),
-        ({"events": "steps"}, "steps"),
-        ({"recipe": {"name": "published"}, "events": "views"}, "views"),
+        ({"schedule_unit": "steps"}, "steps"),
+        ({"recipe": {"name": "published"}, "schedule_unit": "views"}, "views"),
     ],
 )
 def test_published_rules_count_steps_and_all_others_views(settings, unit):
     config, *_ = with_decisions(RunConfig(**settings), sample_scene())
-    assert config.events == unit
+    assert config.schedule_unit == unit

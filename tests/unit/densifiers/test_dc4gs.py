@@ -258,7 +258,7 @@ def test_nothing_is_gathered_after_the_end():
     assert edit == NO_EDIT and not state.per_primitive
 
 
-EARLY = {"events": "steps", "densify_from": 1, "densify_until": 7, "densify_every": 2}
+EARLY = {"schedule_unit": "steps", "densify_from": 1, "densify_until": 7, "densify_every": 2}
 
 
 def setup_of(rasterizer, **options):

@@ -236,13 +236,13 @@ def test_regularisers_are_means_and_come_once_per_step():
     assert densifier.crossgrad_regularize(regularize_context(parameters([]))) is None
 
 
-EARLY = {"events": "steps", "densify_from": 1, "densify_until": 9, "densify_every": 2}
+EARLY = {"schedule_unit": "steps", "densify_from": 1, "densify_until": 9, "densify_every": 2}
 
 
 def setup_of(**options):
     config = RunConfig(
         steps=10,
-        start=ComponentChoice(name="sfm"),
+        initializer=ComponentChoice(name="points"),
         densifier=ComponentChoice(name="mcmc", **options),
         **EARLY,
     )

@@ -362,7 +362,7 @@ def test_the_errors_of_one_regime_are_not_averaged_away(count):
 
 def run_of(views=1, backbone="vanilla", rasterizer="numba", steps=9, **options):
     config = RunConfig(
-        steps=60, events="steps", densify_from=1, densify_until=30, densify_every=3,
+        steps=60, schedule_unit="steps", densify_from=1, densify_until=30, densify_every=3,
         sampler=ComponentChoice(name="random"), views_per_step=views,
         backbone=ComponentChoice(name=backbone), rasterizer=ComponentChoice(name=rasterizer),
         densifier=ComponentChoice(name="multiview", **options), exposure={"name": "gain"},

@@ -33,7 +33,7 @@ ADC = {"name": "adc", "grad_threshold": 1e-9}
 
 def run_of(backbone, of, views=2, steps=7, **options):
     config = RunConfig(
-        steps=60, events="steps", densify_from=1, densify_until=30, densify_every=3,
+        steps=60, schedule_unit="steps", densify_from=1, densify_until=30, densify_every=3,
         sampler=ComponentChoice(name="random"), views_per_step=views,
         backbone=ComponentChoice(**backbone),
         densifier=ComponentChoice(name="multiview-gate", of=of, **options),

@@ -53,8 +53,8 @@ BACKBONES = {
 def test_a_checkpoint_changes_nothing(tmp_path, name, stop, edits_in):
     config = RunConfig(
         steps=10,
-        start=ComponentChoice(name="sfm"),
-        events="steps",
+        initializer=ComponentChoice(name="points"),
+        schedule_unit="steps",
         densify_from=1,
         densify_until=9,
         densify_every=2,
@@ -90,7 +90,7 @@ def assert_same(one, other):
 
 def test_what_plugins_remember_follows_the_run_to_its_device(tmp_path):
     """The device `meta` holds no numbers, and no machine lacks it."""
-    config = RunConfig(steps=10, events="steps", densify_from=1, densify_until=9)
+    config = RunConfig(steps=10, schedule_unit="steps", densify_from=1, densify_until=9)
     setup = assemble(config, sample_scene(), "none")
     state = first_state(setup)
     timed_step(setup, state)

@@ -242,7 +242,7 @@ def test_nothing_happens_between_edits():
 
 def test_a_run_grows_and_lowers_opacities():
     config = RunConfig(
-        steps=10, densify_from=1, densify_until=9, densify_every=2, events="steps",
+        steps=10, densify_from=1, densify_until=9, densify_every=2, schedule_unit="steps",
         densifier=ComponentChoice(name="revising", growth_budget=0.1, error_threshold=0.01),
     )  # fmt: skip
     state = first_state(setup := assemble(config, sample_scene(), "none"))
@@ -270,8 +270,8 @@ def test_decoding_photos_for_an_edit_counts_as_loading():
     scene = sample_scene()
     views = tuple(replace(view, photo=Slow(view.photo)) for view in scene.views)
     config = RunConfig(
-        reading={"init": "random"}, steps=30, densify_from=1, densify_until=29, densify_every=2,
-        events="steps",
+        data={"init": "random"}, steps=30, densify_from=1, densify_until=29, densify_every=2,
+        schedule_unit="steps",
         rasterizer=ComponentChoice(name="torch"), sampler=ComponentChoice(name="epoch"),
         densifier=ComponentChoice(name="revising", growth_budget=0.1, error_threshold=0.01),
     )  # fmt: skip

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("keeps_threads")
 def test_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
     config = RunConfig(
         steps=9,
-        events="steps",
+        schedule_unit="steps",
         densify_from=1,
         densify_until=9,
         densify_every=3,

@@ -36,20 +36,20 @@ def leaves_one_view_alone(operator):
 def test_an_operator_says_whether_it_leaves_one_view_alone(name, options):
     operator = build("operators", name, options.get(name, {}))
     if name == "torchjd":  # Which weighting it has is TorchJD's matter: it claims nothing.
-        assert not operator.does_nothing(1)
+        assert not operator.is_identity(1)
         return
-    assert operator.does_nothing(1) == leaves_one_view_alone(operator)
-    assert not operator.does_nothing(2)
+    assert operator.is_identity(1) == leaves_one_view_alone(operator)
+    assert not operator.is_identity(2)
 
 
 def test_a_chain_with_a_link_that_does_something_is_not_idle():
     links = ["preconditioner", "symmetric"]
-    assert not build("operators", "chain", {"links": links}).does_nothing(1)
+    assert not build("operators", "chain", {"links": links}).is_identity(1)
 
 
 def notes_of(operator, sampler=None, views=None):
     config = RunConfig(
-        reading={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
+        data={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
         operator=ComponentChoice.model_validate(operator), views=views,
         sampler=ComponentChoice.model_validate(sampler or {"name": "epoch"}),
     )  # fmt: skip
@@ -117,7 +117,7 @@ def test_a_sampler_of_one_view_is_named_as_what_stands_in_the_way():
 def test_the_noted_run_is_the_plain_one():
     def trained(operator):
         config = RunConfig(
-            reading={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
+            data={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),
             sampler=ComponentChoice(name="epoch"), operator=ComponentChoice(name=operator), views=1,
         )  # fmt: skip
         state = first_state(setup := assemble(config, sample_scene(), "none"))

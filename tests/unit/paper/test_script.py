@@ -83,7 +83,7 @@ def test_the_estimate_counts_what_is_there_from_packed_tables(paper, planted, mo
         return float(views.split()[-2])
 
     before = left()
-    same = {"clock": "cpu", "min_refinements": 6, "reading": {"max_size": 400}}
+    same = {"clock": "cpu", "min_refinements": 6, "data": {"max_size": 400}}
     same |= {"densifier": {"name": "adc"}}
     settings = {
         "one view, 60 s": {**same, "sampler": {"name": "epoch"}},

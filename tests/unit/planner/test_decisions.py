@@ -61,7 +61,7 @@ PARTS_OF_THE_TABLE = [
     *("modes", "pairs of views", "turns of views", "views per step", "operator"),
     *("exposure", "SH degree"),
     *("scale filter", "resolution", "primitives", "length", "densifier", "dropout"),
-    *("start", "held out", "undistortion", "masks", "background"),
+    *("initializer", "held out", "undistortion", "masks", "background"),
 ]
 
 
@@ -150,7 +150,7 @@ def test_the_scenes_themselves(name):
 @pytest.fixture(scope="module")
 def bundled():
     reading = {"max_size": 100}
-    settings = {"scene": str(bundled_scene()), "reading": reading, "steps": 3_000, "plan": "auto"}
+    settings = {"scene": str(bundled_scene()), "data": reading, "steps": 3_000, "plan": "auto"}
     config = configured(settings)
     return config, read_scene(config)[0]
 
@@ -458,7 +458,7 @@ def test_street_and_air_have_two_modes():
 def test_few_photos_without_points(count):
     scene = posed_scene([posed_view((i, i * i, 0), f"{i}.png") for i in range(count)])
     plan = plan_for(scene)
-    changes = {"reading.init": "random"} if count == 1 else {"start": "triangulated"}
+    changes = {"data.init": "random"} if count == 1 else {"initializer": "triangulated"}
     assert plan.settings == changes
     assert plan.of_part("exposure").basis == "default"
     assert planned(config_of(), scene)[0].reading.init == ("random" if count == 1 else "points")

@@ -10,7 +10,7 @@ import pytest
 
 from crossgrad_core.numerics import jobs
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import share
+from crossgrad_core.numerics.jobs import parallel
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
@@ -395,7 +395,7 @@ def basis_values(directions, k):
         rest[:, k - 1] = 0.1
     records = np.zeros(count * RECORD, np.float32)
     sizes = np.array([min(CHUNK, count - chunk * CHUNK) for chunk in range(chunks)])
-    share(
+    parallel(
         sh_forward,
         3, np.zeros(3), directions.astype(np.float32), dc, rest, sizes,
         np.arange(count, dtype=np.int32), records, np.ones(count, np.int32),

@@ -168,7 +168,7 @@ def parameters_after(path, reader):
         position_lr="extent",
         beta1=0.9,
         threads=1,
-        start={"name": "sfm"},
+        initializer={"name": "points"},
         reader={"name": reader},
         dropout=0.0,
     )

@@ -50,4 +50,4 @@ def test_what_the_user_sets_wins_and_his_length_replaces_that_of_the_recipe():
     config = configured({**recipe, "operator": {"name": "cagrad", "c": 0.3}, "steps": 50})
     assert (config.operator.name, config.operator.options["c"]) == ("cagrad", 0.3)
     assert (config.steps, config.max_views) == (50, None)
-    assert config.reading.max_size == 400
+    assert config.data.max_size == 400

@@ -63,11 +63,11 @@ def test_a_run_is_repeated_bit_for_bit_after_the_constants_of_the_recipe_changed
 
 
 def test_there_is_no_curve_to_a_budget_at_the_published_length():
-    for steps, growth in ((29_999, "curve"), (30_000, "free")):
+    for steps, growth in ((29_999, "budget"), (30_000, "unbounded")):
         setup = assembled(steps=steps)
         assert setup.numbers.growth == growth
         assert ("growth" in {row.setting for row in setup.decisions if row.override}) == (
-            growth == "curve"
+            growth == "budget"
         )
 
 
@@ -77,7 +77,7 @@ def test_a_run_of_two_views_per_step_is_short_or_long_as_a_whole(steps, short):
     assert (numbers.rate_factor > 1.0) == short
     assert (numbers.position_lr == "per-axis") == short
     assert (numbers.max_scale_ratio > 0.0) == short
-    assert (numbers.growth == "curve") == short
+    assert (numbers.growth == "budget") == short
     assert (numbers.beta1 < 0.9) == short
     assert (numbers.reset_every == 0) == short
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from crossgrad_core.contract.similarity import Similarity
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.camera_path import camera_path, ladder
+from crossgrad_core.run.camera_path import camera_path, zoom_path
 from crossgrad_core.run.results import video
 from crossgrad_core.testing.posed import posed_scene, posed_view
 
@@ -29,9 +29,9 @@ def views_above(heights, seen=range(10)):
     return [posed_view((0.1, 0.2, h), f"{h}.png", **ways) for h in heights], points
 
 
-def test_a_ladder_comes_nearer_by_equal_factors():
+def test_a_zoom_path_comes_nearer_by_equal_factors():
     views, points = views_above([2.0, 40.0, 5.0, 0.5])
-    cameras = ladder(views, points, FRAMES)
+    cameras = zoom_path(views, points, FRAMES)
     heights = np.array([float(camera.center[2]) for camera in cameras])
     assert heights[0] == pytest.approx(40.0) and heights[-1] == pytest.approx(0.5)
     np.testing.assert_allclose(heights[1:] / heights[:-1], (0.5 / 40.0) ** (1 / (FRAMES - 1)))
@@ -40,12 +40,12 @@ def test_a_ladder_comes_nearer_by_equal_factors():
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
 
 
-def test_a_ladder_begins_and_ends_with_photos_that_show_the_same():
+def test_a_zoom_path_begins_and_ends_with_photos_that_show_the_same():
     views, points = views_above([40.0, 41.0, 0.5, 0.6, *[5.0] * 6])
     apart = {"forward": (0.0, 0.3, -1.0), "seen": range(8)}
     views[0] = posed_view((9, 9, 40.0), "far.png", **apart)
     views[2] = posed_view((9, 9, 0.5), "near.png", **apart)
-    ends = ladder(views, points, 2)
+    ends = zoom_path(views, points, 2)
     torch.testing.assert_close(ends[0].center, views[1].camera.center)
     torch.testing.assert_close(ends[1].center, views[3].camera.center)
     torch.testing.assert_close(ends[0].world_to_camera, views[1].camera.world_to_camera)
@@ -69,20 +69,20 @@ def test_the_ends_of_a_ladder_against_all_pairs():
             for shared, far, near in pairs
             if shared == most
         }
-        ends = ladder(views, points, 2)
+        ends = zoom_path(views, points, 2)
         found = tuple(float(camera.center[2]) for camera in ends)
         assert any(found == pytest.approx(pair) for pair in best)
 
 
 def test_views_at_one_distance_give_a_ladder_too():
     views, points = views_above([3.0, 3.0])
-    assert {round(float(camera.center[2]), 9) for camera in ladder(views, points, 5)} == {3.0}
+    assert {round(float(camera.center[2]), 9) for camera in zoom_path(views, points, 5)} == {3.0}
 
 
 def test_photos_that_observe_nothing_give_none():
     views, points = views_above([1.0, 2.0], seen=range(3))
-    with pytest.raises(UserError, match="give no ladder"):
-        ladder(views, points, FRAMES)
+    with pytest.raises(UserError, match="give no zoom path"):
+        zoom_path(views, points, FRAMES)
 
 
 def scene_with(similarity):

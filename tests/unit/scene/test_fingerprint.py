@@ -35,7 +35,7 @@ def scene(pristine, tmp_path):
 
 
 def taken(folder: Path, **reading: object):
-    config = RunConfig.model_validate({"reading": reading})
+    config = RunConfig.model_validate({"data": reading})
     return fingerprint_of(read_scene(config, folder)[0], folder)
 
 

@@ -44,7 +44,7 @@ def test_a_plain_scene_has_no_unused_files(scene):
 @pytest.mark.parametrize(
     ("folder", "reason"),
     [
-        ("mask", "named like masks; use them with --set reading.masks=FOLDER"),
+        ("mask", "named like masks; use them with --set data.masks=FOLDER"),
         ("alpha_masks", "named like masks"),
         ("depth", "depth and normal maps are not used"),
         ("images_2", "smaller copies of the photos"),

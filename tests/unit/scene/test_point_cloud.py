@@ -168,7 +168,7 @@ def test_a_dense_cloud_is_thinned_evenly_with_a_note(scene):
     assert abs((kept[:, 0] < 0.0).mean() - 0.5) < 0.1
     note = next(note for note in found.notes if "kept" in note)
     assert f"{len(kept):,} of 22,000" in note
-    assert "reading.max_points" in note
+    assert "data.max_points" in note
     again = read(scene, points=Path("scan.ply"), max_points=1000)
     np.testing.assert_array_equal(found.points, again.points)
     assert len(read(scene, points=Path("scan.ply")).points) == 22_000

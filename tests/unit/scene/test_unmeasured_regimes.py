@@ -10,7 +10,7 @@ FOLDERS = ("street", "aerial")
 
 
 def notes_of(path, **reading):
-    scene, _ = read_scene(configured({"scene": str(path), "reading": reading}))
+    scene, _ = read_scene(configured({"scene": str(path), "data": reading}))
     return [note for note in scene.notes if "is held out" in note]
 
 

@@ -78,14 +78,14 @@ def test_a_run_that_two_configurations_come_to_is_one_run(scene, tmp_path):
 
 
 def test_an_arm_that_chooses_another_component_drops_the_options_of_the_base(scene, tmp_path):
-    base = {"operator": {"name": "cagrad", "c": 0.3}, "reading": {"max_size": 40}, "steps": 9}
+    base = {"operator": {"name": "cagrad", "c": 0.3}, "data": {"max_size": 40}, "steps": 9}
     arms = [
-        {"name": "a", "settings": {"operator.c": 0.1, "reading": {"test_every": 4}}},
+        {"name": "a", "settings": {"operator.c": 0.1, "data": {"test_every": 4}}},
         {"name": "b", "settings": {"operator": "sum", "seconds": 5}},
     ]
     one, other = plan(tmp_path, scenes=[str(scene)], base=base, arms=arms).jobs
     assert one.settings["operator"] == {"name": "cagrad", "c": 0.1}
-    assert one.settings["reading"] == {"max_size": 40, "test_every": 4}
+    assert one.settings["data"] == {"max_size": 40, "test_every": 4}
     assert other.settings["operator"] == {"name": "sum"}
     assert (other.settings["seconds"], other.seconds) == (5, 5.0)
     assert "steps" not in other.settings

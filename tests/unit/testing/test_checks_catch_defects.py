@@ -743,7 +743,7 @@ class CountsSingleViews(api.Operator):
         return api.AggregateResult(context.gradients.total(), {"present": count}), state
 
 
-class FillsBareScenesWithNothing(load("starts", "sfm")):
+class FillsBareScenesWithNothing(load("initializers", "points")):
     alone: ClassVar[bool] = True
 
     def more_points(self, scene):

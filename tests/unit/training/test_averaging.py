@@ -102,8 +102,8 @@ def runs(request):
     """Runs of a backbone: as published, averaged, and with both; the last one also in two parts."""
     setups = {
         "plain": setup_of(request.param, lr_tail=0.0),
-        "averaged": setup_of(request.param, average=0.4, lr_tail=0.0),
-        "both": setup_of(request.param, average=0.5, lr_tail=0.5),
+        "averaged": setup_of(request.param, weight_averaging=0.4, lr_tail=0.0),
+        "both": setup_of(request.param, weight_averaging=0.5, lr_tail=0.5),
     }
     found = {name: recorded(setup) for name, setup in setups.items()}
     half, _ = trained(setups["both"], steps=7)
@@ -160,7 +160,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
 
 
 def test_a_snapshot_keeps_the_average_of_its_moment():
-    setup = setup_of(average=1.0)
+    setup = setup_of(weight_averaging=1.0)
     state, _ = trained(setup, steps=4)
     before = {name: tensor.clone() for name, tensor in eval_parameters(state).items()}
     snapshot = Snapshot.of(state)
@@ -173,7 +173,7 @@ def fake(total, share, states=None):
     """A run of one tensor, to count the steps of an average."""
     block = SimpleNamespace(tensors=("x",))
     setup = SimpleNamespace(
-        config=RunConfig(average=share),
+        config=RunConfig(weight_averaging=share),
         schedule=SimpleNamespace(total=total),
         trained_blocks=(block,),
     )
@@ -255,7 +255,7 @@ def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
 )
 def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeypatch):
     """Of ten steps the last six are averaged, and the edit comes in the eighth."""
-    setup = setup_of(average=0.6)
+    setup = setup_of(weight_averaging=0.6)
 
     def densify(self, context, state):
         answer = edit(context.parameters) if context.step == 8 else Edit()
@@ -269,16 +269,16 @@ def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeyp
 
 
 def test_noise_after_every_step_does_not_keep_the_average_from_growing():
-    setup = setup_of(densifier="mcmc", densify_until=2, average=0.5)
+    setup = setup_of(densifier="mcmc", densify_until=2, weight_averaging=0.5)
     state, _ = trained(setup)
     assert state.states[STATE].values["count"] == 5
 
 
 def test_the_published_rule_has_neither():
     config = resolved(setup_of(recipe={"name": "published"})).model_dump()
-    assert (config["lr_tail"], config["average"]) == (0.0, 0.0)
-    asked = resolved(setup_of(recipe={"name": "published"}, lr_tail=0.2, average=0.1))
-    assert (asked.lr_tail, asked.average) == (0.2, 0.1)
+    assert (config["lr_tail"], config["weight_averaging"]) == (0.0, 0.0)
+    asked = resolved(setup_of(recipe={"name": "published"}, lr_tail=0.2, weight_averaging=0.1))
+    assert (asked.lr_tail, asked.weight_averaging) == (0.2, 0.1)
 
 
 def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
@@ -309,7 +309,7 @@ def test_a_run_says_what_it_does_at_its_end():
     ],
 )
 def test_an_average_of_something_else_is_refused(spoiled):
-    setup = setup_of(average=0.5)
+    setup = setup_of(weight_averaging=0.5)
     state, _ = trained(setup, steps=2)
     state.commit({STATE: spoiled})
     with pytest.raises(UserError, match="does not fit the run"):

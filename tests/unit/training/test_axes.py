@@ -174,7 +174,7 @@ class RoundWithAxes(Round):
 
 
 def with_backbone(backbone):
-    setup = setup_of(start={"name": "sfm"})
+    setup = setup_of(initializer={"name": "points"})
     return replace(setup, selection=replace(setup.selection, backbone=backbone))
 
 
@@ -205,7 +205,7 @@ def setup_of(backbone="vanilla", **settings):
         ({"recipe": {"name": "published"}}, False),
         ({"recipe": {"name": "published"}, "position_lr": "per-axis"}, True),
         ({"schedule": "absolute"}, False),
-        ({"schedule": "absolute", "reference": 10}, True),
+        ({"schedule": "absolute", "schedule_length": 10}, True),
     ],
 )
 def test_short_runs_step_by_size(settings, by_size):

@@ -10,12 +10,12 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.schedule import Counting
 from crossgrad_core.contract.state import PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.errors import IncompatibleSelectionError
-from crossgrad_core.registry.entries import build
+from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run import assemble as assembling
+from crossgrad_core.run import decisions as deciding
 from crossgrad_core.run import select as selecting
 from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
@@ -77,6 +77,8 @@ def assembled(monkeypatch):
         return assembling.assemble(RunConfig(steps=10, **chosen), sample_scene(), "none")
 
     monkeypatch.setattr(selecting, "build", build_own)
+    for module in (deciding, selecting):
+        monkeypatch.setattr(module, "load", lambda slot, name: own.get(name) or load(slot, name))
     return make
 
 
@@ -115,9 +117,10 @@ def test_the_densifier_decides_when_it_acts_and_how_it_starts(assembled):
     assert start.requires_grad
 
 
-def test_what_the_user_sets_wins_over_the_densifier(assembled):
+@pytest.mark.usefixtures("assembled")
+def test_what_the_user_sets_wins_over_the_densifier():
     config = RunConfig(steps=10, densify_every=3, densifier=ComponentChoice(name="reversing"))
-    schedule = assembling.schedule_of(config, Reversing(), 10, Counting())
+    schedule = assembling.assemble(config, sample_scene(), "none").schedule
     assert (schedule.densify_from, schedule.densify_every) == (1, 3)
 
 

@@ -76,7 +76,9 @@ class Run:
 
 
 def setup(densifier="adc", steps=1000, mode="scaled", resolution="full"):
-    config = RunConfig(steps=steps, schedule=mode, events="steps", densifier={"name": densifier})
+    config = RunConfig(
+        steps=steps, schedule=mode, schedule_unit="steps", densifier={"name": densifier}
+    )
     return Run(
         with_decisions(config, sample_scene())[0],
         build("densifiers", densifier, {}),
@@ -134,7 +136,7 @@ def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
 
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
-@pytest.mark.parametrize("name", ["full", "octaves", "interlaced"])
+@pytest.mark.parametrize("name", ["full", "octaves", "strided"])
 def test_probed_steps_gather_statistics_and_have_all_bands(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
@@ -322,7 +324,7 @@ COURSES = {"all": {"photos": 9, "scales": [0.25] * 16 + [0.3 + 0.04 * n for n in
 GROWING = {
     "octaves": build("resolutions", "octaves", {}),
     "spectral": build("resolutions", "spectral", {"courses": COURSES}),
-    "interlaced": build("resolutions", "interlaced", {"coarsest": 4}),
+    "strided": build("resolutions", "strided", {"coarsest": 4}),
 }
 
 
@@ -365,7 +367,7 @@ def test_a_step_ahead_costs_more_where_photos_grow():
 
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
-@pytest.mark.parametrize("name", ["full", "octaves", "spectral", "interlaced"])
+@pytest.mark.parametrize("name", ["full", "octaves", "spectral", "strided"])
 def test_the_probe_tells_what_goes_with_the_pixels(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")

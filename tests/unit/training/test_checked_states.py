@@ -80,7 +80,7 @@ def _one_thread(keeps_threads):
 @cache
 def assembled(**settings):
     # No edit removes what is poisoned.
-    never = {"save_every": 1000, "eval_every": 1000, "events": "steps"}
+    never = {"save_every": 1000, "eval_every": 1000, "schedule_unit": "steps"}
     config = RunConfig.model_validate({"steps": STEPS, **never, **settings})
     return assemble(config, sample_scene(), "none")
 

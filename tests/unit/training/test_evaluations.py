@@ -29,12 +29,12 @@ def test_else_they_are_at_multiples(steps, given):
     ("settings", "every"),
     [
         ({"steps": 20_000}, None),
-        ({"steps": 20_000, "growth": "free"}, 2000),
+        ({"steps": 20_000, "growth": "unbounded"}, 2000),
         ({"steps": 20_000, "max_gaussians": 10**6}, 2000),
         ({"steps": 20_000, "recipe": {"name": "published"}}, 2000),
         ({"steps": 20_000, "reset_every": 500}, 500),
         ({"steps": 30_000}, 3000),
-        ({"steps": 9999, "growth": "free"}, None),
+        ({"steps": 9999, "growth": "unbounded"}, None),
     ],
     ids=str,
 )

@@ -122,7 +122,7 @@ def test_photos_stay_as_they_are(backbone):
 
 
 def test_moments_states_and_the_average_come_along():
-    setup = setup_of(average=1.0)
+    setup = setup_of(weight_averaging=1.0)
     state = scattered(setup)
     for _ in range(3):
         take_step(setup, state)
@@ -141,7 +141,7 @@ def test_moments_states_and_the_average_come_along():
 
 
 def test_it_is_the_average_that_is_looked_at_where_it_is_shown():
-    setup = setup_of(average=1.0)
+    setup = setup_of(weight_averaging=1.0)
     state = scattered(setup)
     take_step(setup, state)
     gone = floaters(setup, state)
@@ -164,7 +164,7 @@ def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
 
 
 def test_a_set_of_which_nothing_would_be_left_stays():
-    setup = setup_of(start=ComponentChoice(name="sfm"))
+    setup = setup_of(initializer=ComponentChoice(name="points"))
     state = first_state(setup)
     behind = setup.train_views[0].camera
     positions = state.parameters["means"].detach()

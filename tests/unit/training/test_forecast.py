@@ -8,16 +8,22 @@ import pytest
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
+from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.eta import LOOK_STEPS, Forecast
 from crossgrad_core.run.results.lines import roughly
+from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.budget import Planned
 from crossgrad_core.training.clock import Clock
 from crossgrad_core.training.expected_cost import COST_PER_EDIT, COUNTED_EDITS
+from crossgrad_core.training.numbers import Numbers
 
 RUN = make_dataclass(
     "Run",
     [
         "config",
+        "in_force",
+        "numbers",
+        "revised",
         "densifier",
         "selection",
         "schedule",
@@ -37,8 +43,12 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
         crossgrad_log=lambda text: said.append((state.step, text)),
         crossgrad_length_changed=lambda step, total: revised.append((step, total)),
     )
+    config, _, _ = with_decisions(RunConfig(steps=steps, growth="unbounded"), sample_scene())
     run = RUN(
-        config=RunConfig(steps=steps, growth="free"),
+        config=config,
+        in_force=config,
+        numbers=Numbers.of(config),
+        revised={},
         densifier=build("densifiers", densifier, {}),
         selection=SimpleNamespace(
             names={"densifier": densifier}, resolution=build("resolutions", "full", {})

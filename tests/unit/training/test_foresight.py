@@ -43,7 +43,7 @@ def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
     setup = setup_of(sampler)
     state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(12):
-        foresight.look(state)
+        foresight.update(state)
         expected = list(setup.photos_ahead.names[-1])
         assert len(expected) >= min(8, 12 - state.step)
         drawn = timed_step(setup, state).names
@@ -57,7 +57,7 @@ def test_looking_ahead_touches_nothing(sampler):
     state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(6):
         before = deepcopy((state.states.get("sampler"), state.rngs, state.step))
-        foresight.look(state)
+        foresight.update(state)
         streams = {name: rng.bit_generator.state for name, rng in state.rngs.items()}
         assert streams == {name: rng.bit_generator.state for name, rng in before[1].items()}
         assert (state.states.get("sampler"), state.step) == (before[0], before[2])
@@ -67,11 +67,11 @@ def test_looking_ahead_touches_nothing(sampler):
 def test_a_step_that_drew_something_else_begins_the_guess_anew():
     setup = setup_of("random")
     state, foresight = first_state(setup), Prefetcher(setup)
-    foresight.look(state)
+    foresight.update(state)
     timed_step(setup, state)
     state.last = replace(state.last, views=(-1, -1))
     state.rngs["sampler"].random(3)
-    foresight.look(state)
+    foresight.update(state)
     expected = setup.photos_ahead.names[-1]
     assert tuple(expected[:2]) == timed_step(setup, state).names
 
@@ -87,7 +87,7 @@ def test_views_in_an_array_are_foreseen():
     object.__setattr__(setup.sampler, "sample", as_array)
     state, foresight = first_state(setup), Prefetcher(setup)
     for _ in range(3):
-        foresight.look(state)
+        foresight.update(state)
         drawn = timed_step(setup, state).names
         assert tuple(setup.photos_ahead.names[-1][:2]) == drawn
     assert len(setup.photos_ahead.names) == 3
@@ -98,7 +98,7 @@ def test_nothing_is_foreseen_of_views_that_are_not_there(views):
     setup = setup_of("random")
     wrong = ViewSample(views)
     object.__setattr__(setup.sampler, "sample", lambda *_: (wrong, EMPTY_STATE))
-    Prefetcher(setup).look(first_state(setup))
+    Prefetcher(setup).update(first_state(setup))
     assert setup.photos_ahead.names == []
 
 
@@ -110,12 +110,12 @@ def test_nothing_is_foreseen_of_a_sampler_that_fails():
         raise ValueError
 
     object.__setattr__(setup.sampler, "sample", fail)
-    foresight.look(state)
-    foresight.look(state)
+    foresight.update(state)
+    foresight.update(state)
     assert setup.photos_ahead.names == []
 
 
-@pytest.mark.parametrize(("resolution", "width"), [("octaves", WIDTH // 2), ("interlaced", WIDTH)])
+@pytest.mark.parametrize(("resolution", "width"), [("octaves", WIDTH // 2), ("strided", WIDTH)])
 def test_photos_that_are_kept_in_the_size_they_are_taken_from_are_not_decoded(resolution, width):
     class OddOnesKept:
         def holds(self, view, camera):
@@ -127,7 +127,7 @@ def test_photos_that_are_kept_in_the_size_they_are_taken_from_are_not_decoded(re
     odd, asked = {view.name for view in setup.train_views[1::2]}, []
     state = first_state(setup)
     state.last = StepRecord(0, (0,), ("",), None, (0.1,), 1, {}, 0.0, scales=(0.5,))
-    Prefetcher(setup).look(state)
+    Prefetcher(setup).update(state)
     assert set(asked) == {width}
     (expected,) = setup.photos_ahead.names
     assert expected and not odd & set(expected)

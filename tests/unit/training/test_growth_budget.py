@@ -56,8 +56,8 @@ EDITS = 4
 def setup_of(densifier, **settings):
     """A run of 4 edits, after steps 2, 4, 6 and 8."""
     config = RunConfig(
-        start={"name": "sfm"},
-        steps=10, events="steps", densify_from=1, densify_until=9, densify_every=2,
+        initializer={"name": "points"},
+        steps=10, schedule_unit="steps", densify_from=1, densify_until=9, densify_every=2,
         densifier=ComponentChoice(name=densifier, **GREEDY[densifier]),
         backbone=ComponentChoice(**BACKBONES.get(densifier, {"name": "vanilla"})), **settings,
     )  # fmt: skip
@@ -87,25 +87,25 @@ def test_every_method_that_grows_follows_the_curve(name):
     start = free[0]
     budget = start + (free[2] - start) // 2  # Less than the first edit alone would add.
     assert budget > start + EDITS
-    found = counts_of(setup_of(name, max_gaussians=budget, growth="curve"))
+    found = counts_of(setup_of(name, max_gaussians=budget, growth="budget"))
     for edit in range(1, EDITS + 1):
         assert found[2 * edit] == curve(edit, EDITS, start, budget)
         assert found[2 * edit - 1] == found[2 * edit - 2]
     assert found[-1] == budget
-    at_once = counts_of(setup_of(name, max_gaussians=budget, growth="free"))
+    at_once = counts_of(setup_of(name, max_gaussians=budget, growth="unbounded"))
     assert at_once[2] == budget
 
 
 def test_the_strongest_come_first():
     """What the curve leaves out is what the method itself would have taken last."""
     found = {}
-    for growth in ("free", "curve"):
+    for growth in ("unbounded", "budget"):
         setup = setup_of("adc", max_gaussians=60, growth=growth)
         state = first_state(setup)
         for _ in range(2):
             timed_step(setup, state)
         found[growth] = state.parameters["means"][40:].detach()
-    some, many = found["curve"], found["free"]
+    some, many = found["budget"], found["unbounded"]
     assert 0 < len(some) < len(many)
     assert {tuple(row) for row in some.tolist()} <= {tuple(row) for row in many.tolist()}
 
@@ -114,11 +114,11 @@ def test_the_strongest_come_first():
     ("settings", "division"),
     [
         ({}, "axis"),
-        ({"growth": "free"}, "drawn"),
+        ({"growth": "unbounded"}, "drawn"),
         ({"max_gaussians": 60}, "drawn"),
-        ({"growth": "curve", "max_gaussians": 60}, "axis"),
+        ({"growth": "budget", "max_gaussians": 60}, "axis"),
         ({"recipe": {"name": "published"}}, "drawn"),
-        ({"steps": 30_000, "growth": "curve"}, "drawn"),
+        ({"steps": 30_000, "growth": "budget"}, "drawn"),
     ],
 )
 def test_what_grows_is_divided_along_its_axis_in_short_runs_with_a_budget(settings, division):
@@ -129,7 +129,7 @@ def test_what_grows_is_divided_along_its_axis_in_short_runs_with_a_budget(settin
 
 
 def test_what_was_pruned_may_be_added_again():
-    setup = setup_of("adc", max_gaussians=80, growth="curve")
+    setup = setup_of("adc", max_gaussians=80, growth="budget")
     state = first_state(setup)
     for _ in range(3):
         timed_step(setup, state)
@@ -143,21 +143,21 @@ def test_what_was_pruned_may_be_added_again():
 @pytest.mark.parametrize(
     ("settings", "growth", "bound"),
     [
-        ({}, "curve", "auto"),
-        ({"max_gaussians": "auto"}, "curve", "auto"),
-        ({"max_gaussians": 60}, "free", 60),
-        ({"growth": "free"}, "free", 0),
-        ({"growth": "free", "max_gaussians": "auto"}, "free", "auto"),
-        ({"growth": "curve", "max_gaussians": 60}, "curve", 60),
-        ({"events": "steps"}, "free", 0),
-        ({"events": "steps", "growth": "curve"}, "curve", "auto"),
-        ({"recipe": {"name": "published"}}, "free", 0),
-        ({"schedule": "absolute"}, "free", 0),
-        ({"steps": 30_000}, "free", 0),
-        ({"densifier": {"name": "none"}}, "free", 0),
-        ({"densifier": {"name": "mcmc"}}, "free", 0),
-        ({"backbone": {"name": "scaffold"}}, "free", 0),
-        ({"backbone": {"name": "pixel"}}, "curve", "auto"),
+        ({}, "budget", "auto"),
+        ({"max_gaussians": "auto"}, "budget", "auto"),
+        ({"max_gaussians": 60}, "unbounded", 60),
+        ({"growth": "unbounded"}, "unbounded", 0),
+        ({"growth": "unbounded", "max_gaussians": "auto"}, "unbounded", "auto"),
+        ({"growth": "budget", "max_gaussians": 60}, "budget", 60),
+        ({"schedule_unit": "steps"}, "unbounded", 0),
+        ({"schedule_unit": "steps", "growth": "budget"}, "budget", "auto"),
+        ({"recipe": {"name": "published"}}, "unbounded", 0),
+        ({"schedule": "absolute"}, "unbounded", 0),
+        ({"steps": 30_000}, "unbounded", 0),
+        ({"densifier": {"name": "none"}}, "unbounded", 0),
+        ({"densifier": {"name": "mcmc"}}, "unbounded", 0),
+        ({"backbone": {"name": "scaffold"}}, "unbounded", 0),
+        ({"backbone": {"name": "pixel"}}, "budget", "auto"),
     ],
 )
 def test_what_growth_a_run_has(settings, growth, bound):
@@ -167,14 +167,14 @@ def test_what_growth_a_run_has(settings, growth, bound):
     assert (setup.numbers.growth, setup.numbers.max_gaussians) == (growth, bound)
     written = resolved(setup)
     assert (written.growth, written.max_gaussians) == (growth, bound)
-    led = growth == "curve" and setup.schedule.counting.unit == "views"
+    led = growth == "budget" and setup.schedule.counting.unit == "views"
     if setup.schedule.total < 30_000:
         assert setup.schedule.min_refinements == (6 if led else 0)
     shown = [row.setting for row in setup.decisions if row.override]
-    assert ("growth" in shown) == (growth == "curve" and "growth" not in settings)
+    assert ("growth" in shown) == (growth == "budget" and "growth" not in settings)
 
 
-@pytest.mark.parametrize("growth", ["free", "curve"])
+@pytest.mark.parametrize("growth", ["unbounded", "budget"])
 @pytest.mark.parametrize("name", GREEDY)
 def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
     whole = first_state(setup_of(name)).primitives(setup_of(name))
@@ -202,14 +202,14 @@ def test_a_start_that_is_taken_as_it_is_is_told_where_it_is_above_the_bound():
     "settings", [{"steps": 4}, {"steps": 2_000, "densifier": {"name": "none"}}]
 )
 def test_without_density_control_all_of_the_bound_is_there_at_once(settings):
-    config = RunConfig(start={"name": "sfm"}, max_gaussians=9, **settings)
+    config = RunConfig(initializer={"name": "points"}, max_gaussians=9, **settings)
     setup = assemble(config, sample_scene(), "none")
     assert first_state(setup).primitives(setup) == 9
 
 
 def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
     def means(seed):
-        config = RunConfig(seed=seed, steps=4, max_gaussians=300, reading={"init": "random"})
+        config = RunConfig(seed=seed, steps=4, max_gaussians=300, data={"init": "random"})
         return first_state(assemble(config, sample_scene(), "none")).parameters["means"]
 
     assert len(means(0)) == 300 and torch.equal(means(0), means(0))
@@ -224,7 +224,7 @@ def test_random_points_know_nothing_of_the_rows_of_sfm_points():
     scene = replace(
         scene, views=views, points=scene.points[rows], point_colors=scene.point_colors[rows]
     )
-    config = RunConfig(steps=4, max_gaussians=300, reading={"init": "random"})
+    config = RunConfig(steps=4, max_gaussians=300, data={"init": "random"})
     setup = assemble(config, scene, "none")
     assert first_state(setup).primitives(setup) == 300
 
@@ -236,10 +236,12 @@ def test_a_bound_is_kept_where_many_points_make_one_anchor():
     scene = replace(scene, points=spread, point_colors=colors)
     scene = replace(scene, views=tuple(replace(v, seen=np.arange(9)) for v in scene.views))
     wide = {"name": "scaffold", "voxel_size": 0.4}
-    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide)
+    config = RunConfig(steps=4, initializer={"name": "points"}, backbone=wide)
     whole = first_state(setup := assemble(config, scene, "none")).primitives(setup)
     assert whole < 400  # Ten points and more in each.
-    config = RunConfig(steps=4, start={"name": "sfm"}, backbone=wide, max_gaussians=whole // 2)
+    config = RunConfig(
+        steps=4, initializer={"name": "points"}, backbone=wide, max_gaussians=whole // 2
+    )
     setup = assemble(config, scene, "none")
     assert 0 < first_state(setup).primitives(setup) <= whole // 2
 
@@ -262,12 +264,12 @@ def test_points_that_a_start_added_are_kept_where_they_fit():
     assert len(thinned(scene, 1e-9, np.random.default_rng(0)).points) == 1
 
 
-@pytest.mark.parametrize("growth", ["free", "curve"])
+@pytest.mark.parametrize("growth", ["unbounded", "budget"])
 def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
     monkeypatch.setattr(budgets, "SHORT_BUDGET", 50)
     found = counts_of(setup_of("adc", max_gaussians="auto", growth=growth))
     assert found[-1] == 50 == max(found)
-    assert (found[2] == 50) == (growth == "free")
+    assert (found[2] == 50) == (growth == "unbounded")
 
 
 def test_budgets_by_length():
@@ -303,7 +305,7 @@ def test_budgets_by_length():
 @pytest.mark.parametrize(("settings", "more"), [({}, 2), ({"beta2": 0.999}, 1)])
 def test_a_run_that_shows_photos_a_few_times_has_more_of_large_ones(settings, more, monkeypatch):
     monkeypatch.setattr(budgets, "SHORT_BUDGET", 50)
-    setup = setup_of("adc", growth="curve", max_gaussians="auto", **settings)
+    setup = setup_of("adc", growth="budget", max_gaussians="auto", **settings)
     monkeypatch.setattr(budgets, "PIXELS", setup.scene.train_pixels / 4)
     monkeypatch.setattr(budgets, "HURRIED_PIXELS", setup.scene.train_pixels)
     monkeypatch.setattr(budgets, "FINER", 0.0)
@@ -320,8 +322,8 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
     turn = first.step_of(first.next_edit(first.densify_from + first.densify_every))
     wanted = Schedule.for_run(longer, counting=counting)
     schedule, present, reached = first, 1_000, []
-    config = RunConfig(growth="curve", max_gaussians=9_000)
-    numbers = SimpleNamespace(growth="curve", max_gaussians=9_000)
+    config = RunConfig(growth="budget", max_gaussians=9_000)
+    numbers = SimpleNamespace(growth="budget", max_gaussians=9_000)
     state = SimpleNamespace(states={}, step=0, primitives=lambda _: present)
     for step in range(1, max(longer, 2_000) + 1):
         if step == turn + 1:
@@ -337,7 +339,7 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
 
 
 def test_a_resumed_run_knows_where_it_started(tmp_path):
-    setup = setup_of("adc", max_gaussians=75, growth="curve")
+    setup = setup_of("adc", max_gaussians=75, growth="budget")
     whole = counts_of(setup)
     state = first_state(setup)
     for _ in range(3):

@@ -172,7 +172,7 @@ def test_what_is_not_a_number_stays_visible():
 
 def setup_of(operator="sum", backbone="vanilla", **settings):
     options = {"sh_degree": 3} if backbone == "vanilla" else {}
-    times = {"densify_from": 8, "densify_every": 8, "densify_until": 20, "events": "steps"}
+    times = {"densify_from": 8, "densify_every": 8, "densify_until": 20, "schedule_unit": "steps"}
     given = {
         "steps": 24,
         "sampler": {"name": "random"},
@@ -308,7 +308,7 @@ def everything(state):
         ({"operator": "pcgrad", "views": 2, "backbone": "distance"}, ()),
         ({"operator": "graddrop", "views": 2}, ()),
         ({"recipe": {"name": "published"}}, ()),
-        ({"average": 0.5}, ()),
+        ({"weight_averaging": 0.5}, ()),
         ({}, (Decay,)),
         ({"views": 2}, (PerView,)),
         ({}, (Copies,)),
@@ -484,7 +484,7 @@ def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     keeper, kept = RollbackGuard(state), state.parameters["x"].clone()
     state.touched = True
     state.late._under_way["x"] = Failing(state.tensors["x"])
-    keeper.settle(state)
+    keeper.commit(state)
     # It is noticed when the tensor is wanted, and whenever it is wanted.
     for _ in range(2):
         with pytest.raises(LookupError):

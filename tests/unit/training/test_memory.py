@@ -80,7 +80,7 @@ def looked(monkeypatch, available=GIB, **settings):
         "room_for_primitives",
         lambda d, demand: demands.append(demand) or room_for(d, demand),
     )
-    times = {"densify_from": 1, "densify_until": 9, "densify_every": 2, "events": "steps"}
+    times = {"densify_from": 1, "densify_until": 9, "densify_every": 2, "schedule_unit": "steps"}
     given = {"steps": 9, **times, "sh_from": 3}
     setup = assemble(RunConfig.model_validate({**given, **settings}), sample_scene(), "none")
     look = Look()

@@ -16,7 +16,7 @@ from crossgrad_core.training.start import first_state
 
 #: Fewer perturbed runs than this miss the ends of their own spread.
 STEPS, RUNS = 30, 24
-TIMES = {"events": "steps", "densify_from": 10, "densify_every": 10, "densify_until": 25}
+TIMES = {"schedule_unit": "steps", "densify_from": 10, "densify_every": 10, "densify_until": 25}
 #: How a run steps -> how far apart in PSNR perturbed runs may end. A step by size is up to five
 #: times as long, and so is a difference of the last bit, one of sizes in a hurry twice; a first
 #: moment of few steps averages less.

@@ -103,7 +103,9 @@ def test_steps_that_edit_leave_all_in_order_and_together(backbone, monkeypatch):
 
 def test_a_run_is_in_order_after_each_of_its_edits():
     given = {"steps": 60, "densify_from": 5, "densify_every": 5, "densify_until": 50}
-    setup = assemble(RunConfig.model_validate({**given, "events": "steps"}), sample_scene(), "none")
+    setup = assemble(
+        RunConfig.model_validate({**given, "schedule_unit": "steps"}), sample_scene(), "none"
+    )
     state = first_state(setup)
     last, edits = len(state.parameters["means"]), 0
     for _ in range(60):

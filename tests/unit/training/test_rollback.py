@@ -24,7 +24,7 @@ STEPS, SAVE_EVERY, FAILS_IN = 20, 5, 13
 CONFIG = RunConfig.model_validate(
     {
         "steps": STEPS, "save_every": SAVE_EVERY, "eval_every": 6, "background": "random",
-        "densify_from": 3, "densify_until": 18, "densify_every": 3, "events": "steps",
+        "densify_from": 3, "densify_until": 18, "densify_every": 3, "schedule_unit": "steps",
         "densifier": {"name": "adc", "grad_threshold": 1e-6, "split_scale": 1e-3},
     }
 )  # fmt: skip

@@ -135,7 +135,7 @@ def test_a_step_bounds_sizes(backbone):
     """Adam's moments stay, and all that is not too long has the bits of a step without a bound."""
     found = {}
     for bound in (None, 0.0):
-        setup = setup_of(backbone, max_scale_ratio=bound, start={"name": "sfm"})
+        setup = setup_of(backbone, max_scale_ratio=bound, initializer={"name": "points"})
         state = first_state(setup)
         state.step = EVERY - 1
         # Behind all cameras that are in front of the scene, and long.

@@ -36,7 +36,7 @@ def decoded(setup, state):
 
 def test_it_begins_with_all_bands_of_the_file(trained):
     setup, state, path = trained
-    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": str(path)}})
+    config = RunConfig.model_validate({"steps": 1000, "data": {"init": str(path)}})
     again = assemble(config, sample_scene(), "none")
     ours, wanted = decoded(again, first_state(again)), decoded(setup, state)
     assert ours.sh_degree == wanted.sh_degree == again.backbone.sh_degree > 0
@@ -49,7 +49,7 @@ def test_it_begins_with_all_bands_of_the_file(trained):
 def test_file_and_degree_are_written_down(trained, monkeypatch):
     path = trained[2]
     monkeypatch.chdir(path.parent)
-    config = RunConfig.model_validate({"steps": 1000, "reading": {"init": path.name}})
+    config = RunConfig.model_validate({"steps": 1000, "data": {"init": path.name}})
     written = resolved(assemble(config, sample_scene(), "none"))
     assert (written.reading.init, written.sh_from) == (str(path.resolve()), 3)
 

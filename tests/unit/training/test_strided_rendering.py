@@ -126,7 +126,7 @@ def test_masks_are_taken_at_the_same_pixels():
     ],
 )
 def test_every_photo_keeps_enough_pixels(width, height, scale, expected):
-    resolution = build("resolutions", "interlaced", {})
+    resolution = build("resolutions", "strided", {})
     assert 1 / resolution.of_photo(posed_camera(width, height), scale) == pytest.approx(expected)
 
 
@@ -149,7 +149,7 @@ def scene_of(width, height):
 )  # fmt: skip
 def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
     scene, schedule = scene_of(width, height), Schedule.for_run(200)
-    resolution = build("resolutions", "interlaced", {}).fitted_to(scene)
+    resolution = build("resolutions", "strided", {}).fitted_to(scene)
     assert resolution.coarsest == coarsest
     state, found = PluginState(), []
     for step in range(1, 201):
@@ -176,13 +176,13 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
     [(100, 0.8), (3000, 0.8), (9487, 0.4), (29_999, 0.0), (30_000, 0.0), (40_000, 0.0)],
 )
 def test_longer_runs_have_all_pixels_sooner(steps, share):
-    resolution = build("resolutions", "interlaced", {"coarsest": 2})
+    resolution = build("resolutions", "strided", {"coarsest": 2})
     schedule = Schedule.for_run(steps)
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
     assert resolution.pixels(schedule, steps) == pytest.approx((1 - 0.75 * share) * steps, rel=1e-3)
     (remark,) = resolution.messages(schedule)
     assert ("all pixels from the start: the run is a long one" in remark) == (steps >= 30_000)
-    assert build("resolutions", "interlaced", {"until": 0.5}).window(schedule) == 0.5 * steps
+    assert build("resolutions", "strided", {"until": 0.5}).window(schedule) == 0.5 * steps
 
 
 def test_a_run_as_long_as_the_published_ones_has_all_pixels_from_its_first_step():
@@ -191,23 +191,23 @@ def test_a_run_as_long_as_the_published_ones_has_all_pixels_from_its_first_step(
 
 
 USUAL = {
-    "a short run": ({}, "interlaced"),
-    "views": ({"steps": None, "max_views": 2000}, "interlaced"),
-    "seconds": ({"steps": None, "seconds": 60}, "interlaced"),
+    "a short run": ({}, "strided"),
+    "views": ({"steps": None, "max_views": 2000}, "strided"),
+    "seconds": ({"steps": None, "seconds": 60}, "strided"),
     "as long as published": ({"steps": 30_000}, "full"),
     "no length": ({"steps": None}, "full"),
     "views as many": ({"steps": None, "max_views": 30_000}, "full"),
     "the recipe": ({"recipe": {"name": "published"}}, "full"),
     "absolute": ({"schedule": "absolute"}, "full"),
-    "of another length": ({"schedule": "absolute", "reference": 2000}, "interlaced"),
-    "free growth": ({"growth": "free"}, "full"),
+    "of another length": ({"schedule": "absolute", "schedule_length": 2000}, "strided"),
+    "free growth": ({"growth": "unbounded"}, "full"),
     "a bound": ({"max_gaussians": 500}, "full"),
-    "no growth": ({"densifier": {"name": "none"}}, "interlaced"),
+    "no growth": ({"densifier": {"name": "none"}}, "strided"),
     "anchors": ({"backbone": {"name": "scaffold"}}, "full"),
     "a filter": ({"backbone": {"name": "mip"}}, "full"),
     "means over pixels": ({"backbone": {"name": "analytic"}}, "full"),
     "named": ({"resolution": {"name": "octaves"}}, "octaves"),
-    "the processor by number": ({"device": "cpu:0"}, "interlaced"),
+    "the processor by number": ({"device": "cpu:0"}, "strided"),
 }
 
 
@@ -224,13 +224,13 @@ def test_an_n_that_is_named_is_that_of_photos_that_are_large_enough(asked, coars
     scene = scene_of(400, 298)
     large = replace(scene.views[0], camera=scene.views[0].camera.resized(1600, 1200))
     scene = replace(scene, views=(large, *scene.views[1:]), train=(0, 1, 2))
-    resolution = build("resolutions", "interlaced", {"coarsest": asked}).fitted_to(scene)
+    resolution = build("resolutions", "strided", {"coarsest": asked}).fitted_to(scene)
     assert resolution.coarsest == coarsest
     assert resolution.fitted_to(scene).coarsest == coarsest
 
 
 def test_a_run_without_a_stage_says_that_a_share_of_zero_was_asked_for():
-    resolution = build("resolutions", "interlaced", {"coarsest": 2, "until": 0.0})
+    resolution = build("resolutions", "strided", {"coarsest": 2, "until": 0.0})
     assert "this share of the run is 0" in resolution.messages(Schedule.for_run(100))[0]
 
 
@@ -238,12 +238,12 @@ def test_a_rasterizer_with_one_dilation_is_refused():
     gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
     selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
     told = gswarp.crossgrad_validate_selection(selection)
-    assert any("resolution interlaced by less" in each for each in told)
+    assert any("resolution strided by less" in each for each in told)
 
 
 def assembled(**settings):
     given = {
-        "resolution": {"name": "interlaced", "smallest": 4, "least": 16, "coarsest": 2},
+        "resolution": {"name": "strided", "smallest": 4, "least": 16, "coarsest": 2},
         "steps": 20,
         **settings,
     }

@@ -16,7 +16,7 @@ from crossgrad_plugins.authoring.matrix.combinations import NEEDED
 
 STEPS = 60
 #: Density control edits in steps 20 and 40.
-TIMES = {"events": "steps", "densify_from": 10, "densify_every": 20, "densify_until": 59}
+TIMES = {"schedule_unit": "steps", "densify_from": 10, "densify_every": 20, "densify_until": 59}
 #: What density control counts where it edits.
 EDITS = ("cloned", "split", "pruned", "grown", "added", "relocated")
 #: Every backbone and every densifier, at least once.
@@ -52,7 +52,7 @@ def setup_of(backbone, densifier, operator, views, rasterizer="numba", way=None)
     config |= {"operator": {"name": operator}, "sampler": {"name": "random"}, "views": views}
     config |= {
         "steps": STEPS,
-        "start": {"name": "sfm"},
+        "initializer": {"name": "points"},
         "rasterizer": {"name": rasterizer},
         "position_lr": way,
         **TIMES,

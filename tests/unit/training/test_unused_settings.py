@@ -77,7 +77,7 @@ IDLE = [
     ({"grouping": {"name": "radial"}, "sampler": {"name": "random-split"}}, "grouping"),
     ({"densifier": {"name": "none"}, "densify_every": 10}, "densify_every"),
     ({"densifier": {"name": "none"}, "max_gaussians": "auto"}, "max_gaussians"),
-    ({"densifier": {"name": "none"}, "growth": "curve"}, "growth"),
+    ({"densifier": {"name": "none"}, "growth": "budget"}, "growth"),
     ({"densifier": {"name": "none"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "adc", "prune_scale": 0.3}}, "densifier.prune_scale"),
@@ -122,13 +122,13 @@ IDLE = [
         {"backbone": {"name": "mip"}, "rasterizer": {"name": "torch", "dilation": 0.1}},
         "rasterizer.dilation",
     ),
-    ({"reading": {"split": "none", "test_every": 4}}, "reading.test_every"),
+    ({"data": {"split": "none", "test_every": 4}}, "data.test_every"),
     ({"clock": "cpu"}, "clock"),
     ({"stop_after": 11}, "stop_after"),
-    ({"min_refinements": 6, "events": "steps"}, "min_refinements"),
+    ({"min_refinements": 6, "schedule_unit": "steps"}, "min_refinements"),
     ({"min_refinements": 6, "densify_until": 600}, "min_refinements"),
     ({"min_refinements": 6, "densify_from": 0, "densify_every": 9}, "min_refinements"),
-    ({"min_refinements": 6, "schedule": "absolute", "events": "views"}, "min_refinements"),
+    ({"min_refinements": 6, "schedule": "absolute", "schedule_unit": "views"}, "min_refinements"),
     ({"lr_tail_factor": 0.5, "lr_tail": 0.0}, "lr_tail_factor"),
     ({"lr_tail_factor": 0.5, "recipe": {"name": "published"}}, "lr_tail_factor"),
     (
@@ -157,11 +157,11 @@ AT_WORK = [
     {"densifier": {"name": "adc", "prune_scale": 0.3}, "reset_every": 10},
     {"backbone": {"name": "vanilla", "sh_degree": 1}, "sh_every": 2},
     {"backbone": {"name": "scaffold"}, "sh_every": 1},
-    {"max_gaussians": "auto", "growth": "curve"},
-    {"densifier": {"name": "adc"}, "growth": "curve"},
+    {"max_gaussians": "auto", "growth": "budget"},
+    {"densifier": {"name": "adc"}, "growth": "budget"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
     {"min_refinements": 6},
-    {"min_refinements": 6, "schedule": "absolute", "reference": 600},
+    {"min_refinements": 6, "schedule": "absolute", "schedule_length": 600},
     {"seconds": 9.0, "clock": "cpu"},
     {"stop_after": 10},
     {"steps": None, "seconds": 9.0, "stop_after": 40_000},
@@ -175,7 +175,7 @@ AT_WORK = [
 
 
 def refusal(settings):
-    config = RunConfig.model_validate({"steps": 10, "reading": {"init": "random"}, **settings})
+    config = RunConfig.model_validate({"steps": 10, "data": {"init": "random"}, **settings})
     setup = assemble(config, sample_scene(), "none")
     refuse_settings_for_nothing(config, setup)
     return setup
@@ -203,7 +203,7 @@ def test_settings_that_do_something_are_not(settings):
 def test_gaussians_of_a_file_are_not_bounded(tmp_path):
     setup = assemble(RunConfig(steps=4), sample_scene(), "none")
     export_scene(setup, first_state(setup), tmp_path / "start.ply")
-    settings = {"reading": {"init": str(tmp_path / "start.ply")}, "max_gaussians": 10}
+    settings = {"data": {"init": str(tmp_path / "start.ply")}, "max_gaussians": 10}
     refusal(settings)
     with pytest.raises(UserError) as caught:
         refusal({**settings, "densifier": {"name": "none"}})
@@ -224,8 +224,8 @@ def test_listed_splits_leave_test_every_nothing_to_do(tmp_path):
     (scene / "test_list.txt").write_text(names[0])
     settings = {"scene": str(scene), "steps": 10, "out": str(tmp_path / "run")}
     with pytest.raises(UserError, match=r"test_list\.txt decide"):
-        run({**settings, "reading": {"test_every": 4}}, dry_run=True)
-    assert run({**settings, "reading": {"test_every": 4, "split": "every"}}, dry_run=True) == 0
+        run({**settings, "data": {"test_every": 4}}, dry_run=True)
+    assert run({**settings, "data": {"test_every": 4, "split": "every"}}, dry_run=True) == 0
 
 
 LABELS = [

@@ -13,9 +13,9 @@ from crossgrad_core.contract.blocks import Block, LearningRate
 from crossgrad_core.contract.contexts import DensifyResult, RegularizeResult, ViewSample
 from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting, _kinds
+from crossgrad_core.contract.initializer import MorePoints
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.objections import objections_to
-from crossgrad_core.contract.start import MorePoints
 from crossgrad_core.contract.state import TAKEN, PluginState
 from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.errors import UserError
@@ -32,7 +32,7 @@ from crossgrad_core.training.step import take_step
 
 def setup_of(replaced=None, **observers):
     """A run on the sample scene with components by slot, and plugins, in the place of others."""
-    config = RunConfig.model_validate({"steps": 10, "start": {"name": "sfm"}})
+    config = RunConfig.model_validate({"steps": 10, "initializer": {"name": "points"}})
     setup = assemble(config, sample_scene(), "none")
     selection = replace(setup.selection, **(replaced or {}))
     plugins = {**setup.plugins, **selection.components, **observers}
@@ -117,7 +117,9 @@ def test_what_a_backbone_prepares_it_need_not_create():
 
 @pytest.mark.parametrize("answer", [3, ()])
 def test_what_a_start_adds_are_points(answer):
-    error = refused(setup_of({"start": of_slot("starts", "sfm", "more_points", answer)}))
+    error = refused(
+        setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
+    )
     assert "Wrong.more_points gave a wrong answer" in error.what
     assert error.expected == "MorePoints"
 
@@ -442,23 +444,25 @@ def more_points(**changed):
     ],
 )
 def test_what_a_start_adds_can_be_points(changed, found):
-    start = of_slot("starts", "sfm", "more_points", more_points(**changed))
-    error = refused(setup_of({"start": start}))
+    start = of_slot("initializers", "points", "more_points", more_points(**changed))
+    error = refused(setup_of({"initializer": start}))
     assert error.what == "start sfm adds what cannot be points"
     assert "Wrong.more_points" in error.where
     assert found in error.found
 
 
 def test_good_points_of_a_start_are_taken_and_its_own_errors_come_through():
-    setup = setup_of({"start": of_slot("starts", "sfm", "more_points", more_points())})
+    setup = setup_of(
+        {"initializer": of_slot("initializers", "points", "more_points", more_points())}
+    )
     assert first_state(setup).primitives(setup) == 42
 
-    class Failing(type(build("starts", "sfm", {}))):
+    class Failing(type(build("initializers", "points", {}))):
         def more_points(self, scene):
             raise ValueError("no luck")
 
     with pytest.raises(ValueError, match="no luck"):
-        first_state(setup_of({"start": Failing()}))
+        first_state(setup_of({"initializer": Failing()}))
 
 
 @pytest.mark.parametrize("form", ["d", "%.2f"])

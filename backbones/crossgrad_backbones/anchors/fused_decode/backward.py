@@ -13,7 +13,7 @@ from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept, Layer
 from crossgrad_backbones.anchors.fused_decode.forward import STRETCH, array, stretches
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
 from crossgrad_backbones.anchors.panels import product
-from crossgrad_core.numerics.jobs import share
+from crossgrad_core.numerics.jobs import parallel
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
 
@@ -67,7 +67,7 @@ class _Back:
             self.raw[count:rows] = 0.0
             hidden = self.hidden[:rows]
             self._second(inputs, kept.hidden[part, mine], self.raw[:rows], hidden)
-            share(layers.rectify_back, part.start, rows, begin, whole, buffer)
+            parallel(layers.rectify_back, part.start, rows, begin, whole, buffer)
             self.first[0][mine] += product(hidden, kept.joined[part])
             self.first[1][mine] += hidden.sum(0)
             owners = inputs.view.feature_rows[part]
@@ -129,7 +129,7 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
 
 
 def _call(kernel: Callable[..., None], arrays: tuple[Any, ...], first: int, count: int) -> None:
-    share(kernel, first, count, *arrays)
+    parallel(kernel, first, count, *arrays)
 
 
 def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:

@@ -11,7 +11,7 @@ from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept
 from crossgrad_backbones.anchors.numba_kernels import activation, layers
 from crossgrad_backbones.anchors.panels import PANEL
 from crossgrad_core.numerics.elementwise import sigmoid_
-from crossgrad_core.numerics.jobs import share
+from crossgrad_core.numerics.jobs import parallel
 
 #: Anchors of a stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
 STRETCH = 2048
@@ -66,7 +66,7 @@ def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
     features, rows, views = map(
         array, (inputs.features, inputs.view.feature_rows, inputs.view.views)
     )
-    share(layers.join, features, rows, views, array(joined))
+    parallel(layers.join, features, rows, views, array(joined))
     return joined, torch.addmm(bias, joined, weight.T).relu_()
 
 
@@ -77,4 +77,4 @@ def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> N
     for part in stretches(len(inputs.view.rows)):
         covariances = torch.addmm(cov_bias, hidden[part, width : 2 * width], cov.T)
         colors = torch.addmm(color_bias, hidden[part, 2 * width :], color.T)
-        share(activation.gather, part.start, array(covariances), array(colors), *arrays)
+        parallel(activation.gather, part.start, array(covariances), array(colors), *arrays)

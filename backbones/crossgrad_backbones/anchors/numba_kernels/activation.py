@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crossgrad_backbones.anchors.heads import COVARIANCE
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
@@ -81,7 +81,7 @@ def gather(
     """
     anchors, slots = len(covariances), opacities.shape[1]
     parts = (anchors + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
@@ -98,7 +98,7 @@ def gather(
                     for c in range(4):
                         out_quats[g, c] = covariances[n, COVARIANCE * j + 3 + c]
                     g += 1
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)
 
 
 @kernel
@@ -151,7 +151,7 @@ def scatter(
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
     parts = (anchors + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
@@ -173,7 +173,7 @@ def scatter(
                     raw[n, rgb + c] = v_colors[g, c] * color * (_ONE - color)
                 for c in range(4):
                     raw[n, cov + 3 + c] = v_quats[g, c]
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)
 
 
 @kernel
@@ -192,7 +192,7 @@ def scatter_scales(
 ) -> None:
     """As `scatter` where only the scales have a gradient; `raw` [n, 7 k] is by covariances."""
     parts = (anchors + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             a = first + n
@@ -204,4 +204,4 @@ def scatter_scales(
                     by_log = v_scales[g, c] * shares[g, c] * spreads[a, 3 + c]
                     out_log_scales[p, 3 + c] += by_log
                     raw[n, cov + c] = by_log * (_ONE - shares[g, c])
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)

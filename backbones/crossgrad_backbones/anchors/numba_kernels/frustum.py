@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 #: Anchors that one thread takes at a time.
 SHARE = 4096
@@ -40,7 +40,7 @@ def in_frustum(
     """
     count = len(positions)
     parts = (count + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for p in range(part * SHARE, min(count, (part + 1) * SHARE)):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
@@ -65,4 +65,4 @@ def in_frustum(
                 extent = reach * math.sqrt(variance * ratio * ratio + dilation)
                 passes = place + extent >= axes[k, 4] and place - extent <= axes[k, 5]
             inside[p] = passes
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)

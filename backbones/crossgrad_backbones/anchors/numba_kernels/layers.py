@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
@@ -22,7 +22,7 @@ def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Float
     """Writes [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
     parts = (anchors + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for a in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             row = rows[a]
@@ -30,7 +30,7 @@ def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Float
                 out[a, c] = features[row, c]
             for c in range(view):
                 out[a, feature + c] = views[a, c]
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)
 
 
 @kernel
@@ -49,11 +49,11 @@ def rectify_back(
     """
     width = gradient.shape[1]
     parts = (anchors + SHARE - 1) // SHARE
-    part = take(jobs, parts)
+    part = next_job(jobs, parts)
     while part < parts:
         for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
             mine = gradient[n]
             theirs = hidden[first + n, column : column + width]
             for c in range(width):
                 mine[c] = mine[c] if theirs[c] > _ZERO else _ZERO
-        part = take(jobs, parts)
+        part = next_job(jobs, parts)

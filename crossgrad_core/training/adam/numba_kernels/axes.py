@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import device, kernel
-from crossgrad_core.numerics.jobs import Jobs, alone, share, take
+from crossgrad_core.numerics.jobs import Jobs, next_job, parallel, serial
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -65,7 +65,7 @@ def _move_chunks(
     factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)
     chunks = (rows + _ROWS - 1) // _ROWS
-    job = take(jobs, chunks)
+    job = next_job(jobs, chunks)
     while job < chunks:
         first, end = job * _ROWS, min(rows, (job + 1) * _ROWS)
         whole = first + (end - first) // LANES * LANES
@@ -83,7 +83,7 @@ def _move_chunks(
             x, y, z = load_triples(place, 0)
             store_triples(place, 0, x + moved[0], y + moved[1], z + moved[2])
             positions[whole:end] = place[:left]
-        job = take(jobs, chunks)
+        job = next_job(jobs, chunks)
 
 
 def move_rows(positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats) -> None:
@@ -95,5 +95,5 @@ def move_rows(positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floa
         factors: By axis.
         quats: [N, 4] rotations, wxyz of any length.
     """
-    run = alone if len(positions) <= _ROWS else share
+    run = serial if len(positions) <= _ROWS else parallel
     run(_move_chunks, positions, steps, factors, quats)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
-from crossgrad_core.numerics.jobs import Jobs, alone, share, take
+from crossgrad_core.numerics.jobs import Jobs, next_job, parallel, serial
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
@@ -78,7 +78,7 @@ def _update_chunks(
     chunks = 0
     for size in sizes:
         chunks += (size + _CHUNK - 1) // _CHUNK
-    job = take(jobs, chunks)
+    job = next_job(jobs, chunks)
     while job < chunks:
         tensor, chunk = 0, job
         while chunk * _CHUNK >= sizes[tensor]:
@@ -97,7 +97,7 @@ def _update_chunks(
                 param[a:b] = _ZERO
             if moves(grad[a:b], exp_avg[a:b], exp_avg_sq[a:b]):
                 update(param[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], of_step)
-        job = take(jobs, chunks)
+        job = next_job(jobs, chunks)
 
 
 def numbers_of(step: Coefficients) -> Numbers:
@@ -129,7 +129,7 @@ def update_at(
     """
     numbers = np.array([numbers_of(step) for step in steps], np.float32).reshape(-1, 9)
     # No more elements than a chunk has are not worth waking other threads for.
-    run = alone if sum(sizes) <= _CHUNK else share
+    run = serial if sum(sizes) <= _CHUNK else parallel
     where = np.array(addresses, np.int64).reshape(-1, 4)
     from_zero = np.array([step.from_zero for step in steps], np.bool_)
     run(_update_chunks, where, np.array(sizes, np.int64), numbers, from_zero)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import device, kernel
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
@@ -148,7 +148,7 @@ def catch_up(
     # What is left over of a row is worked on here, the rest of the eight being zero.
     rest = np.zeros(3 * LANES, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
-    task = take(jobs, tasks)
+    task = next_job(jobs, tasks)
     while task < tasks:
         for place in range(task * _ROWS, min(count, (task + 1) * _ROWS)):
             ahead = place + _AHEAD
@@ -181,7 +181,7 @@ def catch_up(
                     exp_avg[at + c] = rest[LANES + c]
                     exp_avg_sq[at + c] = rest[2 * LANES + c]
             done[i] = before + end
-        task = take(jobs, tasks)
+        task = next_job(jobs, tasks)
 
 
 @device
@@ -269,7 +269,7 @@ def update_rows(
     room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
     ps, ms, vs = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     tasks = (rows.size + _ROWS - 1) // _ROWS
-    task = take(jobs, tasks)
+    task = next_job(jobs, tasks)
     while task < tasks:
         last = min(rows.size, (task + 1) * _ROWS)
         for first in range(task * _ROWS, last, together):
@@ -297,7 +297,7 @@ def update_rows(
                 for i in range(width):
                     param[at + i], exp_avg[at + i] = ps[to + i], ms[to + i]
                     exp_avg_sq[at + i] = vs[to + i]
-        task = take(jobs, tasks)
+        task = next_job(jobs, tasks)
 
 
 @kernel
@@ -326,7 +326,7 @@ def update_all(
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
     pulls = np.zeros(together * width, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
-    task = take(jobs, tasks)
+    task = next_job(jobs, tasks)
     while task < tasks:
         end = min(count, (task + 1) * _ROWS)
         place = np.searchsorted(rows, task * _ROWS)
@@ -354,4 +354,4 @@ def update_all(
                 own = begin < place and rows[begin] == row
                 _step_row(row, width, own, begin, param, grad, exp_avg, exp_avg_sq, numbers)
                 begin += own
-        task = take(jobs, tasks)
+        task = next_job(jobs, tasks)

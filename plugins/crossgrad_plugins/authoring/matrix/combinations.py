@@ -23,7 +23,7 @@ from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
 from crossgrad_plugins.authoring.matrix.pairwise import Row
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
-FURTHER: Final = ("loss", "exposure", "start", "resolution", "grouping", "observer")
+FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
 #: Options without which a component has nothing to do in so few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
@@ -38,7 +38,7 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
 #: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
-_TIMES: Final = {"events": "steps", "reset_every": 4, **_WINDOW}
+_TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
 
 #: Row -> reasons; rows that work are not there.
 Refused: TypeAlias = Mapping[Row, Collection[str]]
@@ -100,7 +100,7 @@ def config_of(row: Row, slots: Sequence[str] = SLOTS) -> RunConfig:
         "steps": 100,
         "views": _several_views(choices["sampler"], choices["operator"]),
         "metrics": [{"name": "psnr"}],
-        "start": {"name": "sfm"},
+        "initializer": {"name": "points"},
         "device": device_of(choices["rasterizer"].name),
     }
     for slot, choice in choices.items():

@@ -13,7 +13,7 @@ final transmittance; the accumulated depth is one more colour channel.
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
@@ -476,7 +476,7 @@ def differentiate(
         written: [slots] 1 written for these; zero before.
     """
     tiles = starts.shape[0] - 1
-    tile = take(jobs, tiles)
+    tile = next_job(jobs, tiles)
     while tile < tiles:
         _backward(
             tile,
@@ -496,4 +496,4 @@ def differentiate(
             partials,
             written,
         )
-        tile = take(jobs, tiles)
+        tile = next_job(jobs, tiles)

@@ -7,7 +7,7 @@ consecutive slots; the tile lists are then filled in the order of depth.
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     LANES,
     Lanes,
@@ -253,12 +253,12 @@ def find_tiles(
     ellipses = np.zeros(6 * _GROUP, np.float32)
     begins = np.empty(_GROUP * LANES, np.float32)
     ends = np.empty(_GROUP * LANES, np.float32)
-    job = take(jobs, PARTS + 1)
+    job = next_job(jobs, PARTS + 1)
     while job <= PARTS:
         # To sort is one job, the longest one.
         if job == 0:
             order[:] = order_by_depth(depths, order)
-            job = take(jobs, PARTS + 1)
+            job = next_job(jobs, PARTS + 1)
             continue
         part = job - 1
         for chunk in range(part * chunks // PARTS, (part + 1) * chunks // PARTS):
@@ -287,7 +287,7 @@ def find_tiles(
                     )
                     shelves[j, FIRST_ROW] = boxes[j, 2]
                     shelves[j, LAST_ROW] = boxes[j, 3] - 1
-        job = take(jobs, PARTS + 1)
+        job = next_job(jobs, PARTS + 1)
 
 
 @kernel
@@ -343,7 +343,7 @@ def fill_tiles(
     """
     count = order.shape[0]
     last = bands.shape[0] - 1
-    band = take(jobs, last)
+    band = next_job(jobs, last)
     while band < last:
         first_tile, end_tile = bands[band] * tile_columns, bands[band + 1] * tile_columns
         positions = starts[first_tile:end_tile].copy()
@@ -362,4 +362,4 @@ def fill_tiles(
                     positions[tile - first_tile] = entry + 1
                     entries[entry, 0] = j
                     entries[entry, 1] = slot
-        band = take(jobs, last)
+        band = next_job(jobs, last)

@@ -8,7 +8,7 @@ the same operations as `backward`, hence with the same gradients, and sums per e
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
@@ -226,7 +226,7 @@ def bin_directions(
     places = np.empty(LANES, np.float32)
     binned = np.empty(SUMS * LANES, np.float32)
     tiles = starts.shape[0] - 1
-    tile = take(jobs, tiles)
+    tile = next_job(jobs, tiles)
     while tile < tiles:
         top = (tile // columns) * TILE_HEIGHT
         left = (tile % columns) * TILE_WIDTH
@@ -261,4 +261,4 @@ def bin_directions(
                 found,
                 np.intp(entries[entry, 1]) * SUMS,
             )
-        tile = take(jobs, tiles)
+        tile = next_job(jobs, tiles)

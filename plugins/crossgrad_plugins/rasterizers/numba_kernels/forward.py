@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     LANES,
     WIDE,
@@ -411,7 +411,7 @@ def composite(
         masks: [E] patches per entry, written; zero before.
     """
     tiles = starts.shape[0] - 1
-    tile = take(jobs, tiles)
+    tile = next_job(jobs, tiles)
     while tile < tiles:
         _composite(
             tile,
@@ -428,4 +428,4 @@ def composite(
             limits,
             masks,
         )
-        tile = take(jobs, tiles)
+        tile = next_job(jobs, tiles)

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import share
+from crossgrad_core.numerics.jobs import parallel
 from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     CameraArrays,
     DrawOptions,
@@ -65,7 +65,7 @@ def forward(
     depth = np.empty(shape, np.float32) if options.depth else None
     counts = np.zeros(lists.slots, np.int32) if options.pixels else None
     masks = np.zeros(lists.entries.shape[0], np.uint64)
-    share(
+    parallel(
         composite,
         lists.starts,
         lists.entries,
@@ -114,7 +114,7 @@ def backward(
     partials = in_lines((lists.slots + 1) * PARTIAL)
     partials[-PARTIAL:] = 0.0
     written = np.zeros(lists.slots, np.uint8)
-    share(
+    parallel(
         differentiate,
         lists.starts,
         lists.entries,
@@ -146,7 +146,7 @@ def backward(
         absolute=np.empty((count, 2), np.float32) if absolute else None,
         directions=_directions(frame, v_image, v_alpha, v_depth, written) if directions else None,
     )
-    share(
+    parallel(
         project_backward,
         projected.camera,
         _dilation(options),
@@ -172,7 +172,7 @@ def backward(
     )
     if gradients.dc is not None and gaussians.rest is not None:
         nothing = np.empty((0, *gaussians.rest.shape[1:]), np.float32)
-        share(
+        parallel(
             sh_backward,
             gaussians.degree,
             projected.camera.eye,
@@ -211,7 +211,7 @@ def _directions(
     gaussians, projected, lists = frame.gaussians, frame.projected, frame.lists
     analytic = _analytic(frame.options)
     axes = np.empty(2 * gaussians.means.shape[0], np.float32)
-    share(
+    parallel(
         longest_axes,
         projected.camera,
         gaussians.means,
@@ -222,7 +222,7 @@ def _directions(
         axes,
     )
     found = np.empty(lists.slots * SUMS, np.float32)
-    share(
+    parallel(
         bin_directions,
         lists.starts,
         lists.entries,
@@ -240,7 +240,7 @@ def _directions(
         found,
     )
     directions = np.zeros((gaussians.means.shape[0], BINS, FIELDS), np.float32)
-    share(
+    parallel(
         add_directions,
         analytic is not None,
         projected.drawn,
@@ -270,7 +270,7 @@ def marked_pixels(
         marked: [H, W], not 0 where a pixel is marked.
     """
     counts = np.zeros(lists.slots, np.int32)
-    share(
+    parallel(
         count_marked,
         lists.starts,
         lists.entries,
@@ -287,7 +287,7 @@ def marked_pixels(
 def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
     """Sums of the counts [slots] by Gaussian, [N]."""
     pixels = np.zeros_like(projected.radii)
-    share(count_pixels, projected.drawn, projected.owners, lists.shelves, counts, pixels)
+    parallel(count_pixels, projected.drawn, projected.owners, lists.shelves, counts, pixels)
     return pixels
 
 
@@ -317,7 +317,7 @@ def _project(
     shelves = np.empty((count, SHELF), np.int32)
     depths = np.empty(count, np.float64)
     room = np.empty(chunks, np.int64)
-    share(
+    parallel(
         project,
         projected.camera,
         options.near,
@@ -343,7 +343,7 @@ def _project(
         projected = replace(projected, rows=listed(projected.drawn, projected.owners))
         gaussians.bring(projected.rows)
     if gaussians.dc is not None and gaussians.rest is not None:
-        share(
+        parallel(
             sh_forward,
             gaussians.degree,
             projected.camera.eye,
@@ -375,7 +375,7 @@ def _bin(
     order, keys, slots = collect(projected.drawn, room, depths, shelves)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
-    share(
+    parallel(
         find_tiles,
         columns,
         projected.records,
@@ -391,5 +391,5 @@ def _bin(
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
     entries = np.empty((int(starts[-1]), 2), np.int32)
-    share(fill_tiles, order, columns, bands, shelves, tile_of_slot, starts, entries)
+    parallel(fill_tiles, order, columns, bands, shelves, tile_of_slot, starts, entries)
     return TileLists(starts, entries, shelves, slots)

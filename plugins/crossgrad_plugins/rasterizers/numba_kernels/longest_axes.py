@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.directions import BINS, FIELDS, SUMS
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
@@ -81,12 +81,12 @@ def longest_axes(
             deviation long, in pixels; 0 where it is seen end on.
     """
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             i = np.intp(owners[j])
             axes[2 * j], axes[2 * j + 1] = _axis(camera, means[i], quats[i], scales[i])
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)
 
 
 @kernel
@@ -115,7 +115,7 @@ def add_directions(
     unit = 1.0 if analytic else _PLAIN_UNIT
     total = np.empty(SUMS, np.float32)
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             total[:] = np.float32(0.0)
@@ -129,4 +129,4 @@ def add_directions(
                 for field in range(FIELDS):
                     value = np.float64(total[number * FIELDS + field])
                     directions[i, number, field] = value * unit if field in (2, 3) else value
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)

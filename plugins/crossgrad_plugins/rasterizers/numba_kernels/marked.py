@@ -8,7 +8,7 @@ patches that hold a marked pixel. The operations are those of `forward`, and so 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import (
     WIDE,
     aligned,
@@ -158,7 +158,7 @@ def count_marked(
     state = aligned(PATCHES * WIDE)
     rows = np.empty(ROWS, np.float32)
     tiles = starts.shape[0] - 1
-    tile = take(jobs, tiles)
+    tile = next_job(jobs, tiles)
     while tile < tiles:
         top, left = (tile // columns) * TILE_HEIGHT, (tile % columns) * TILE_WIDTH
         live = _start(state, marked, top, left)
@@ -176,4 +176,4 @@ def count_marked(
                     reached, records, record, rows, state, constants, analytic
                 )
             entry += 1
-        tile = take(jobs, tiles)
+        tile = next_job(jobs, tiles)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import BLOCK, get, put
@@ -322,7 +322,7 @@ def project(
     chosen = np.empty(BLOCK, np.int64)
     picked = np.empty(11 * BLOCK, np.float32)
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         first = chunk * CHUNK
         end = first
@@ -371,4 +371,4 @@ def project(
             )
         drawn[chunk] = end - first
         room[chunk] = _give_slots(first, end, boxes, shelves)
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)

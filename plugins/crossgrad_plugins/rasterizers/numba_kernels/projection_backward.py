@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_plugins.rasterizers.numba_kernels.analytic import main_axes
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import (
@@ -312,7 +312,7 @@ def project_backward(
     numbers = np.empty(BLOCK, np.int64)
     chunks = drawn.shape[0]
     nothing = np.float32(0.0)
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         j = chunk * CHUNK
         end = j + drawn[chunk]
@@ -351,4 +351,4 @@ def project_backward(
                 v_centres,
                 v_absolute,
             )
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import LANES, load, prefetch, splat, store
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
@@ -59,7 +59,7 @@ def count_pixels(
         pixels: [N] written for the Gaussians drawn; zero before.
     """
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             first = np.intp(shelves[j, FIRST_SLOT])
@@ -67,4 +67,4 @@ def count_pixels(
             for slot in range(first, first + shelves[j, SLOTS]):
                 total += counts[slot]
             pixels[owners[j]] = total
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)

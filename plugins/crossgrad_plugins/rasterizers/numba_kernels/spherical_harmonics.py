@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jobs import Jobs, take
+from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_core.numerics.simd import WIDE, aligned, prefetch
 from crossgrad_plugins.rasterizers.numba_kernels.basis import (
     BASIS,
@@ -101,7 +101,7 @@ def sh_forward(
     bases, colours = aligned(TABLE), aligned(TABLE)
     table[:] = np.float32(0.0)
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         end = chunk * CHUNK + drawn[chunk]
         for first in range(chunk * CHUNK, end, _BLOCK):
@@ -127,7 +127,7 @@ def sh_forward(
                         records[j * RECORD + LOG_OPACITY] = -math.inf
                         radii[i] = 0
                     records[j * RECORD + RED + channel] = max(colour, 0.0)
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)
 
 
 @kernel
@@ -171,7 +171,7 @@ def sh_backward(
     bases, v_rgb, v_bases = aligned(TABLE), aligned(TABLE), aligned(TABLE)
     table[:] = v_rgb[:] = v_bases[:] = np.float32(0.0)
     chunks = drawn.shape[0]
-    chunk = take(jobs, chunks)
+    chunk = next_job(jobs, chunks)
     while chunk < chunks:
         before = drawn[:chunk].sum() - chunk * CHUNK
         end = chunk * CHUNK + drawn[chunk]
@@ -214,4 +214,4 @@ def sh_backward(
                 i = np.intp(owners[j])
                 for axis in range(3):
                     v_means[i, axis] += ways[j - first + axis * WIDE]
-        chunk = take(jobs, chunks)
+        chunk = next_job(jobs, chunks)

@@ -78,7 +78,7 @@ PATH = Target(
     seeds=_paths,
     parse=_parse_path,
     parser={
-        camera_path: ("flight", "ladder", "_distance", "_ends", "_way", "_between", "_unit"),
+        camera_path: ("flight", "zoom", "_distance", "_ends", "_way", "_between", "_unit"),
     },
     words=_WORDS,
     mutators=_FORMAT,

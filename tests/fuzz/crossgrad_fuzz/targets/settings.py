@@ -45,7 +45,7 @@ _MANY = b"operator.c=0.4\noperator.name=cagrad\nviews=2\nseed=7\nobservers=progr
 def _seeds() -> Sequence[Case]:
     resolved = _written(RunConfig(steps=5, seed=3)).encode()
     return [
-        {_FILE: _USER, _SETS: b"reading.max_size=320\n"},
+        {_FILE: _USER, _SETS: b"data.max_size=320\n"},
         {_FILE: _CHAIN, _SETS: b"operator.cagrad.c=0.3\nobservers.diagnostics.every=5"},
         {_FILE: _ALIASES, _SETS: b"reading=null\n"},
         {_FILE: b"", _SETS: _MANY},
@@ -146,8 +146,8 @@ _WORDS = (
     *(b"!!set ", b"!!omap ", b"!!binary ", b"!!timestamp ", b"!!null ", b"? ", b"- ", b": "),
     *(b"---\n", b"...\n", b"%YAML 1.2\n", b"%TAG ! tag:x,2000:\n", b"|\n", b">\n", b'"\\0"'),
     *(b'"\\UFFFFFFFF"', b'"\\uD800"', b".nan", b".inf", b"-.inf", b"~", b"null", b"true", b"no"),
-    *(b"[", b"]", b"{", b"}", b"steps: ", b"operator: ", b"observers: ", b"reading: ", b"name: "),
-    *(b"operator.c=", b"reading.split=every", b"observers=", b"observers.progress.level=", b"."),
+    *(b"[", b"]", b"{", b"}", b"steps: ", b"operator: ", b"observers: ", b"data: ", b"name: "),
+    *(b"operator.c=", b"data.split=every", b"observers=", b"observers.progress.level=", b"."),
     *(b"seconds: ", b"revisions: ", b"background: white", b"grouping: lists", b"cagrad", b"mean"),
 )
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel, part
-from crossgrad_core.numerics.jobs import Jobs, share, take
+from crossgrad_core.numerics.jobs import Jobs, next_job, parallel
 from crossgrad_core.numerics.simd import aligned
 from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     BACK,
@@ -108,7 +108,7 @@ def _all_tiles(
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
     tiles = down * across
-    tile = take(jobs, tiles)
+    tile = next_job(jobs, tiles)
     if tile >= tiles:
         return
     scratch = aligned(SCRATCH)
@@ -123,7 +123,7 @@ def _all_tiles(
             )  # fmt: skip
             sums[tile // across, tile % across, 0] = absolute
             sums[tile // across, tile % across, 1] = dissimilarity
-        tile = take(jobs, tiles)
+        tile = next_job(jobs, tiles)
 
 
 def loss_terms(
@@ -156,7 +156,7 @@ def loss_terms(
     down, across = -(-height // TILE_ROWS), -(-width // TILE_COLUMNS)
     sums = np.zeros((down, across, 2))
     is_8bit = target.dtype == np.uint8
-    share(
+    parallel(
         _all_tiles,
         image.reshape(-1),
         np.empty(0, np.float32) if is_8bit else target.reshape(-1).view(np.float32),

@@ -2,10 +2,10 @@
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import MorePoints, Scene, Start
+from crossgrad_core.plugin import Initializer, MorePoints, Scene
 
 
-class SfmPoints(Start):
+class SfmPoints(Initializer):
     """Adds nothing."""
 
     @override

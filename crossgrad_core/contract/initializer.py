@@ -30,7 +30,7 @@ class MorePoints:
     opacities: NDArray[np.float64]
 
 
-class Start(Component):
+class Initializer(Component):
     """Adds points where a scene has too few to begin with; asked once and again, it answers alike.
 
     Only runs that start from the scene's own points (`--init points`) ask it.
@@ -39,7 +39,7 @@ class Start(Component):
         alone: Whether it has points for a scene without any; it then raises where it finds none.
     """
 
-    slot: ClassVar[str] = "starts"
+    slot: ClassVar[str] = "initializers"
     alone: ClassVar[bool] = False
 
     @abstractmethod

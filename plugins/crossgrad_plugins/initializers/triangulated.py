@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import MorePoints, Scene, Start, UserError, View, centers_of
+from crossgrad_core.plugin import Initializer, MorePoints, Scene, UserError, View, centers_of
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
-from crossgrad_plugins.starts.two_views import Features, Met, meet
+from crossgrad_plugins.initializers.two_views import Features, Met, meet
 
 #: Cosine of the largest angle between the axes of two cameras that are compared.
 _ASKEW: Final = 0.5
@@ -23,7 +23,7 @@ _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
 
 
-class Triangulated(Start):
+class Triangulated(Initializer):
     """Triangulates SIFT features of neighbouring training photos, where a scene has no points.
 
     Poses are taken as they are: nothing is optimised. A scene with points of its own starts from

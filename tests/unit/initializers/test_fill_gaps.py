@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_plugins.starts.cells import Cells
-from crossgrad_plugins.starts.depth import Depth, Sky, from_the_middle
-from crossgrad_plugins.starts.filled import Filled
+from crossgrad_plugins.initializers.cells import Cells
+from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
+from crossgrad_plugins.initializers.fill_gaps import Filled
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
 

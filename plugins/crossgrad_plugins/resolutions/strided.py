@@ -17,14 +17,14 @@ _SHARE = 0.8
 _EIGHTH, _QUARTER = 0.3, 0.6
 
 
-class Interlaced(CoarseToFine):
+class Strided(CoarseToFine):
     """Draws one pixel of each n x n up to a share of the run, another one in each step.
 
     Photos are not reduced: what is drawn is what the full render has at these pixels, so that the
     gradients of an error by pixels are right in the mean. Ours.
     """
 
-    interlaced: ClassVar[bool] = True
+    strided: ClassVar[bool] = True
 
     until: float | None = Field(
         None,
@@ -40,7 +40,7 @@ class Interlaced(CoarseToFine):
     )
 
     @override
-    def fitted_to(self, scene: Scene) -> "Interlaced":
+    def fitted_to(self, scene: Scene) -> "Strided":
         most = [self._most(view.camera) for view in scene.train_views]
         # An n that somebody names is that of the photos that are large enough for it.
         n = median(most) if self.coarsest is None else min(self.coarsest, max(most))

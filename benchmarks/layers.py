@@ -1,6 +1,6 @@
-"""Draws docs/rooms.svg: the rooms of the code by floors, and who imports whom.
+"""Draws docs/layers.svg: the rooms of the code by floors, and who imports whom.
 
-    python benchmarks/rooms.py [--png FILE]
+    python benchmarks/layers.py [--png FILE]
 
 Read from the sources. An arrow is left out where a longer way through other rooms leads to the same
 place.
@@ -119,4 +119,4 @@ def draw(path: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--png", type=Path, help="another file, to look at")
-    draw(parser.parse_args().png or ROOT / "docs" / "rooms.svg")
+    draw(parser.parse_args().png or ROOT / "docs" / "layers.svg")

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.plugin import Camera, Field, MorePoints, Scene, Start, View
+from crossgrad_core.plugin import Camera, Field, Initializer, MorePoints, Scene, View
 from crossgrad_plugins.groupings.heights import upward
-from crossgrad_plugins.starts.cells import Cells
-from crossgrad_plugins.starts.depth import Depth, Sky, from_the_middle
+from crossgrad_plugins.initializers.cells import Cells
+from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
 
 #: A photo needs so many observed points to say how deep it is.
 FEWEST: Final = 8
@@ -61,7 +61,7 @@ class _Filling:
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 
-class Filled(Start):
+class Filled(Initializer):
     """Fills what is empty: cells of photos without points, and a margin beyond all photos.
 
     Depth is that of a plane through the points that a photo observed, bent by those nearby. Cells
@@ -111,7 +111,7 @@ class Filled(Start):
         if not views:
             return filling
         some = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
-        sky = Sky(upward(scene)[0], scene.usual_centers, some, _NOT_STRAY)
+        sky = Sky(upward(scene)[0], scene.robust_centers, some, _NOT_STRAY)
         deep = {
             view: Depth.of(view.camera, scene.points[view.seen], FEWEST, sky)
             for view in (scene.train_views if margin else views)

@@ -34,7 +34,7 @@ PLACES = {
     # Reads the headers of photo files.
     "crossgrad_plugins.exposures.photo_headers": READERS,
     # Finds features with pycolmap, which is imported with care.
-    "crossgrad_plugins.starts.triangulated": READERS,
+    "crossgrad_plugins.initializers.triangulated": READERS,
     # Checks packages, and writes one for each slot, readers and tests included.
     "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
     "crossgrad_plugins.compare": COMMAND_ROOMS,

@@ -12,9 +12,9 @@ from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_core.training.start import first_state
+from crossgrad_plugins.initializers import two_views
+from crossgrad_plugins.initializers.triangulated import Triangulated
 from crossgrad_plugins.readers.colmap import ColmapReader
-from crossgrad_plugins.starts import two_views
-from crossgrad_plugins.starts.triangulated import Triangulated
 
 FEW = Triangulated(views=4)
 
@@ -62,17 +62,19 @@ def test_without_points_the_start_or_the_user_has_to_give_some(bare):
     config = RunConfig(scene="somewhere", steps=2, threads=1)
     with pytest.raises(UserError, match="no SfM points") as caught:
         assemble(config, bare, "colmap")
-    assert "--start triangulated" in caught.value.todo
+    assert "--initializer triangulated" in caught.value.todo
     assert "--init random" in caught.value.todo
-    config = RunConfig(scene="somewhere", threads=1, start={"name": "triangulated", "views": 4})
+    config = RunConfig(
+        scene="somewhere", threads=1, initializer={"name": "triangulated", "views": 4}
+    )
     setup = assemble(config, bare, "colmap")
-    assert setup.selection.start == FEW
+    assert setup.selection.initializer == FEW
 
 
 @pytest.mark.parametrize("backbone", sorted(entries("backbones")))
 def test_every_backbone_begins_with_triangulated_points(bare, backbone):
     """The points have no sizes and opacities of their own: the backbone has to find some."""
-    chosen = {"backbone": {"name": backbone}, "start": {"name": "triangulated", "views": 4}}
+    chosen = {"backbone": {"name": backbone}, "initializer": {"name": "triangulated", "views": 4}}
     setup = assemble(RunConfig(scene="somewhere", steps=2, threads=1, **chosen), bare, "colmap")
     state = first_state(setup)
     assert state.primitives(setup) > 100

@@ -29,7 +29,7 @@ def run(scene, out, *options):
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 def test_by_default_the_start_is_filled_and_says_so(scene, tmp_path, backbone):
     options = ("--backbone", backbone, "--densifier", "none")
-    assert run(scene, tmp_path / "plain", *options, "--start", "sfm") == 0
+    assert run(scene, tmp_path / "plain", *options, "--initializer", "points") == 0
     assert run(scene, tmp_path / "filled", *options) == 0
     assert primitives(tmp_path / "filled") > primitives(tmp_path / "plain")
     assert any(note.startswith("start: ") for note in read_notes(tmp_path / "filled"))
@@ -37,7 +37,7 @@ def test_by_default_the_start_is_filled_and_says_so(scene, tmp_path, backbone):
 
 
 def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
-    options = ("--start", "filled", "--set", "start.cells=6")
+    options = ("--initializer", "fill-gaps", "--set", "initializer.cells=6")
     assert run(scene, tmp_path / "whole", *options) == 0
     assert run(scene, tmp_path / "broken", *options, "--stop-after", "4") == 0
     assert ended("run", "--resume", str(tmp_path / "broken"), "-q") == 0
@@ -52,7 +52,7 @@ def test_these_runs_start_bare(scene, tmp_path, options):
     """Their configuration says so, and repeats the run."""
     assert run(scene, tmp_path / "run", *options) == 0
     stored = read_config(tmp_path / "run")
-    assert stored["start"] == {"name": "sfm"}
+    assert stored["initializer"] == {"name": "points"}
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
 
 
@@ -70,13 +70,13 @@ def sparse(tmp_path_factory):
 
 
 @pytest.mark.parametrize("points", [0, 1, 2])
-@pytest.mark.parametrize("start", sorted(entries("starts")))
+@pytest.mark.parametrize("initializer", sorted(entries("initializers")))
 def test_every_start_trains_a_scene_with_no_points_or_few_of_them(
     sparse, tmp_path, capsys, start, points
 ):
     given = ("--steps", "4", "--threads", "1", "-q", "--out", tmp_path / "run")
-    trains = points or load("starts", start).alone
-    assert ended("run", sparse(points), *given, "--start", start) == (0 if trains else 2)
+    trains = points or load("initializers", start).alone
+    assert ended("run", sparse(points), *given, "--initializer", start) == (0 if trains else 2)
     if trains:
         assert primitives(tmp_path / "run") >= max(points, 1)
     else:
@@ -84,6 +84,6 @@ def test_every_start_trains_a_scene_with_no_points_or_few_of_them(
 
 
 def test_points_of_its_own_make_a_start_do_nothing(scene, tmp_path, capsys):
-    assert run(scene, tmp_path / "run", "--init", "random", "--start", "filled") == 2
+    assert run(scene, tmp_path / "run", "--init", "random", "--initializer", "fill-gaps") == 2
     assert "start: --init random has points of its own" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from crossgrad_core.contract.start import MorePoints, Start
+from crossgrad_core.contract.initializer import Initializer, MorePoints
 from crossgrad_core.errors import UserError
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
@@ -18,7 +18,7 @@ from crossgrad_core.testing.contract import (
 from crossgrad_core.testing.fixtures import sample_scene
 
 
-def adds_points(make: Make[Start]) -> None:
+def adds_points(make: Make[Initializer]) -> None:
     """Positions and colours, sizes above 0 and opacities between 0 and 1, one of each a point.
 
     A size or an opacity may be NaN. A start that works alone is also asked about a scene without
@@ -51,7 +51,7 @@ def _require_points(more: object) -> None:
     require(inside.all(), "an opacity is neither between 0 and 1 nor NaN")
 
 
-def answers_alike(make: Make[Start]) -> None:
+def answers_alike(make: Make[Initializer]) -> None:
     """Asked again, also as a new object, it gives the same points and says the same."""
     scene = sample_scene()
     with global_randomness_untouched():
@@ -66,4 +66,4 @@ def answers_alike(make: Make[Start]) -> None:
             require(same, f"{each.name} differ from one call to the next")
 
 
-START_CHECKS: tuple[Check[Start], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)
+START_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)
