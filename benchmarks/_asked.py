@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from crossgrad_core.commands import RunConfig, UserError, configured
-from crossgrad_core.contract.pace import ViewsPerStepSpec
+from crossgrad_core.contract.schedule import ViewsPerStepSpec
 from crossgrad_plugins.compare.load_runs import without_length
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.settings import ABSENT, Settings, settings_of

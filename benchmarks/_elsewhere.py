@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from crossgrad_core.commands import UserError, configured, fingerprint, read_scene, write_atomically
 from crossgrad_core.run.postprocess import evaluate
 from crossgrad_core.run.postprocess.open_options import How
-from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.metrics_csv import write_per_view
 from crossgrad_core.scene.fingerprint import mark_of
 from crossgrad_core.system.text_files import read_json
 from crossgrad_plugins.compare.run import Run

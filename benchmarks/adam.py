@@ -15,7 +15,7 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.blocks import AdamState
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from _machine import facts
 
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.gradients.sparse_rows import sparse_rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late

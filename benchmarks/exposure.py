@@ -11,7 +11,7 @@ from pathlib import Path
 from time import process_time
 
 from crossgrad_core.commands import configured, read_scene
-from crossgrad_plugins.exposures.photo_headers import exposure_value
+from crossgrad_plugins.exposures.exif import exposure_value
 from crossgrad_plugins.exposures.tracks.gains import TrackGains, track_gains
 
 HEADER = (

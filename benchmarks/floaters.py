@@ -18,10 +18,10 @@ from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.export import renderer
 from crossgrad_core.run.load_run import opened
 from crossgrad_core.training.averaging import eval_parameters
-from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import EMPTY, in_empty_space, rows_without_floaters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.step import keep
 
 _METRICS = ("psnr", "psnr_cc")
 #: Changes of a photo below it are not shown, dB.

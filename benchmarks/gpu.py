@@ -39,8 +39,8 @@ from scale import STEP, Cell, Run
 from crossgrad_core.commands import assemble, begin, configured, read_scene
 from crossgrad_core.run.results.reading import read_run
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.rollback import RollbackGuard
-from crossgrad_core.training.view_target import target_at
+from crossgrad_core.training.state import RollbackGuard
+from crossgrad_core.training.views import target_at
 
 if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup

@@ -82,9 +82,8 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     begun = monotonic()
     from crossgrad_core.run.load_run import parsed, set_up
     from crossgrad_core.scene.photo_check import check_photos, fits
-    from crossgrad_core.training.loop import timed_step
+    from crossgrad_core.training.loop import Prefetcher, timed_step
     from crossgrad_core.training.start import first_state, warm_up
-    from crossgrad_core.training.view_prefetch import Prefetcher
 
     settings: dict[str, Any] = {
         "scene": str(scene),

@@ -16,7 +16,7 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_core.numerics.threads import configure_threads
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 
 

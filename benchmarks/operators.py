@@ -24,12 +24,11 @@ import torch
 from _machine import facts, peak_mib
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate
+from crossgrad_core.contract.blocks import EMPTY_STATE, Block, BlockKind, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gradients import SeparateGradients
 from crossgrad_core.contract.gramian_operator import MatrixOperator, operator_context
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.numerics.threads import configure_threads

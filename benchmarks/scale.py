@@ -235,7 +235,7 @@ class Run:
 
     def __init__(self, cell: Cell, **options: object) -> None:
         from crossgrad_core.commands import begin
-        from crossgrad_core.training.rollback import RollbackGuard
+        from crossgrad_core.training.state import RollbackGuard
 
         self.setup = setup_of(cell, **options)
         self.state: TrainState = begin(self.setup)

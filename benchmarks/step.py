@@ -29,7 +29,7 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.contract.gaussians import OnDemand
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.contract.schedule import Phase, Schedule
@@ -38,7 +38,7 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.adam.late import Late
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 
 #: Late enough for SH degree 3 in the published schedule.

@@ -65,19 +65,18 @@ if TYPE_CHECKING:
     from crossgrad_core.run.assemble import accepts, assemble
     from crossgrad_core.run.decisions import DEFAULT_STEPS, edits_of, facts_of, table_of
     from crossgrad_core.run.load_run import opened as open_run
-    from crossgrad_core.run.results.panel_layout import panels_of, read_panel
+    from crossgrad_core.run.results.panels import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
     from crossgrad_core.run.usual_views import views_per_step_of
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.dropout import photos_per_point
-    from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-    from crossgrad_core.training.model import model_of
     from crossgrad_core.training.probe_gradients import view_gradients
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
-    from crossgrad_core.training.state import TrainState
+    from crossgrad_core.training.state import NonFiniteError, TrainingFailedError, TrainState
+    from crossgrad_core.training.step import model_of
 
 __all__ = [
     "COMMANDS",
@@ -191,12 +190,12 @@ FAILED: Final = 1
 _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",
-    "NonFiniteError": "training.failure",
+    "NonFiniteError": "training.state",
     "RunConfig": "config",
     "RunResults": "run.results.reading",
     "Setup": "training.setup",
     "TrainState": "training.state",
-    "TrainingFailedError": "training.failure",
+    "TrainingFailedError": "training.state",
     "accepts": "run.assemble",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
@@ -206,11 +205,11 @@ _LATE: Final = {
     "gathered": "gradients.separate:DenseGradients",
     "layered": "run.settings",
     "merged": "run.settings",
-    "model_of": "training.model",
+    "model_of": "training.step",
     "open_run": "run.load_run:opened",
-    "panels_of": "run.results.panel_layout",
+    "panels_of": "run.results.panels",
     "photos_per_point": "training.dropout",
-    "read_panel": "run.results.panel_layout",
+    "read_panel": "run.results.panels",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
     "table_of": "run.decisions",
@@ -394,8 +393,8 @@ def affordable_steps(setup: "Setup", seconds: float) -> int:
         TrainingFailedError: Not even the steps that are tried out can be taken.
     """
     from crossgrad_core.training.budget import steps_for
-    from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
     from crossgrad_core.training.start import warm_up
+    from crossgrad_core.training.state import NonFiniteError, TrainingFailedError
 
     try:
         warm_up(setup)
@@ -413,8 +412,7 @@ def take_steps(setup: "Setup", state: "TrainState") -> None:
     Raises:
         TrainingFailedError: Training failed; the state is the last one that was good.
     """
-    from crossgrad_core.training.loop import train
-    from crossgrad_core.training.stopper import Stopper
+    from crossgrad_core.training.loop import Stopper, train
 
     train(setup, state, _NoFolder(), Stopper())
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import (
     BaseModel,
@@ -16,12 +16,15 @@ from pydantic import (
 
 from crossgrad_core import defaults
 from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS, TRAINING, Flag
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.contract.schedule import ScheduleMode, Unit
+from crossgrad_core.contract.schedule import ScheduleMode, Unit, ViewsPerStepSpec
 
 #: Name of a choice that the run makes at its start.
 AUTO: Final = "auto"
+#: Settings of a run that do not change its training.
+CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
+#: How primitives grow: as density control requests, or along a budget that follows the length.
+Growth: TypeAlias = Literal["unbounded", "budget"]
 
 
 #: Settings of earlier versions -> what they are called now.
@@ -320,12 +323,10 @@ class RunConfig(BaseModel):
         description="At most N primitives, 0 for no bound; auto: as suits the length of the run. "
         "Default: auto.",
     )
-    growth: Annotated[Literal["unbounded", "budget"] | None, Flag("unbounded|budget", TRAINING)] = (
-        Field(
-            None,
-            description="Growth up to --max-gaussians: unbounded, or along a budget that reaches it "
-            "with the last edit. Default: auto.",
-        )
+    growth: Annotated[Growth | None, Flag("unbounded|budget", TRAINING)] = Field(
+        None,
+        description="Growth up to --max-gaussians: unbounded, or along a budget that reaches it "
+        "with the last edit. Default: auto.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None,

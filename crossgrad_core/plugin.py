@@ -7,7 +7,19 @@ from pydantic import Field
 
 from crossgrad_core.contract import screen_statistics
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    NO_EDIT,
+    Block,
+    BlockKind,
+    Edit,
+    Json,
+    LearningRate,
+    Parameters,
+    PluginState,
+    Rows,
+    apply_to_parameters,
+)
 from crossgrad_core.contract.component import Component, ViewCounts
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
@@ -40,14 +52,6 @@ from crossgrad_core.contract.exporter import Exporter, Rounding
 from crossgrad_core.contract.exposure import Exposure, Fitted, PerPhoto
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
-from crossgrad_core.contract.georeference import (
-    COORDINATES_TAG,
-    INPUT,
-    LOCAL,
-    Georeference,
-    Placed,
-    Unplaced,
-)
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.gramian_operator import (
     GramianOperator,
@@ -57,7 +61,6 @@ from crossgrad_core.contract.gramian_operator import (
     transformed,
 )
 from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
-from crossgrad_core.contract.images import masked, to_uint8, unit_range
 from crossgrad_core.contract.initializer import Initializer, MorePoints
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.markers import hookimpl
@@ -65,14 +68,32 @@ from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewsPerStepSpec
-from crossgrad_core.contract.poses import footprint_of, radial_distances, without_rounding
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.recipe import Facts, Recipe, with_rows
 from crossgrad_core.contract.resolution import Resolution, octave
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Camera, Photo, Pinhole, Scene, View, centers_of
+from crossgrad_core.contract.scene import (
+    COORDINATES_TAG,
+    INPUT,
+    LOCAL,
+    Camera,
+    Georeference,
+    Photo,
+    Pinhole,
+    Placed,
+    Scene,
+    Similarity,
+    Unplaced,
+    View,
+    centers_of,
+    footprint_of,
+    masked,
+    radial_distances,
+    to_uint8,
+    unit_range,
+    without_rounding,
+)
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import (
     REFERENCE,
@@ -80,12 +101,10 @@ from crossgrad_core.contract.schedule import (
     Phase,
     Schedule,
     Unit,
+    ViewsPerStepSpec,
     shortness,
 )
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
-from crossgrad_core.contract.similarity import Similarity
-from crossgrad_core.contract.state import EMPTY_STATE, Json, PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.recipe.lines import full_lines, short_lines, table_lines
@@ -93,7 +112,7 @@ from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.registry.entries import name_of as component_name
 from crossgrad_core.registry.entries import plain as plain_component
-from crossgrad_core.run.results.lines import (
+from crossgrad_core.run.results.log import (
     Pace,
     evaluation_line,
     figures,

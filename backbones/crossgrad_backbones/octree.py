@@ -1,6 +1,8 @@
 """Octree-GS: neural Gaussians on anchors of several levels of detail (Ren et al. 2024)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -12,9 +14,8 @@ from typing_extensions import override
 
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
 from crossgrad_backbones.levels import fitting
-from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
-from crossgrad_backbones.levels.init_anchors import init_anchors, visible_share
 from crossgrad_backbones.levels.lattice import Lattice
+from crossgrad_backbones.neighbours import nearest_neighbour_scales
 from crossgrad_core.plugin import (
     Block,
     Camera,
@@ -26,8 +27,98 @@ from crossgrad_core.plugin import (
     Selection,
 )
 
-Rounding = Literal["round", "floor", "ceil", "progressive"]
 
+def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
+    """The steps at which `count` further levels open, the last one at `span`.
+
+    The time between two openings shrinks by `factor` from one to the next: a geometric series with
+    the first term span (1 - q) / (1 - q^count), q = 1 / factor.
+    """
+    q = 1.0 / factor
+    terms = [q**i for i in range(count)]
+    scale = span / sum(terms) if terms else 0.0
+    return tuple(accumulate(scale * term for term in terms))
+
+
+def allowed_top(step: int, openings: tuple[float, ...], initial: int) -> int:
+    """The finest level that may be trained at a step."""
+    return initial + sum(step >= opening for opening in openings)
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """Anchors of all levels, level by level.
+
+    Attributes:
+        positions: [A, 3] float64, local units.
+        levels: [A] int64.
+        spacings: [A] float64, initial scale of each anchor, local units.
+    """
+
+    positions: Tensor
+    levels: Tensor
+    spacings: Tensor
+
+    def kept(self, mask: Tensor) -> "Planted":
+        """Those of a mask [A]."""
+        return Planted(self.positions[mask], self.levels[mask], self.spacings[mask])
+
+
+def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: bool) -> Planted:
+    """Anchors of every level: the points, rounded to the level's lattice, each site once.
+
+    Initial scales come from the neighbouring sites of the same level, whether or not an anchor is
+    planted there. The published code takes neighbours of any level, so that coarse anchors start as
+    small as the fine ones around them; a camera that is far away sees coarse ones only, with gaps
+    between them.
+
+    Args:
+        points: [P, 3] local units.
+        lattice: The lattices.
+        everywhere: Whether a site counts also where the points of the coarser site that it belongs
+            to are all on it: its anchor repeats that of the coarser level.
+    """
+    origin = lattice.origin.numpy()
+    levels = torch.arange(lattice.count)
+    found, coarser = [], np.zeros(0, np.int64)
+    for level, cell in enumerate(lattice.cells(levels).tolist()):
+        sites, site = np.unique(np.round((points - origin) / cell), axis=0, return_inverse=True)
+        site = site.reshape(-1)
+        positions = sites * cell + origin
+        spacings = nearest_neighbour_scales(positions)
+        rows = np.arange(len(sites))
+        if level > 0 and not everywhere:
+            rows = np.unique(site[_parted(coarser, site)])
+        numbers = np.full(len(rows), level)
+        found.append(
+            [torch.from_numpy(each) for each in (positions[rows], numbers, spacings[rows])]
+        )
+        coarser = site
+    return Planted(*(torch.cat(each) for each in zip(*found, strict=True)))
+
+
+def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """[P] whether the points that share a point's coarser site are on several of the finer ones.
+
+    Args:
+        coarser: [P] number of each point's site on the level before.
+        site: [P] number of its site.
+    """
+    pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
+    return np.bincount(pairs[:, 0])[coarser] > 1
+
+
+def visible_share(shares: Tensor, asked: float) -> float:
+    """The share of the cameras that must see an anchor's level, and more, for it to stay.
+
+    Args:
+        shares: [A] share of the cameras that see the level of each anchor.
+        asked: The option; a negative one asks for the mean share of all anchors.
+    """
+    return float(shares.mean()) if asked < 0.0 else asked
+
+
+Rounding = Literal["round", "floor", "ceil", "progressive"]
 #: How many levels beyond L* are used (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
 

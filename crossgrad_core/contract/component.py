@@ -6,7 +6,7 @@ from typing import ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict
 from typing_extensions import override
 
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.errors import UserError
 
 A = TypeVar("A")

@@ -10,15 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
-from crossgrad_core.contract.blocks import Block, BlockKind, Parameters
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    AdamRule,
+    AdamState,
+    Block,
+    BlockKind,
+    Edit,
+    Parameters,
+    PluginState,
+)
 from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.gaussians import Gaussians, Render, Screen
 from crossgrad_core.contract.gradients import Gradients, SeparateGradients
 from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import Edit
 
 if TYPE_CHECKING:
     from crossgrad_core.contract.backbone import Backbone

@@ -3,13 +3,11 @@
 from abc import abstractmethod
 from typing import ClassVar
 
-from crossgrad_core.contract.blocks import Parameters
+from crossgrad_core.contract.blocks import Edit, Parameters, PluginState
 from crossgrad_core.contract.component import Component, with_state
 from crossgrad_core.contract.contexts import DensifyContext, DensifyResult
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit
 
 STATE = "densifier"
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.errors import UserError
 
 

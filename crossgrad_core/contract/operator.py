@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from typing_extensions import override
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.component import Component, ViewCounts, with_state
 from crossgrad_core.contract.contexts import AggregateContext, AggregateResult
 from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.state import PluginState
 
 STATE = "operator"
 

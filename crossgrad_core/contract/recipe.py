@@ -9,13 +9,13 @@ from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import (
     REFERENCE,
     Counting,
     Schedule,
     ScheduleMode,
     Unit,
+    ViewsPerStepSpec,
     is_published,
 )
 

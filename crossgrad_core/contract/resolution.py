@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from math import log2
 from typing import ClassVar
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.component import Component, with_state
 from crossgrad_core.contract.contexts import ScaleContext, ScaleResult
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
 
 STATE = "resolution"
 

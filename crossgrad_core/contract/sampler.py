@@ -3,10 +3,10 @@
 from abc import abstractmethod
 from typing import ClassVar
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.component import Component, ViewCounts, with_state
 from crossgrad_core.contract.contexts import SampleContext, SampleResult, ViewSample
 from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.state import PluginState
 
 STATE = "sampler"
 

@@ -1,20 +1,176 @@
 """The data types of a scene."""
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Final, Protocol, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.georeference import UNPLACED, Georeference
-from crossgrad_core.contract.similarity import Similarity
-from crossgrad_core.contract.state import Json
-from crossgrad_core.contract.strays import stray_rows
+from crossgrad_core.contract.blocks import Json
+from crossgrad_core.contract.gaussians import Gaussians
+from crossgrad_core.errors import UserError
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x_local = (x_input - offset) * scale, in float64; the rotation is the identity.
+
+    Attributes:
+        offset: [3] float64, input frame.
+        scale: Local units per input unit.
+    """
+
+    offset: NDArray[np.float64]
+    scale: float
+
+    def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the input frame in the local frame."""
+        return (points - self.offset) * self.scale
+
+    def to_input(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] points of the local frame in the input frame."""
+        return points / self.scale + self.offset
+
+
+#: Those of the scene's files, and those that are trained in.
+INPUT, LOCAL = "input", "local"
+_KNOWN: Final = re.compile(rf"{INPUT}|{LOCAL}|enu|utm|epsg:[0-9]{{4,6}}")
+#: Begins the comment of a file that is in other coordinates than the scene's.
+COORDINATES_TAG = "crossgrad_coordinates:"
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Gaussians on their way into a file.
+
+    Attributes:
+        gaussians: Of a frame that may be turned against the local one.
+        similarity: Maps that frame to the coordinates of the file.
+        facts: Of `.georef.json`, for programs that read the file; empty where nothing is known.
+        notes: What the user should know, one sentence each.
+    """
+
+    gaussians: Gaussians
+    similarity: Similarity
+    facts: Mapping[str, Json] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+class Georeference(Protocol):
+    """A scene's place on Earth, as far as it is known."""
+
+    @property
+    def note(self) -> str:
+        """The place and how well it is known, or why it is not, in a sentence."""
+        ...
+
+    def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
+        """Gaussians in coordinates that were asked for.
+
+        Args:
+            gaussians: Of the local frame, without a graph.
+            similarity: Maps the local frame back to the input frame.
+            coordinates: As `check_coordinates` takes them.
+
+        Raises:
+            UserError: The scene cannot be put into these coordinates.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Unplaced:
+    """A scene whose place is not known.
+
+    Attributes:
+        why: What is missing.
+    """
+
+    why: str = "neither its files nor its photos tell where on Earth it is"
+
+    @property
+    def note(self) -> str:
+        """See `Georeference`."""
+        return f"not georeferenced: {self.why}"
+
+    def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
+        """See `Georeference`."""
+        if coordinates == INPUT:
+            return Placed(gaussians, similarity)
+        if coordinates == LOCAL:
+            return Placed(gaussians, Similarity(np.zeros(3), 1.0), {"coordinates": LOCAL})
+        raise UserError(
+            "the scene is not georeferenced",
+            where=f"--coordinates {coordinates}",
+            found=self.why,
+            todo="export in input or local coordinates, or see docs/coordinates.md for what tells "
+            "a scene's place",
+        )
+
+
+#: A scene of which nothing is known.
+UNPLACED: Final = Unplaced()
+
+
+def check_coordinates(name: str) -> None:
+    """Refuses coordinates that do not exist.
+
+    Raises:
+        UserError: They are none of those that a file can be in.
+    """
+    if not _KNOWN.fullmatch(name):
+        raise UserError(
+            "there are no such coordinates",
+            where=f"--coordinates {name}",
+            expected="input, local, enu (metres east, north, up), utm, or epsg:N such as "
+            "epsg:32633",
+            todo="choose one of these",
+        )
+
+
+#: Cameras without which none can be told to be stray.
+_FEWEST: Final = 5
+#: Largest share of the cameras that is stray; one may be in any case.
+_MOST: Final = 0.1
+#: A stray camera is so many times farther from the middle than the others, and than the points.
+_FAR: Final = 10.0
+#: Share of the points that the points' distance is taken of: single ones lie astray, too.
+_OF_POINTS: Final = 0.9
+
+
+def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[N] which cameras are stray: ten times farther away than all others and than most points.
+
+    A camera that photographs the scene from afar is none, because the points show the scene's size.
+
+    Args:
+        centers: [N, 3] camera centres.
+        points: [P, 3] SfM points in the same frame; may be empty.
+    """
+    none = np.zeros(len(centers), dtype=np.bool_)
+    if len(centers) < _FEWEST:
+        return none
+    middle = np.median(centers, axis=0)
+    away = np.linalg.norm(centers - middle, axis=1)
+    most = max(1, int(_MOST * len(centers)))
+    order = np.argsort(away)
+    # The widest gap among the farthest cameras separates those that are stray.
+    ratios = away[order][-most:] / np.maximum(away[order][-most - 1 : -1], np.finfo(float).tiny)
+    first = len(centers) - most + int(ratios.argmax())
+    reach = away[order[first - 1]]
+    if ratios.max() <= _FAR or reach == 0.0:
+        return none
+    if len(points):
+        ways = np.linalg.norm(points - middle, axis=1)
+        reach = max(reach, float(np.quantile(ways, _OF_POINTS)))
+    none[order[first:]] = away[order[first:]] > _FAR * reach
+    return none
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,3 +373,96 @@ def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
     if not views:
         return np.zeros((0, 3))
     return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)
+
+
+#: A median over fewer observed points says little; points in the image are taken instead.
+_FEWEST_SEEN = 3
+#: Points tested against the image of a view that observed too few.
+_MOST_TESTED = 50_000
+#: Of a length between cameras; what is behind them is rounding.
+_BITS = 40
+#: Of a coordinate of the input, what its rounding and that of some sums with it may make.
+_ROUNDED = 16 * float(np.finfo(np.float64).eps)
+
+
+def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
+    """[V] distance of each camera from the mean training camera centre, local units.
+
+    Without what is rounding: a camera that stands there has 0, and equal distances are equal.
+    """
+    return without_rounding(scene, np.linalg.norm(centers_of(views) - scene.middle, axis=1))
+
+
+def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths [V] between camera centres, rounded to 2^-40 (1e-12) of the largest coordinate.
+
+    What the mean of the training cameras is taken from differs by its rounding alone in layouts
+    that are regular, and a cut at the median, a rank or a logarithm would depend on it. Where the
+    scene's input has coordinates that are so large that they are rounded more, that decides.
+    """
+    largest = float(np.abs(scene.centers).max(initial=0.0))
+    given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
+    least = max(largest * 2.0**-_BITS, given * scene.similarity.scale * _ROUNDED)
+    if not 0.0 < least < np.inf:
+        return lengths
+    step = 2.0 ** np.ceil(np.log2(least))
+    return np.asarray(np.round(lengths / step) * step)
+
+
+def footprint_of(scene: Scene, view: View) -> float:
+    """`footprint` of a view of the scene."""
+    return footprint(view.camera, scene.points, view.seen)
+
+
+def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int64]) -> float:
+    """Median of f / z [pixels per local unit] over the SfM points that a camera observed.
+
+    Over those in its image where it observed fewer than 3 in front of it; NaN where there is none.
+
+    Args:
+        camera: The camera, in the size of the photo as trained.
+        points: [P, 3] SfM points, local frame.
+        seen: Rows of `points` that it observed.
+    """
+    depths = _in_front(camera, points[seen])[:, 2]
+    if len(depths) < _FEWEST_SEEN:
+        tested = points[:: max(1, len(points) // _MOST_TESTED)]
+        inside = camera.local(tested[is_in_image(camera, tested)])[:, 2]
+        depths = inside if len(inside) else depths
+    if not len(depths):
+        return float("nan")
+    return float(np.sqrt(camera.fx * camera.fy) / np.median(depths))
+
+
+def _in_front(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    local = camera.local(points)
+    return local[local[:, 2] > 0.0]
+
+
+def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[P] whether a camera has points [P, 3] of the local frame in its image, seen or hidden."""
+    local = camera.local(points)
+    front = local[:, 2] > 0.0
+    depth = np.where(front, local[:, 2], 1.0)
+    x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
+    return np.asarray(front & (x >= 0.0) & (x < camera.width) & (y >= 0.0) & (y < camera.height))
+
+
+def masked(image: Tensor, mask: Tensor | None) -> Tensor:
+    """The image [H, W, C], 0 at masked-out pixels, so that not even a NaN leaks from them."""
+    if mask is None:
+        return image
+    return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))
+
+
+def unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """The image in `dtype`, 8-bit values divided by 255."""
+    return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+
+
+def to_uint8(image: Tensor) -> Tensor:
+    """The image as uint8 on the CPU, clamped to [0, 1] and rounded; NaN becomes 0."""
+    image = image.detach().cpu()
+    if image.dtype == torch.uint8:
+        return image
+    return (torch.nan_to_num(image, nan=0.0).clamp(0, 1) * 255).round().to(torch.uint8)

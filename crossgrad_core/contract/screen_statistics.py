@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import DensifyContext, RenderedView
-from crossgrad_core.contract.state import PluginState
 
 
 def half_size(record: RenderedView, like: Tensor) -> Tensor:

@@ -14,10 +14,10 @@ from crossgrad_core.contract.initializer import Initializer
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.schedule import ViewsPerStepSpec
 
 
 @dataclass(frozen=True)

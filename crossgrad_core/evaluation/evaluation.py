@@ -12,9 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.images import to_uint8
 from crossgrad_core.contract.metric import Compared, Metric
-from crossgrad_core.contract.scene import View
+from crossgrad_core.contract.scene import View, to_uint8
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
 
 

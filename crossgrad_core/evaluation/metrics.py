@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.images import to_uint8
+from crossgrad_core.contract.scene import to_uint8
 
 #: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite;
 #: images that differ reach it only if fewer than one value in 150,000 is off, by one 8-bit step.

@@ -13,6 +13,7 @@ import pluggy
 from torch import Tensor
 from typing_extensions import override
 
+from crossgrad_core.contract.blocks import Edit
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import (
     Answer,
@@ -23,7 +24,6 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.markers import PROJECT
-from crossgrad_core.contract.topology import Edit
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.wording import did_you_mean, listed, sentences, singular

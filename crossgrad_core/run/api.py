@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crossgrad_core.errors import RunFailedError
 from crossgrad_core.run import app
-from crossgrad_core.run.process import as_in_a_command
+from crossgrad_core.run.app import as_in_a_command
 from crossgrad_core.run.settings import merged
 from crossgrad_core.run.trained import Run
 from crossgrad_core.system.startup import announce, finish

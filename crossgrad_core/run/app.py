@@ -10,6 +10,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
+import numba
+import numpy as np
+import torch
+
 from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
@@ -17,16 +21,19 @@ from crossgrad_core.recipe.lines import short_lines
 from crossgrad_core.recipe.table import open_again
 from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.run.apply_plan import seconds_of
-from crossgrad_core.run.budget_clock import check_clock
-from crossgrad_core.run.bundled import BUNDLED_SECONDS, BUNDLED_VIEWS, bundled_scene
 from crossgrad_core.run.decisions import redecided
-from crossgrad_core.run.eta import Forecast
-from crossgrad_core.run.failure_report import reason_of
-from crossgrad_core.run.finish import Ending, RunLoop, exit_messages, resume_line
+from crossgrad_core.run.finish import (
+    Ending,
+    Forecast,
+    RunLoop,
+    exit_messages,
+    reason_of,
+    resume_line,
+)
 from crossgrad_core.run.load_run import continued, parsed, set_up
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import FILE as CONFIG
-from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
+from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config, write_plan
 from crossgrad_core.run.results.folder import (
     RUNS,
     SMALLEST_NEED,
@@ -38,8 +45,7 @@ from crossgrad_core.run.results.folder import (
 )
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.log import RunLog
-from crossgrad_core.run.results.per_view import FILE as PER_VIEW
-from crossgrad_core.run.results.plan_file import write_plan
+from crossgrad_core.run.results.metrics_csv import PER_VIEW
 from crossgrad_core.run.results.plugins_file import (
     packages_of,
     read_plugins,
@@ -47,8 +53,7 @@ from crossgrad_core.run.results.plugins_file import (
     write_plugins,
 )
 from crossgrad_core.run.results.scene_file import write_scene
-from crossgrad_core.run.results.summary import summarised_step
-from crossgrad_core.run.results.table import final_table
+from crossgrad_core.run.results.summary import final_table, summarised_step
 from crossgrad_core.run.session import CLOUD, Session, totals
 from crossgrad_core.run.settings import layered, with_recipe
 from crossgrad_core.run.unused_settings import (
@@ -62,15 +67,68 @@ from crossgrad_core.system.check_writable import check_folder
 from crossgrad_core.system.checksums import changed_files, drop_checksums
 from crossgrad_core.system.interrupts import exit_code, resume_hint
 from crossgrad_core.training.budget import Length, Planned, Timed, most_steps, steps_for
-from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
+from crossgrad_core.training.loop import Stopper
 from crossgrad_core.training.per_image_params import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
-from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.state import NonFiniteError, TrainingFailedError, TrainState
 from crossgrad_core.training.step import check_largest_draw
-from crossgrad_core.training.stopper import Stopper
 from crossgrad_core.wording import listed, one_line
+
+
+def check_clock(config: RunConfig) -> None:
+    """Refuses a budget in CPU seconds on several threads or a GPU; threads are set already.
+
+    Raises:
+        UserError: They would be counted while they wait, or not counted while they work.
+    """
+    if config.seconds is None or config.clock == "wall":
+        return
+    if config.device != AUTO and torch.device(config.device).type != "cpu":
+        raise UserError(
+            "CPU time does not tell what a GPU does",
+            where="--clock cpu",
+            expected="--device cpu",
+            found=f"--device {config.device}",
+            todo="leave --clock out",
+        )
+    threads = torch.get_num_threads()
+    if threads > 1:
+        raise UserError(
+            "CPU time counts threads that wait for others, as they spin",
+            where="--clock cpu",
+            expected="one thread",
+            found=f"{threads} threads",
+            todo="add --threads 1, or leave --clock out",
+        )
+
+
+#: The length of a run on the bundled scene that asks for none, whichever is over first: training
+#: seconds, and 100 views of each of its training photos, which more teach by heart
+#: (docs/few-photos.md).
+BUNDLED_SECONDS = 120.0
+BUNDLED_VIEWS = 2_400
+
+
+def bundled_scene() -> Path:
+    """The folder of the bundled scene: inside an installed package, or in a checkout.
+
+    Raises:
+        UserError: It is in neither place.
+    """
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "data" / "boruszyn"
+    checkout = package.parent / "examples" / "scenes" / "boruszyn"
+    for folder in (installed, checkout):
+        if folder.is_dir():
+            return folder
+    raise UserError(
+        "the bundled scene is missing",
+        where=installed,
+        todo="name a scene: crossgrad run SCENE",
+    )
+
 
 _LOG = logging.getLogger(__name__)
 #: Exit code of a run that failed; what it has is kept.
@@ -415,3 +473,34 @@ def _print_dry_run(setup: Setup) -> None:
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
     print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
+
+
+@contextmanager
+def as_in_a_command() -> Iterator[None]:
+    """Inside the block torch and numpy are as in a new process; then as they were.
+
+    Default type and device, `no_grad`, `inference_mode`, `np.errstate` and the number of threads
+    would change the bits of a run, or end it.
+    """
+    threads = torch.get_num_threads(), numba.get_num_threads()
+    kind, device = torch.get_default_dtype(), torch.get_default_device()
+    torch.set_default_dtype(torch.float32)
+    _set_device(device, torch.device("cpu"))
+    try:
+        with (
+            torch.inference_mode(mode=False),
+            torch.enable_grad(),
+            np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"),
+        ):
+            yield
+    finally:
+        torch.set_default_dtype(kind)
+        _set_device(torch.device("cpu"), device)
+        torch.set_num_threads(threads[0])
+        numba.set_num_threads(threads[1])
+
+
+def _set_device(old: torch.device, new: torch.device) -> None:
+    """Does nothing where there is nothing to do: a default device slows every call down."""
+    if old != new:
+        torch.set_default_device(new)

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from typing import TypeAlias, cast
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.blocks import Json
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.state import Json
 from crossgrad_core.defaults import PLANNER
 from crossgrad_core.registry.entries import find, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS

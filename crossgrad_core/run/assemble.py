@@ -5,16 +5,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from crossgrad_core.config import AUTO, RunConfig
-from crossgrad_core.contract.adam_state import MOST_VIEWS
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.blocks import MOST_VIEWS
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.schedule import Counting
+from crossgrad_core.contract.schedule import Counting, ViewsPerStepSpec
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
@@ -32,17 +31,36 @@ from crossgrad_core.registry.slots import GROUPS, LISTS
 from crossgrad_core.run.apply_plan import notes_of, planned
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
 from crossgrad_core.run.devices import choose_device
-from crossgrad_core.run.noop_operator import idle_note
 from crossgrad_core.run.select import select
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.self_check.check import checked
 from crossgrad_core.training.modes import mode_note
-from crossgrad_core.training.relabel import labels_of
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.step import labels_of
 from crossgrad_core.wording import in_one_line, listed, plural, singular
+
+
+def idle_note(setup: Setup) -> tuple[str, ...]:
+    """Says that an operator leaves the gradient of a single view as it is, and the way out.
+
+    The default operator is left alone: a sum of one gradient is expected to be no more than that.
+    """
+    selection = setup.selection
+    name, views = selection.names["operator"], selection.views_per_step
+    default: ComponentChoice = RunConfig.model_fields["operator"].default
+    if name == default.name or not selection.operator.is_identity(views):
+        return ()
+    sampler = selection.names["sampler"]
+    more = next((k for k in (2, 3) if selection.sampler.view_counts.admits(k)), None)
+    way_out = f"--views {more}" if more else f"a sampler other than {sampler} as it is set"
+    return (
+        f"operator {name} does nothing at K = {views}: a step has one gradient, which it leaves as "
+        f"it is; {way_out} gives it more",
+    )
+
 
 _LOG = logging.getLogger(__name__)
 

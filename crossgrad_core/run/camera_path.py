@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import radians, tan
+from math import isfinite, radians, tan
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -10,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera, Scene, View
-from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL
@@ -30,7 +31,6 @@ MOST_VIEWS: Final = 500
 _TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
 #: Longer paths are a mistake.
 MOST_FRAMES: Final = 100_000
-
 _Floats = NDArray[np.float64]
 
 
@@ -217,3 +217,48 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
     pose[:3, 3] = -rotation.T @ center
     focal = size[1] / 2 / tan(radians(frame.fov) / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2, torch.from_numpy(pose))
+
+
+def checked_camera(camera: object) -> Camera:
+    """The camera.
+
+    Raises:
+        UserError: It is none, or one of its numbers is none of a camera.
+    """
+    if not isinstance(camera, Camera):
+        raise _refused("a view's name or a camera", f"{type(camera).__name__}")
+    sides = {"width": camera.width, "height": camera.height}
+    for name, side in sides.items():
+        if not isinstance(side, Integral) or isinstance(side, bool) or side < 1:
+            raise _refused(f"a {name} of 1 pixel or more", repr(side))
+    for name in ("fx", "fy", "cx", "cy"):
+        value, focal = getattr(camera, name), name in {"fx", "fy"}
+        known = isinstance(value, Real) and isfinite(value)
+        if not known or (focal and value <= 0):
+            above = " above 0" if focal else ""
+            raise _refused(f"a finite {name}{above}, in pixels", repr(value))
+    if not _is_pose(camera.world_to_camera):
+        raise _refused(
+            "world_to_camera, a tensor [4, 4] of a rotation and a translation",
+            str(camera.world_to_camera).replace("\n", ""),
+        )
+    return camera
+
+
+def _is_pose(pose: object) -> bool:
+    if not isinstance(pose, Tensor) or pose.shape != (4, 4) or not bool(pose.isfinite().all()):
+        return False
+    pose = pose.detach().cpu().double()
+    rotation, last = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    straight = torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=pose.dtype), atol=1e-3)
+    return straight and float(torch.det(rotation)) > 0 and torch.allclose(pose[3], last)
+
+
+def _refused(expected: str, found: str) -> UserError:
+    return UserError(
+        "this is no camera to draw",
+        where="Run.render",
+        expected=expected,
+        found=found,
+        todo="take one of `run.scene.views`, or change it with `dataclasses.replace`",
+    )

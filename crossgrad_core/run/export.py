@@ -9,11 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import Json
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.georeference import COORDINATES_TAG, INPUT, Placed
-from crossgrad_core.contract.scene import Camera, View
-from crossgrad_core.contract.state import Json
+from crossgrad_core.contract.scene import COORDINATES_TAG, INPUT, Camera, Placed, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare
 from crossgrad_core.evaluation.metrics import psnr
@@ -22,7 +21,7 @@ from crossgrad_core.training.averaging import eval_parameters
 from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.view_target import eval_background
+from crossgrad_core.training.views import eval_background
 
 
 @dataclass(frozen=True)

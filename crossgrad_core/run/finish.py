@@ -1,5 +1,6 @@
 """A run from its first step to its last file: whatever ends it, what there is gets kept."""
 
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -8,28 +9,64 @@ from shlex import quote
 from typing import Final, TypeVar
 
 from crossgrad_core.contract.contexts import RunInfo
+from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import notes_on
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
-from crossgrad_core.run.failure_report import is_unexpected, reason_of, traceback_of
+from crossgrad_core.run.checkpoint.checkpoint import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
-from crossgrad_core.run.results.log import RunLog
+from crossgrad_core.run.results.log import RunLog, roughly
 from crossgrad_core.run.results.metrics_csv import Row, read_metrics
 from crossgrad_core.run.results.seal import seal
 from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.system.checksums import SUMS
-from crossgrad_core.training.budget import Length
-from crossgrad_core.training.clock import PhaseTimer
-from crossgrad_core.training.edits import keep
+from crossgrad_core.training.budget import Length, seconds_ahead
 from crossgrad_core.training.floaters import rows_without_floaters, told_of
-from crossgrad_core.training.loop import evaluates_after, train
-from crossgrad_core.training.rollback import RollbackGuard
+from crossgrad_core.training.loop import Stopper, evaluates_after, train
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFailedError, TrainState
+from crossgrad_core.training.step import keep
 from crossgrad_core.wording import one_line
+
+#: How torch says that there is no memory, besides errors of a type of its own.
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
+
+
+def reason_of(error: BaseException) -> str:
+    """What went wrong; of an unexpected error also its type and place."""
+    if not is_unexpected(error):
+        return str(error)
+    text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    if is_out_of_memory(error):
+        return f"out of memory ({text}); try --max-gaussians N or --max-size PIXELS"
+    return f"{text}{_place(error)}"
+
+
+def is_unexpected(error: BaseException) -> bool:
+    """Whether the error is none that crossgrad words for its users."""
+    return not isinstance(error, UserError | TrainingFailedError)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory was asked for that is not there."""
+    if isinstance(error, MemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(sign in str(error) for sign in _NO_MEMORY)
+
+
+def traceback_of(error: BaseException) -> str:
+    """The traceback as text."""
+    return "".join(traceback.format_exception(error))
+
+
+def _place(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return ""
+    last = frames[-1]
+    return f" ({Path(last.filename).name}, line {last.lineno}, in {last.name})"
+
 
 #: A run that ends so many decibels below its best evaluation says so; where few photos are held out
 #: single evaluations differ by less all the time.
@@ -257,3 +294,56 @@ def _kept(course: RunLoop) -> list[str]:
         return []
     there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"
     return [f"the state of step {step} could not be saved; {there}"]
+
+
+#: Steps and training seconds to look at before anything is said; the very first step is left out.
+LOOK_STEPS, LOOK_SECONDS = 3, 2.0
+#: A run that takes less is over before an estimate helps.
+WORTH_A_LINE = 60.0
+
+
+class Forecast:
+    """Another length; says once how long the rest of the run will take.
+
+    Args:
+        length: The length that decides.
+    """
+
+    def __init__(self, length: Length) -> None:
+        self._length = length
+        self._first: tuple[int, float] | None = None
+        self._told = False
+
+    def due(self, state: TrainState) -> bool:
+        """When there is something to decide or to tell."""
+        if self._first is None:
+            self._first = state.step, state.clock.train
+        return self._length.due(state) or self._is_time(state)
+
+    def revised(self, setup: Setup, state: TrainState) -> Setup:
+        """The setup with the length that now holds."""
+        if self._length.due(state):
+            setup = self._length.revised(setup, state)
+        if self._is_time(state):
+            self._tell(setup, state)
+        return setup
+
+    def _is_time(self, state: TrainState) -> bool:
+        if self._told or self._first is None:
+            return False
+        step, seconds = self._first
+        return state.step - step >= LOOK_STEPS and state.clock.train - seconds >= LOOK_SECONDS
+
+    def _tell(self, setup: Setup, state: TrainState) -> None:
+        self._told = True
+        step, seconds = self._first or (0, 0.0)
+        each = (state.clock.train - seconds) / (state.step - step)
+        ahead = seconds_ahead(setup, state, each)
+        if ahead < WORTH_A_LINE:
+            return
+        left = setup.schedule.total - state.step
+        growth = ", growth included" if ahead > left * each else ""
+        setup.hook.crossgrad_log(
+            text=f"{left:,} more steps take {roughly(ahead)} (one takes {each * 1000:.0f} ms now"
+            f"{growth}); --seconds S sets a time instead, and Ctrl-C keeps what there is"
+        )

@@ -14,11 +14,10 @@ from crossgrad_core.contract.initializer import Initializer
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.poses import is_in_image
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.scene import Scene, is_in_image
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.defaults import METRICS, START_ALONE
 from crossgrad_core.errors import UserError

@@ -10,29 +10,26 @@ from crossgrad_core.contract.contexts import EvaluationReport
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.checkpoint.checkpoint import drop_later, latest, renew_scalars, save
-from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.checkpoint_io import to_checkpoint
+from crossgrad_core.run.checkpoint.checkpoint import Keep, drop_later, latest, renew_scalars, save
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
-from crossgrad_core.run.results.cost_totals import Totals
+from crossgrad_core.run.load_run import to_checkpoint
+from crossgrad_core.run.results.config_file import read_plan
 from crossgrad_core.run.results.curve import draw_curve
-from crossgrad_core.run.results.environment import environment
 from crossgrad_core.run.results.kept import KEY as KEPT
 from crossgrad_core.run.results.kept import kept_files
-from crossgrad_core.run.results.machine import Machine
+from crossgrad_core.run.results.machine import Machine, environment
 from crossgrad_core.run.results.metrics_csv import (
     MetricsCsv,
+    Totals,
     columns_for,
     metrics_row,
     read_metrics,
+    write_per_view,
 )
 from crossgrad_core.run.results.panels import PanelWriter
-from crossgrad_core.run.results.per_view import write_per_view
-from crossgrad_core.run.results.plan_file import read_plan
 from crossgrad_core.run.results.summary import Status, Summary, write_summary
 from crossgrad_core.training.memory import peak_mebibytes
-from crossgrad_core.training.per_image_params import write_photos
-from crossgrad_core.training.photo_file import FILE as PHOTO_VALUES
+from crossgrad_core.training.per_image_params import PHOTO_VALUES, write_photos
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.run.checkpoint.folders import CHECKPOINTS, named_checkpoints
+from crossgrad_core.run.checkpoint.checkpoint import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.results.summary import read_summary
@@ -99,9 +99,9 @@ class Run:
         """
         import torch
 
-        from crossgrad_core.run.asked_cameras import checked_camera
+        from crossgrad_core.run.app import as_in_a_command
+        from crossgrad_core.run.camera_path import checked_camera
         from crossgrad_core.run.export import camera_renderer, renderer, view_named
-        from crossgrad_core.run.process import as_in_a_command
 
         setup, state = self._open()
         with as_in_a_command(), torch.no_grad():
@@ -117,8 +117,8 @@ class Run:
         Raises:
             UserError: The run has no checkpoint, or its scene is another one.
         """
+        from crossgrad_core.run.app import as_in_a_command
         from crossgrad_core.run.postprocess.evaluate import evaluated
-        from crossgrad_core.run.process import as_in_a_command
 
         with as_in_a_command():
             return evaluated(self.folder, self._opened)[0]
@@ -141,8 +141,8 @@ class Run:
             UserError: The file exists or cannot be written, there is no such view, the scene is not
                 georeferenced, or the run has no checkpoint.
         """
+        from crossgrad_core.run.app import as_in_a_command
         from crossgrad_core.run.postprocess.export import exported
-        from crossgrad_core.run.process import as_in_a_command
 
         with as_in_a_command():
             out = Path(path)
@@ -157,8 +157,8 @@ class Run:
             return out
 
     def _open(self) -> "tuple[Setup, TrainState]":
+        from crossgrad_core.run.app import as_in_a_command
         from crossgrad_core.run.load_run import require_checkpoint
-        from crossgrad_core.run.process import as_in_a_command
 
         require_checkpoint(self.folder)
         with as_in_a_command():

@@ -4,8 +4,8 @@ from typing import Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.schedule import ViewsPerStepSpec
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.registry.entries import build
 

@@ -2,20 +2,25 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.scene import Camera, Scene, View, footprint
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.scene.blank_photos import without_blank_photos
+from crossgrad_core.errors import UserError
 from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
+from crossgrad_core.scene.decode import decode_mask, decode_photo
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
 from crossgrad_core.scene.photo_names import with_photo_names
 from crossgrad_core.scene.photo_store import PhotoStore, store_folder
 from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
-from crossgrad_core.scene.point_option import with_points_of_file
+from crossgrad_core.scene.point_cloud import read_cloud
+from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.raw_checks import (
     CheckedPoints,
@@ -23,11 +28,162 @@ from crossgrad_core.scene.raw_checks import (
     check_points,
     check_views,
 )
-from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
-from crossgrad_core.scene.split import Label, split_views
+from crossgrad_core.scene.split import Label, Split, split_views
 from crossgrad_core.scene.thinning import FEWEST, PER_PHOTO, thinned
 from crossgrad_core.scene.wording import count, name_some
+from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
+
+#: A photo of whose stored pixels at least this share counts keeps some whatever is done to it.
+#: Undistorting and resizing could take the last ones of others, so these are decoded.
+_SURE = 0.05
+_HALF = 128
+
+
+def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root: Path) -> Split:
+    """The split without training photos that are masked as a whole; a note names them.
+
+    Masks are read for it, and photos with transparency decoded. Held-out photos stay: their
+    figures say that they have no pixel.
+
+    Raises:
+        UserError: No training photo has a pixel that counts.
+    """
+    doubtful = [name for name in split.train if _can_be_blank(sources[name])]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(_is_blank, [sources[name] for name in doubtful]))
+    blank = [name for name, is_blank in zip(doubtful, found, strict=True) if is_blank]
+    if not blank:
+        return split
+    if len(blank) == len(split.train):
+        raise _all_blank(blank, root)
+    train = tuple(name for name in split.train if name not in set(blank))
+    what = f"{count(len(blank), 'training photo')} left out, masked as a whole: {name_some(blank)}"
+    return replace(split, train=train, notes=(*split.notes, f"masks: {what}"))
+
+
+def _can_be_blank(source: PhotoSource) -> bool:
+    return source.mask is not None or (source.alpha and source.background is None)
+
+
+def _is_blank(source: PhotoSource) -> bool:
+    if min(_counting_shares(source)) >= _SURE:
+        return False
+    keep = source.decode()[1]
+    return keep is not None and not bool(keep.any())
+
+
+def _counting_shares(source: PhotoSource) -> list[float]:
+    """Shares of the stored pixels that count, by the mask and by transparency."""
+    shares = [1.0]
+    if source.mask is not None:
+        shares.append(float((decode_mask(source.mask) > 0).mean()))
+    if source.alpha and source.background is None:
+        alpha = decode_photo(source.path)[1]
+        shares.append(1.0 if alpha is None else float((alpha >= _HALF).mean()))
+    return shares
+
+
+def _all_blank(names: Sequence[str], root: Path) -> UserError:
+    return UserError(
+        "every pixel of every training photo is masked",
+        where=root,
+        expected="white in a mask, or opaque in a photo with transparency, where a pixel counts",
+        found=f"no such pixel in {name_some(names)}",
+        todo="invert the masks if black is meant to count, or rename their folder to train without",
+    )
+
+
+def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
+    """The scene with the points of a file; no photo is known to have observed any of them.
+
+    Args:
+        raw: The scene as a reader found it.
+        option: The file, as it is or within the scene; None keeps the points of the reader.
+
+    Raises:
+        UserError: The file is not there, cannot be read, holds Gaussians, or stands in another
+            frame than the cameras.
+    """
+    if option is None:
+        return raw
+    path = next(filter(is_file, (option, raw.root / option)), None)
+    if path is None:
+        raise UserError(
+            "the file of points is not there",
+            where=option,
+            expected="a PLY, LAS or LAZ file, as it is or within the scene",
+            todo="check the path: --points FILE",
+        )
+    cloud = read_cloud(path, path.name)
+    if cloud.gaussians:
+        raise UserError(
+            "a PLY of Gaussians in place of points",
+            where=path,
+            expected="positions and colours",
+            todo=f"--init {option} starts from its Gaussians",
+        )
+    check_seen(cloud, raw.views, path, "cut the cloud to what the photos show; or leave it out")
+    views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in raw.views)
+    note = f"points: {len(cloud.positions):,} from {path.name}, in place of those of the scene"
+    return replace(
+        raw,
+        views=views,
+        points=cloud.positions,
+        point_colors=cloud.colors,
+        notes=(*raw.notes, note),
+        files=(*raw.files, path),
+    )
+
+
+NEAR, FAR = "near", "far"
+# Label of the photos that lie directly in the image folder, beside folders.
+_TOP = "images"
+# Label of all views where nothing tells near from far.
+_ONLY = "all"
+
+
+def label_by_folder(names: Sequence[str]) -> tuple[str, ...] | None:
+    """The first folder in which the names differ; None where all are in one folder."""
+    folders = [PurePosixPath(name).parent.parts for name in names]
+    shared = 0
+    while len({parts[: shared + 1] for parts in folders}) == 1:
+        if len(folders[0]) <= shared:
+            return None
+        shared += 1
+    return tuple("/".join(parts[shared : shared + 1]) or _TOP for parts in folders)
+
+
+def label_by_footprint(
+    cameras: Sequence[Camera],
+    seen: Sequence[NDArray[np.int64]],
+    points: NDArray[np.float64],
+    train: Sequence[int],
+) -> tuple[str, ...]:
+    """Near where the scene is drawn at least as large as in the median training view, else far.
+
+    See `contract.poses.footprint`. A view without one takes that of the nearest camera that has
+    one. Without a footprint at all, every view is in one regime `all`.
+
+    Args:
+        cameras: Cameras of all views, local frame.
+        seen: Rows of `points` that each view observed.
+        points: [P, 3], local frame.
+        train: Indices of the training views: the median is theirs.
+    """
+    footprints = np.array(
+        [footprint(camera, points, rows) for camera, rows in zip(cameras, seen, strict=True)]
+    )
+    known = np.isfinite(footprints)
+    trained = footprints[[i for i in train if known[i]]]
+    if not len(trained):
+        return (_ONLY,) * len(cameras)
+    centers = np.stack([camera.center.numpy() for camera in cameras])
+    for i in np.flatnonzero(~known):
+        distance = np.linalg.norm(centers[known] - centers[i], axis=1)
+        footprints[i] = footprints[known][distance.argmin()]
+    threshold = np.median(trained)
+    return tuple(NEAR if value >= threshold else FAR for value in footprints)
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:

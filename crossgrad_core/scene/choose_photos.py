@@ -1,18 +1,19 @@
 """Which file, size and calibration every view gets; only headers are read."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from crossgrad_core.contract.scene import Pinhole
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.decode import FULL_16_BIT
+from crossgrad_core.scene.decode import FULL_16_BIT, WHITES, brightest
 from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
 from crossgrad_core.scene.ledger import note_unused
 from crossgrad_core.scene.mask_files import check_masks, find_mask_folder, pair_masks
-from crossgrad_core.scene.photo_bits import white_of
 from crossgrad_core.scene.photo_files import PhotoFolder, find_photo_folders
 from crossgrad_core.scene.photo_notes import (
     note_kinds,
@@ -28,6 +29,44 @@ from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.reduction import choose_reduction
 from crossgrad_core.scene.shapes import check_mask, is_scaled
 from crossgrad_core.scene.wording import count, name_some
+
+#: Photos of 8, 10, 12 or 14 bits reach this share of that range; darker ones may be anything.
+_REACHED: Final = 0.8
+#: Photos with a larger value use their 16 bits.
+_DARK: Final = WHITES[-2]
+#: Photos that are decoded before the largest value is looked at.
+_AT_ONCE: Final = 8
+
+
+def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
+    """Return the value of white for all photos of 16 bits, and a note if it is not 65535.
+
+    All photos share one value, which depends on the brightest pixel of all. Photos that use a small
+    part of their range without filling that of a smaller number of bits are left dark.
+
+    Args:
+        deep: The photos. They are decoded until one is bright enough for 16 bits.
+
+    Raises:
+        UserError: A photo is damaged.
+    """
+    top = 0 if deep else FULL_16_BIT
+    with ThreadPoolExecutor() as pool:
+        for start in range(0, len(deep), _AT_ONCE):
+            top = max(top, *pool.map(brightest, deep[start : start + _AT_ONCE]))
+            if top > _DARK:
+                break
+    if top > _DARK:
+        return FULL_16_BIT, []
+    white = next(white for white in WHITES if white >= top)
+    photos = f"photos: {count(len(deep), 'photo')} of 16 bits"
+    bits = white.bit_length()
+    if white > WHITES[0] and top >= _REACHED * white:
+        return white, [f"{photos} hold {bits}-bit values (up to {top}): scaled, {white} is white"]
+    return FULL_16_BIT, [
+        f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) and are dark; "
+        f"if they hold {bits}-bit values, save them scaled to 16 bits"
+    ]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.similarity import Similarity
-from crossgrad_core.contract.strays import stray_rows
+from crossgrad_core.contract.scene import Similarity, stray_rows
 
 # 1.1 x the largest distance of a training camera from their mean (3DGS, scene extent).
 _MARGIN = 1.1

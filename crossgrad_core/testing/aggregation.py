@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import Block, LearningRate, PluginState
 from crossgrad_core.contract.contexts import AggregateContext, AggregateResult
 from crossgrad_core.contract.operator import STATE, Operator
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.testing.contract import (
@@ -26,7 +25,7 @@ from crossgrad_core.testing.contract import (
 )
 from crossgrad_core.testing.fixtures import step_fields
 from crossgrad_core.testing.growth import require_bounded, size_of
-from crossgrad_core.training.operator_scale import OperatorScale
+from crossgrad_core.training.setup import OperatorScale
 
 _RATE = LearningRate(0.01)
 BLOCKS = (

@@ -8,11 +8,10 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.blocks import Edit, Parameters, apply_to_parameters, primitives_of
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.defaults import REFERENCE_RASTERIZER
 from crossgrad_core.numerics.spherical import COEFFICIENTS
 from crossgrad_core.registry import entries as registry

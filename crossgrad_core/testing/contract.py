@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.component import Component, ViewCounts
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)

@@ -8,13 +8,20 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Block, Parameters, primitives_of
+from crossgrad_core.contract.blocks import (
+    Block,
+    Edit,
+    Parameters,
+    PluginState,
+    apply_to_parameters,
+    gather_indices,
+    misfit_of,
+    primitives_of,
+)
 from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
 from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices, misfit_of
 from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created

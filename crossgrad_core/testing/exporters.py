@@ -8,7 +8,7 @@ import torch
 
 from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import sample_gaussians

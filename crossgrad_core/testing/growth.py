@@ -7,7 +7,7 @@ state that grows with every step makes each checkpoint larger than the one befor
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.contract import require
 
 #: Steps of the first look, which is enough for a state that does not grow.

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import AdamState
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand
 from crossgrad_core.training.state import TrainState
 

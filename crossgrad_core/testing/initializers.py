@@ -1,4 +1,4 @@
-"""Contract checks of starts."""
+"""Contract checks of initializers."""
 
 from contextlib import suppress
 from dataclasses import fields
@@ -66,4 +66,4 @@ def answers_alike(make: Make[Initializer]) -> None:
             require(same, f"{each.name} differ from one call to the next")
 
 
-START_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)
+INITIALIZER_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.adam_state import AdamState
 from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import NO_EDIT, AdamState, Edit, PluginState
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -43,8 +43,6 @@ from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.observer import Observer
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_seam, make_manager

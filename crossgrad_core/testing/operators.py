@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.blocks import BlockKind
+from crossgrad_core.contract.blocks import EMPTY_STATE, BlockKind, PluginState
 from crossgrad_core.contract.contexts import OperatorContext
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
 from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
 from crossgrad_core.testing.aggregation import AGGREGATION_CHECKS
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (

@@ -8,12 +8,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import SampleContext, StepRecord, ViewSample
 from crossgrad_core.contract.sampler import Sampler
-from crossgrad_core.contract.scene import Camera, Scene, View
+from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.similarity import Similarity
-from crossgrad_core.contract.state import PluginState
 
 
 class _Blank:

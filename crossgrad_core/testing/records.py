@@ -5,7 +5,7 @@ import torch
 from crossgrad_core.contract.contexts import ViewRecord
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import View
-from crossgrad_core.training.view_target import camera_at
+from crossgrad_core.training.views import camera_at
 
 
 def view_record(

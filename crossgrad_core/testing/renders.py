@@ -14,7 +14,7 @@ from crossgrad_core.contract.schedule import Phase
 from crossgrad_core.defaults import LOSS
 from crossgrad_core.registry.entries import build
 from crossgrad_core.training.scaled_photos import reduced
-from crossgrad_core.training.view_target import camera_at
+from crossgrad_core.training.views import camera_at
 
 
 def renders_of(

@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import ScaleContext, StepRecord, ViewSample
 from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
     Check,

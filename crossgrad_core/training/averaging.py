@@ -9,9 +9,13 @@ from typing import Final
 
 from torch import Tensor
 
-from crossgrad_core.contract.blocks import LearningRate, Parameters
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.contract.blocks import (
+    Edit,
+    LearningRate,
+    Parameters,
+    PluginState,
+    apply_to_parameters,
+)
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 

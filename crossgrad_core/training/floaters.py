@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from crossgrad_core.contract.blocks import Edit, apply_to_parameters
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.training.averaging import eval_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState

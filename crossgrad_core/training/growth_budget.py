@@ -4,8 +4,8 @@ import sys
 from typing import cast
 
 from crossgrad_core.config import AUTO
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.training.memory import Demand, kept_bytes, room_for_primitives
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState

@@ -1,25 +1,186 @@
 """The loop around the step: evaluation, checkpoints, interruption, rewinding."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal, Protocol
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from types import FrameType
+from typing import Any, Literal, Protocol
 
+import numpy as np
+
+from crossgrad_core.contract.blocks import EMPTY_STATE, PluginState
 from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.contract.sampler import STATE
 from crossgrad_core.system.allocator import use_large_pages
-from crossgrad_core.training.checks import check_dropped, check_start
-from crossgrad_core.training.clock import PhaseTimer
-from crossgrad_core.training.failure import NonFiniteError, TrainingFailedError
-from crossgrad_core.training.model import model_of
-from crossgrad_core.training.rollback import RollbackGuard, is_whole
+from crossgrad_core.system.interrupts import end_at_once, signal_names, tell
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.step import take_step
-from crossgrad_core.training.stopper import Stopper
-from crossgrad_core.training.view_prefetch import Prefetcher
+from crossgrad_core.training.state import (
+    NonFiniteError,
+    PhaseTimer,
+    RollbackGuard,
+    TrainingFailedError,
+    TrainState,
+    check_dropped,
+    check_start,
+    is_whole,
+)
+from crossgrad_core.training.step import model_of, sample_context, take_step
+from crossgrad_core.training.views import photo_camera
+
+#: What the user is told at the first and at the second signal; the third one ends the process.
+_WORDS = (
+    "stopping: what there is gets saved and evaluated first (once more: only saved)",
+    "stopping: what there is gets saved first (once more: ends at once)",
+)
+
+
+@dataclass
+class Stopper:
+    """Whether and why a run is to stop.
+
+    Attributes:
+        signal: Number of the first signal; None where there was none.
+        at_once: Whether a second one came: what only takes time is left out.
+        error: What was found beside training and ends it; None where nothing was.
+    """
+
+    signal: int | None = None
+    at_once: bool = False
+    error: Exception | None = None
+    _interruptible: bool = field(default=False, repr=False)
+    _count: int = field(default=0, repr=False)
+    _before: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def requested(self) -> bool:
+        """Whether training is to stop after the step under way."""
+        return self.signal is not None or self.error is not None
+
+    def fail(self, error: Exception) -> None:
+        """Asks the run to end after its step because of an error found beside it, in any thread."""
+        self.error = error
+
+    @contextmanager
+    def installed(self) -> Iterator["Stopper"]:
+        """Handles signals inside the block; does nothing outside the main thread.
+
+        A signal that the process was told to ignore (`nohup`, a job in the background) stays so.
+        """
+        before = self._before
+        try:
+            for number in signal_names():
+                before[number] = signal.signal(number, self._handle)
+        except ValueError:  # Signals can be handled in the main thread only.
+            yield self
+            return
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Inside the block a second signal raises KeyboardInterrupt; elsewhere it is only noted."""
+        self._interruptible = not self.at_once
+        try:
+            yield
+        finally:
+            self._interruptible = False
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._count += 1
+        if self._count > len(_WORDS):
+            self._end(number, frame)
+        tell(_WORDS[self._count - 1])
+        if self.signal is None:
+            self.signal = number
+            return
+        self.at_once = True
+        if self._interruptible:
+            self._interruptible = False
+            raise KeyboardInterrupt
+
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        """Leaves the end to the previous handler of signals; in Python itself an exception."""
+        before = self._before.get(number)
+        (before if callable(before) else end_at_once)(number, frame)
+        raise KeyboardInterrupt
+
+
+#: Views, or where they are more those of two steps, that are foreseen.
+_VIEWS, _STEPS = 8, 2
+
+
+class Prefetcher:
+    """Lets the sampler draw ahead on copies of its random stream and its state.
+
+    A guess, which only decides what is decoded first: a sampler that looks at the losses of the
+    step before may draw other views then. Nothing that the run itself uses is touched.
+
+    Args:
+        setup: The run.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._draws: deque[tuple[int, ...]] = deque()
+        self._step = 0
+        self._rng = np.random.default_rng(0)
+        self._state: PluginState = EMPTY_STATE
+        self._blind = False
+
+    def update(self, state: TrainState) -> None:
+        """Names the photos of the steps after `state.step` to those who decode them."""
+        setup = self._setup
+        if self._blind or not setup.photos_ahead.useful:
+            return
+        try:
+            self._follow(state)
+            self._draw(state)
+            views = [setup.train_views[index] for draw in self._draws for index in draw]
+        except Exception:  # The step itself will say what is wrong.
+            self._blind = True
+            return
+        scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
+        small = setup.scaled_photos
+        wanted = [v for v in views if not small.holds(v, photo_camera(setup, v, scale))]
+        setup.photos_ahead.expect(wanted)
+
+    def _follow(self, state: TrainState) -> None:
+        """Forgets the step that was taken, and all others where it drew something else."""
+        if self._draws and self._step - len(self._draws) == state.step - 1:
+            drawn = self._draws.popleft()
+            if state.last is not None and state.last.views == drawn:
+                return
+        elif self._draws and self._step - len(self._draws) == state.step:
+            return
+        self._draws.clear()
+        self._step = state.step
+        self._rng = deepcopy(state.rngs[STATE])
+        self._state = state.states.get(STATE, EMPTY_STATE)
+
+    def _draw(self, state: TrainState) -> None:
+        setup = self._setup
+        while self._step < setup.schedule.total and not self._enough():
+            context = replace(
+                sample_context(setup, state, self._step + 1),
+                rng=self._rng,
+                states={**state.states, STATE: self._state},
+            )
+            draw, self._state = setup.sampler.sample(context, self._state)
+            self._draws.append(tuple(map(int, draw.views)))
+            self._step += 1
+
+    def _enough(self) -> bool:
+        return len(self._draws) >= _STEPS and sum(map(len, self._draws)) >= _VIEWS
+
 
 #: Why the loop came back.
 Ending = Literal["finished", "stopped", "paused"]
-
 #: Steps between looks at all parameters. Losses and gradients are looked at in every step; a bad
 #: parameter that touches neither (a Gaussian that is not drawn any more) can wait so long.
 CHECK_EVERY = 10

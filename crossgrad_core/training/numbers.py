@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from crossgrad_core.config import RunConfig
+from crossgrad_core.config import Growth, RunConfig
 from crossgrad_core.contract.schedule import Unit
 from crossgrad_core.errors import UserError
 from crossgrad_core.wording import listed
@@ -22,7 +22,7 @@ class Numbers:
     lr_tail: float
     floaters: Literal["keep", "remove"]
     dropout: float
-    growth: Literal["unbounded", "budget"]
+    growth: Growth
     max_gaussians: int | Literal["auto"]
     step_order: Literal["optimize-first", "densify-first"]
     schedule_unit: Unit

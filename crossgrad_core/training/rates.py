@@ -3,8 +3,7 @@
 from math import sqrt
 from typing import Final
 
-from crossgrad_core.contract.adam_state import AdamRule
-from crossgrad_core.contract.blocks import LearningRate, Parameters
+from crossgrad_core.contract.blocks import AdamRule, LearningRate, Parameters
 from crossgrad_core.errors import UserError
 from crossgrad_core.training.averaging import tail_lr_factor
 from crossgrad_core.training.setup import Setup

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.poses import is_in_image
-from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.scene import Scene, is_in_image
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 

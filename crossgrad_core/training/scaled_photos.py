@@ -1,12 +1,14 @@
 """Photos in a smaller size, by an area filter, in a bounded amount of memory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from threading import Event, Thread
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.scene import Camera, Scene, View
 
 #: Photo [H, W, 3] uint8 and mask [H, W] bool, None where every pixel counts.
 Pair = tuple[Tensor, Tensor | None]
@@ -136,3 +138,28 @@ def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair
     reduce_by_area(rows, kept, small, counts)
     found = torch.from_numpy(small).to(image.device)
     return found, None if counts.all() else torch.from_numpy(counts).to(image.device)
+
+
+@contextmanager
+def decoded_meanwhile(scene: Scene) -> Iterator[None]:
+    """Decodes the scene's photos in a thread as long as the block runs, the held-out ones first.
+
+    They stay where decoded photos are kept, as far as there is room. A photo that cannot be decoded
+    is left alone; the next access to it raises the error.
+    """
+    over = Event()
+    thread = Thread(target=_decode, args=(scene, over), name="crossgrad-photos", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def _decode(scene: Scene, over: Event) -> None:
+    for view in (*scene.test_views, *scene.train_views):
+        if over.is_set():
+            return
+        with suppress(Exception):
+            view.photo.image()

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, SupportsIndex
+from time import perf_counter, process_time
+from typing import Any, Final, Literal, SupportsIndex, get_args
 
 import numpy as np
 import torch
@@ -10,16 +11,119 @@ from pluggy import HookCaller
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.contract.blocks import Parameters, primitives_of
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    SLOTS,
+    TAKEN,
+    AdamState,
+    Parameters,
+    PluginState,
+    primitives_of,
+)
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.state import EMPTY_STATE, SLOTS, TAKEN, PluginState
 from crossgrad_core.errors import UserError
+from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.training.adam.late import Late
-from crossgrad_core.training.clock import Clock, PhaseTimer
 from crossgrad_core.training.rngs import make_streams, restored_streams, stream_states
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
+
+#: What a budget counts: seconds of the clock on the wall, or of CPU time of the process.
+ClockKind = Literal["wall", "cpu"]
+Phase = Literal[
+    "photos",
+    "decode",
+    "render",
+    "loss",
+    "backward",
+    "aggregation",
+    "optimizer",
+    "density_control",
+    "other",
+]
+#: What a step spends time on: `photos` is choosing views and scales and having the photos at hand
+#: (decoding files is loading), `loss` has exposure, pixel weights and regularisation in it.
+PHASES: Final[tuple[Phase, ...]] = get_args(Phase)
+
+
+@dataclass
+class Clock:
+    """Seconds by what they were spent on; only `train` counts as training.
+
+    Attributes:
+        train: Training.
+        compile: Compiling kernels.
+        load: Reading the scene and decoding photos.
+        evaluate: Evaluating held-out views.
+        report: Writing results.
+        phases: Training seconds by phase of the step; together they are `train`. Work of a GPU, or
+            of the other threads alone, is counted in the phase that waits for it.
+        cpu: Seconds of CPU time that the process took while it trained, all threads together, but
+            for what others do between two steps where this clock is no budget.
+    """
+
+    train: float = 0.0
+    compile: float = 0.0
+    load: float = 0.0
+    evaluate: float = 0.0
+    report: float = 0.0
+    phases: dict[str, float] = field(default_factory=dict)
+    cpu: float = 0.0
+
+    def trained(self, kind: ClockKind) -> float:
+        """Training seconds of that kind."""
+        return self.cpu if kind == "cpu" else self.train
+
+    def copy(self) -> "Clock":
+        """A copy that stays as it is."""
+        return replace(self, phases=dict(self.phases))
+
+    def count(self, laps: "PhaseTimer") -> None:
+        """Adds a complete step."""
+        self.train += laps.total
+        self.cpu += laps.cpu
+        for phase in PHASES:
+            self.phases[phase] = self.phases.get(phase, 0.0) + laps.spent.get(phase, 0.0)
+
+
+@dataclass
+class PhaseTimer:
+    """The phases of the step under way; a step that is cut short counts for none.
+
+    Attributes:
+        border: When the present phase began.
+        total: Seconds from the start of the step to the last border, without what was left out.
+        spent: Phase -> seconds.
+        cpu: CPU seconds of the process from the start of the step to the last border, likewise.
+        cpu_border: CPU time of the process at the last border.
+    """
+
+    phase_began: float = field(default_factory=perf_counter)
+    total: float = 0.0
+    spent: dict[str, float] = field(default_factory=dict)
+    cpu: float = 0.0
+    cpu_border: float = field(default_factory=process_time)
+
+    def lap(self, phase: Phase) -> None:
+        """Ends a phase here: the seconds since the last border were spent on it."""
+        now = perf_counter()
+        seconds = now - self.phase_began
+        self.spent[phase] = self.spent.get(phase, 0.0) + seconds
+        self.total += seconds
+        self.phase_began = now
+        cpu = process_time()
+        self.cpu += cpu - self.cpu_border
+        self.cpu_border = cpu
+
+    def leave_out(self, seconds: float, cpu: float) -> None:
+        """Does not count seconds of the present phase: they belong to another clock.
+
+        Args:
+            seconds: Seconds on the wall.
+            cpu: Seconds of CPU time in them.
+        """
+        self.phase_began += seconds
+        self.cpu_border += cpu
 
 
 @dataclass
@@ -315,3 +419,151 @@ def copied_moments(adam: AdamState) -> AdamState:
         exp_avg_sq={name: tensor.clone() for name, tensor in adam.exp_avg_sq.items()},
         steps=dict(adam.steps),
     )
+
+
+class NonFiniteError(Exception):
+    """A loss, gradient or parameter is NaN or infinite.
+
+    Args:
+        step: Step in which it was found.
+        views: Names of the views of that step (the one view, where it can be told).
+        block: What is not finite.
+    """
+
+    def __init__(self, step: int, views: tuple[str, ...], block: str) -> None:
+        self.step = step
+        self.views = views
+        self.block = block
+        super().__init__(
+            f"{block} is not finite in step {step}, view{'s' if len(views) > 1 else ''} "
+            f"{', '.join(views)}"
+        )
+
+
+class TrainingFailedError(Exception):
+    """Training cannot go on; the results so far and the last checkpoint are kept."""
+
+
+def are_parameters_finite(state: TrainState) -> bool:
+    """Whether no parameter is NaN or infinite."""
+    state.late.finish()
+    return all(is_finite(tensor) for tensor in state.tensors.values())
+
+
+def check_parameters(state: TrainState) -> None:
+    """Raises NonFiniteError where a parameter is NaN or infinite after a step."""
+    state.late.finish()
+    for name, tensor in state.tensors.items():
+        if not is_finite(tensor):
+            views = () if state.last is None else state.last.names
+            raise NonFiniteError(state.step, views, f"block {name}")
+
+
+def check_start(state: TrainState) -> None:
+    """Refuses to train from a state that is bad already: nothing could be gone back to.
+
+    Raises:
+        TrainingFailedError: A parameter or moment is NaN or infinite; names it.
+    """
+    parts = {
+        "block": state.parameters,
+        "the first moment of": state.adam.exp_avg,
+        "the second moment of": state.adam.exp_avg_sq,
+    }
+    for kind, tensors in parts.items():
+        for name, tensor in tensors.items():
+            if not is_finite(tensor):
+                raise TrainingFailedError(
+                    f"{kind} {name} is not finite in the state of step {state.step} that training "
+                    f"was to go on from; {_way_out(state.step)}"
+                )
+
+
+def _way_out(step: int) -> str:
+    if step == 0:
+        return "look at the Gaussians of --init, or at what changes the first parameters"
+    return f"remove checkpoints/step-{step:06d} to go on from an earlier one, where there is one"
+
+
+def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
+    """Stops a run that had to drop too many non-finite gradients."""
+    if state.counters.dropped >= setup.config.max_nonfinite_blocks:
+        raise TrainingFailedError(
+            f"{state.counters.dropped} blocks of single views were dropped because their gradient "
+            f"was not finite, the last in step {state.step} (views {', '.join(record.names)})"
+        )
+
+
+class RollbackGuard:
+    """Holds the state before the step under way, and a copy of an earlier good one.
+
+    Most of what can go wrong in a step (sampling, a photo, rendering, an operator, the memory)
+    does so before parameters change: then only the step under way is lost. Where an optimizer step
+    or an edit was cut short, the copy takes their place. Only a state that was looked at is copied.
+
+    Args:
+        state: The state that training starts from, which was looked at.
+    """
+
+    def __init__(self, state: TrainState) -> None:
+        self._snapshot = Snapshot.of(state)
+        self._mark = self._snapshot.mark
+        self._looked = state.step
+        state.touched = False
+
+    def commit(self, state: TrainState, *, look: bool = False) -> None:
+        """Notes that a step is complete.
+
+        Raises:
+            NonFiniteError: `look` was asked for, and a parameter is NaN or infinite.
+        """
+        if look:
+            self.check(state)
+        self._mark = StepSnapshot.of(state)
+        state.touched = False
+
+    def check(self, state: TrainState) -> None:
+        """Looks at the parameters, unless that was done after this very step.
+
+        Raises:
+            NonFiniteError: One of them is NaN or infinite.
+        """
+        if self._looked != state.step:
+            check_parameters(state)
+            self._looked = state.step
+
+    def copy(self, state: TrainState) -> None:
+        """Takes this state as the one to go back to.
+
+        Raises:
+            NonFiniteError: A parameter is NaN or infinite.
+        """
+        self.check(state)
+        self._snapshot = Snapshot.of(state)
+
+    def rewind(self, state: TrainState, seed: int) -> None:
+        """Puts `state` back to the copy, with fresh random streams."""
+        self._snapshot.restore(state, seed)
+        self._looked = state.step
+        self.commit(state)
+
+    def restore(self, state: TrainState) -> None:
+        """Puts `state` back to the last complete step, or further back to the copy.
+
+        It is for the end of training: there may be no copy afterwards.
+        """
+        for tensor in state.tensors.values():
+            tensor.grad = None
+        if not state.touched and is_whole(state):
+            self._mark.restore(state)
+        else:
+            self._snapshot.hand_over(state)
+            state.touched = False
+
+
+def is_whole(state: TrainState) -> bool:
+    """Whether all parameters are finite, as far as the machine lets it be seen."""
+    try:
+        return are_parameters_finite(state)
+    except Exception:  # Its last step has failed, there is no memory for it, or the GPU failed.
+        return False

@@ -1,27 +1,43 @@
 """One optimizer step: sample, render, aggregate, optimize, densify."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract import sampler
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    AdamRule,
+    AdamState,
+    Block,
+    Edit,
+    Parameters,
+    PluginState,
+    apply_to_moment,
+    apply_to_parameters,
+    gather_indices,
+    misfit_of,
+)
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
     AggregateResult,
     DensifyContext,
     DensifyResult,
+    Model,
     SampleContext,
     SampleResult,
     StepRecord,
+    ViewRecord,
     ViewSample,
 )
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.state import EMPTY_STATE
-from crossgrad_core.contract.topology import Edit
+from crossgrad_core.contract.grouping import Regrouping, Rule
+from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.gradients.sparse_rows import coalesced, dense
@@ -29,24 +45,251 @@ from crossgrad_core.registry.manager import call_question, call_seam
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.adam.axes import step_along_axes
-from crossgrad_core.training.averaging import restart, update_average
-from crossgrad_core.training.densify_views import observed_views
-from crossgrad_core.training.edits import apply_edit, put_in_order
-from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.averaging import STATE as AVERAGE
+from crossgrad_core.training.averaging import restart, update_average, with_rows
 from crossgrad_core.training.growth_budget import max_new_gaussians
-from crossgrad_core.training.operator_scale import Scale
-from crossgrad_core.training.per_image_params import take_photo_step
+from crossgrad_core.training.per_image_params import apply, take_photo_step
 from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
-from crossgrad_core.training.regularize import TensorGradients, add_regularization, joined
-from crossgrad_core.training.relabel import groups_of, regroup_if_due
-from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.scale_clamp import clamp_scales
-from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.view_target import context_fields
-from crossgrad_core.training.views import Rendered, render_views, scales_of
+from crossgrad_core.training.setup import Scale, Setup
+from crossgrad_core.training.state import NonFiniteError, TrainState
+from crossgrad_core.training.views import (
+    RenderCallback,
+    Rendered,
+    TensorGradients,
+    add_regularization,
+    context_fields,
+    eval_background,
+    joined,
+    observe_view,
+    render_views,
+    scales_of,
+)
 from crossgrad_core.wording import listed
+
+
+def model_of(setup: Setup, state: TrainState) -> Model:
+    """The model as it is after the last step, shared, not copied."""
+    return Model(
+        phase=setup.phase(state.step, training=True),
+        scene=setup.scene,
+        backbone=setup.backbone,
+        rasterizer=setup.rasterizer,
+        parameters=state.parameters,
+        adam=state.adam,
+        background=eval_background(setup),
+        loss=setup.loss,
+        exposed=partial(apply, setup, state),
+        rule=rule_at(setup, state.step + 1),
+        render=RenderCallback(setup, state, counted=False),
+        groups=setup.groups,
+    )
+
+
+#: Name of the state that holds the labels, and of their stream of random numbers.
+GROUPING = "grouping"
+_LABELS = "labels"
+
+
+def regroup_if_due(setup: Setup, state: TrainState) -> None:
+    """Groups the training views anew where the step that was done last is the one for it.
+
+    The sampler starts afresh: what it remembers (decks of views, turns) is about the old groups.
+    """
+    grouping = setup.selection.grouping
+    if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
+        return
+    rule = grouping.refit(model_of(setup, state), state.rngs[GROUPING])
+    labels = labels_of(rule, setup.scene, setup.selection.names["grouping"])
+    state.commit({GROUPING: PluginState({_LABELS: list(labels)}), sampler.STATE: EMPTY_STATE})
+    for note in rule.notes:
+        setup.hook.crossgrad_log(text=f"step {state.step}: {note}")
+
+
+def labels_of(rule: Rule, scene: Scene, name: str) -> tuple[str, ...]:
+    """The labels of the training views by the rule of the grouping of that name, one for each."""
+    labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
+    if len(labels) == len(views):
+        return labels
+    raise UserError(
+        f"grouping {name} does not label each view",
+        found=f"{len(labels)} labels of {len(views)} training views",
+        todo="choose another --grouping, or repair the plugin",
+    )
+
+
+def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:
+    """The label of each training view now; None where there is no grouping."""
+    known = state.states.get(GROUPING, EMPTY_STATE).values.get(_LABELS)
+    return tuple(map(str, known)) if isinstance(known, list) else setup.groups
+
+
+#: Name of the stream that all random numbers of further views come from.
+STREAM = "density"
+
+
+def observed_views(
+    setup: Setup, state: TrainState, records: Sequence[ViewRecord]
+) -> tuple[ViewRecord, ...]:
+    """Of the views of a step those that density control gets, and a further one where it is due.
+
+    Raises:
+        NonFiniteError: The loss of the further view is not finite.
+    """
+    if setup.config.densify_views == "one":
+        # Each place of a draw in turn, as samplers may always put the same group first.
+        return (records[state.step % len(records)],)
+    wanted = setup.schedule.grows and setup.schedule.collects(state.step)
+    if setup.config.densify_views != "extra" or not wanted:
+        return tuple(records)
+    # Whatever is drawn for the further view, its background and what plugins draw included.
+    streams, states = dict.fromkeys(state.rngs, state.rngs[STREAM]), dict(state.states)
+    state = replace(state, rngs=streams, states=states)
+    index = int(state.rngs[STREAM].integers(len(setup.train_views)))
+    groups = groups_of(setup, state)
+    draw = ViewSample((index,), None if groups is None else (groups[index],))
+    return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
+
+
+#: Primitives from which on they are put in order: of 59 parameters each and their moments, 12 MB.
+FEWEST_SORTED = 2**14
+#: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame (of which the
+#: cameras span about one): farther away than 128 units all is one cell.
+_BITS = 21
+_CELLS = 2**13
+#: Shifts and masks that put two zeros between the bits of a number, from Morton's interleaving.
+_SPREAD = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def along_curve(positions: Tensor) -> Tensor:
+    """[N] int64: rows of `positions` [N, 3] (local frame) along Morton's curve; stable."""
+    highest = 2**_BITS - 1
+    cells = torch.nan_to_num(positions.detach().double() * _CELLS + 2 ** (_BITS - 1), nan=0.0)
+    codes = cells.clamp(0, highest).long()
+    for shift, mask in _SPREAD:
+        codes = (codes | (codes << shift)) & mask
+    return torch.argsort(codes[:, 0] | (codes[:, 1] << 1) | (codes[:, 2] << 2), stable=True)
+
+
+def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Tensor | None:
+    """[N] int64, the rows of the primitives along the curve; None where they stay as they are.
+
+    Args:
+        parameters: In any order.
+        blocks: Of the backbone.
+        name: The tensor that has the positions; without it the order stays as it is.
+    """
+    if not any(block.per_primitive and name in block.tensors for block in blocks):
+        return None
+    return along_curve(parameters[name]) if len(parameters[name]) >= FEWEST_SORTED else None
+
+
+def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Parameters:
+    """The parameters with their primitives in that order."""
+    rows = in_order(parameters, blocks, name)
+    return (
+        parameters if rows is None else apply_to_parameters(Edit(source=rows), blocks, parameters)
+    )
+
+
+def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
+    """Edits parameters, moments and plugin states together.
+
+    Returns:
+        Whether the set of primitives changed.
+
+    Raises:
+        UserError: The edit does not fit the parameters.
+    """
+    if edit.is_empty:
+        return False
+    if misfit := misfit_of(edit, setup.blocks, state.tensors):
+        raise UserError(
+            "a plugin's edit does not fit the primitives",
+            where=f"step {state.step}, densifier {setup.selection.names['densifier']} or a plugin "
+            "that acts after steps",
+            found=misfit,
+            todo="repair the plugin; `crossgrad plugins check` looks at its edits",
+        )
+    _apply(setup, state, edit)
+    if edit.source is None:
+        return False
+    phase = setup.phase(state.step, training=True)
+    state.tensors = setup.backbone.prepare(state.tensors, setup.scene, phase)
+    return True
+
+
+def keep(setup: Setup, state: TrainState, rows: Tensor) -> None:
+    """Keeps these primitives only, as they are: what a backbone derives is not renewed.
+
+    What ends it halfway leaves the state as it was.
+
+    Args:
+        setup: The run.
+        state: Its state.
+        rows: [M] int64, in rising order.
+    """
+    edit, adam, before = Edit(rows), state.adam, state.primitives(setup)
+    names = [n for block in setup.blocks if block.per_primitive for n in block.tensors]
+    first, second = (
+        {**moments, **{n: apply_to_moment(edit, n, moments[n]) for n in names if n in moments}}
+        for moments in (adam.exp_avg, adam.exp_avg_sq)
+    )
+    tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
+    source, fresh = gather_indices(edit, before, rows.device)
+    states = {
+        name: with_rows(setup, state, old, rows)
+        if name == AVERAGE
+        else _gathered(name, old, source, fresh, before)
+        for name, old in state.states.items()
+    }
+    state.moments = replace(adam, exp_avg=first, exp_avg_sq=second)
+    state.tensors, state.states = tensors, states
+
+
+def put_in_order(setup: Setup, state: TrainState) -> None:
+    """Puts the primitives in the order in which they are kept, when a step has edited them."""
+    rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
+    if rows is not None:
+        _apply(setup, state, Edit(source=rows))
+
+
+def _apply(setup: Setup, state: TrainState, edit: Edit) -> None:
+    before = state.primitives(setup)
+    state.settle(edit.values if edit.keeps_rows else None)
+    for block in setup.blocks:
+        if block.per_primitive:
+            for name in block.tensors:
+                for moments in (state.moments.exp_avg, state.moments.exp_avg_sq):
+                    if name in moments:
+                        moments[name] = apply_to_moment(edit, name, moments[name])
+    state.tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
+    if edit.keeps_rows:
+        return
+    source, fresh = gather_indices(edit, before, setup.device)
+    state.states = {
+        name: _gathered(name, old, source, fresh, before) for name, old in state.states.items()
+    }
+
+
+def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: int) -> PluginState:
+    for key, tensor in old.per_primitive.items():
+        if tensor.shape[:1] != (rows,):
+            raise UserError(
+                f"the state of plugin {name} does not fit the primitives",
+                where=f"per_primitive, {key}",
+                expected=f"a row for each of {rows} primitives, as they were before the edit",
+                found=f"shape {list(tensor.shape)}",
+                todo="repair the plugin (docs/hooks.md)",
+            )
+    return old.gathered(source, fresh)
 
 
 def take_step(setup: Setup, state: TrainState) -> StepRecord:

@@ -9,7 +9,7 @@ import sys
 import pytest
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.training.stopper import _WORDS
+from crossgrad_core.training.loop import _WORDS
 
 #: Sends itself a signal when a module is about to be imported, or when a line has been written.
 PROGRAM = """

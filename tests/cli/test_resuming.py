@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.cli.main import main
-from crossgrad_core.cli.resuming import CHANGEABLE, refuse_beside_resume
+from crossgrad_core.cli.run import CHANGEABLE, refuse_beside_resume
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.load_run import CHANGEABLE as OF_A_RUN
 from crossgrad_core.run.load_run import _config

@@ -15,7 +15,7 @@ CONFIG = """
 steps: 100
 operator: {name: cagrad, c: 0.4}
 observers: [progress, {name: rate, every: 10}]
-reading: {max_size: 640}
+data: {max_size: 640}
 """
 
 

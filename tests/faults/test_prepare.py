@@ -12,7 +12,7 @@ import time
 import pycolmap
 import pytest
 
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 
 #: Kills in the short version and in the long one, and photos of the bundled scene.
 SHORT, LONG, COUNT = 2, 20, 7

@@ -14,16 +14,16 @@ from support.gaussians import posed_camera, random_gaussians
 from torch import Tensor
 
 from crossgrad_core.commands import assemble, begin, configured
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.blocks import AdamState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.dropout import STREAM, dropped
-from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import rows_without_floaters
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.step import keep
 from crossgrad_core.training.strided_rendering import as_in_full, camera_of
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
 from crossgrad_plugins.rasterizers.gswarp_cuda import GswarpRasterizer

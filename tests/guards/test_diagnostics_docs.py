@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_plugins.diagnostics.exposure import exposure_of
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement
 from crossgrad_plugins.diagnostics.table import table
+from crossgrad_plugins.diagnostics.watch import camera_rows, distances_of, grouping_rows
 
 PAGE = Path(__file__).parents[2] / "docs" / "diagnostics.md"
 

@@ -32,7 +32,7 @@ COMMAND_ROOMS = (*DOORS, f"{CORE}.commands")
 PLACES = {
     "crossgrad_plugins.readers": READERS,
     # Reads the headers of photo files.
-    "crossgrad_plugins.exposures.photo_headers": READERS,
+    "crossgrad_plugins.exposures.exif": READERS,
     # Finds features with pycolmap, which is imported with care.
     "crossgrad_plugins.initializers.triangulated": READERS,
     # Checks packages, and writes one for each slot, readers and tests included.

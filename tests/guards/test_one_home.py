@@ -22,7 +22,7 @@ SLOTS = (
 )
 #: Concept -> pattern, the files that hold it.
 HOMES = {
-    "near and far by footprint": (r"def footprint", {f"{CORE}/contract/poses.py"}),
+    "near and far by footprint": (r"def footprint", {SCENE}),
     "points in a camera's axes": (
         r"\[:3, :3\]\.T \+ ",
         # Tensors on the run's device, through which the reference is differentiated.
@@ -33,7 +33,7 @@ HOMES = {
         },
     ),
     "the centre of a camera": (r"-[\w.]+\[:3, :3\]\.T @ ", {SCENE}),
-    "training seconds": (r"class (Clock|Seconds)\b", {f"{CORE}/training/clock.py"}),
+    "training seconds": (r"class (Clock|Seconds)\b", {f"{CORE}/training/state.py"}),
     "how a run ended": (
         r"^Status\b.*=",
         # An attempt of a sweep may also have died.

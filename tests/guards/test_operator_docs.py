@@ -8,7 +8,7 @@ import pytest
 
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
-from crossgrad_core.training.operator_scale import OperatorScale
+from crossgrad_core.training.setup import OperatorScale
 
 PAGE = (Path(__file__).parents[2] / "docs" / "operators.md").read_text(encoding="utf-8")
 STARTS = ("- Formula:", "- Differs from `sum`:", "- At the edges:", "- Options:", "- Source:")

@@ -19,5 +19,5 @@ def test_no_plugin_decodes_photos_itself(shelf):
 
 
 def test_the_pattern_finds_what_decodes():
-    source = ROOT / "crossgrad_core" / "training" / "view_target.py"
+    source = ROOT / "crossgrad_core" / "training" / "views.py"
     assert DECODES.search(source.read_text(encoding="utf-8"))

@@ -11,8 +11,8 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
+from crossgrad_core.run.app import check_clock
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.budget_clock import check_clock
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.results import machine
@@ -21,11 +21,11 @@ from crossgrad_core.run.results.machine import WORTH_A_CALIBRATION, Machine, cal
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.session import totals
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import clock as clocks
+from crossgrad_core.training import state as states
 from crossgrad_core.training.budget import Timed
-from crossgrad_core.training.clock import Clock, PhaseTimer
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import Clock, PhaseTimer
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def scene(tmp_path_factory):
 
 def test_laps_count_cpu_time_without_what_is_left_out(monkeypatch):
     times = iter([10.0, 10.5, 12.0, 12.25])
-    monkeypatch.setattr(clocks, "process_time", lambda: next(times))
+    monkeypatch.setattr(states, "process_time", lambda: next(times))
     clock, laps = Clock(), PhaseTimer(cpu_border=next(times))
     laps.lap("photos")
     laps.leave_out(3.0, 1.25)  # Decoding: 1.25 of the 1.5 seconds until the next border.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.adam_state import BETAS, EPS, AdamRule, AdamState
+from crossgrad_core.contract.blocks import BETAS, EPS, AdamRule, AdamState
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.recipe.lines import short_lines

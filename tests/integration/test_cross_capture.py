@@ -106,7 +106,7 @@ def test_a_ladder_is_drawn_as_frames_and_a_video(trained, tmp_path, capsys):
     # In the run's own folder a video takes the place of the one before.
     for frames in (3, 2):
         render.render_path(trained, "zoom", frames=frames, out=None)
-    assert len(list((trained / "renders").glob("*/path_ladder/video.*"))) == 1
+    assert len(list((trained / "renders").glob("*/path_zoom/video.*"))) == 1
     with pytest.raises(UserError, match="frames of a zoom path"):
         render.render_path(trained, "path.json", frames=2, out=None)
 

@@ -14,7 +14,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.training import loop
-from crossgrad_core.training.failure import NonFiniteError
+from crossgrad_core.training.state import NonFiniteError
 from crossgrad_plugins.diagnostics import exposure_figure, figure
 from crossgrad_plugins.diagnostics.app import diagnose
 from crossgrad_plugins.diagnostics.command import Options

@@ -11,9 +11,9 @@ import pytest
 import torch
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.contract.blocks import Edit, Rows
 from crossgrad_core.contract.contexts import DensifyResult
 from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, finish, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.commands import configured, read_scene
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_plugins.exposures.tracks.gains import deciding_gains, track_gains
 
 #: Scene -> standard deviation of the gains in stops, share of the deviation that they take away,

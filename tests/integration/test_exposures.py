@@ -314,7 +314,7 @@ def test_exif_starts_photos_and_tells_of_unseen_ones(varied, tmp_path, model):
     shutil.copytree(varied, folder)
     for number, path in enumerate(sorted(folder.glob("images/*.png"))):
         with_exif(path, np.log2(0.35) if number % 2 else 0.0)
-    settings = {"exposure": {"name": model, "initializer": "exif"}}
+    settings = {"exposure": {"name": model, "start": "exif"}}
     # The photos held out are the first and the last, both bright; the others are half and half.
     assert run(folder, tmp_path / "exif", steps=120, **settings) == 0
     told = read_run(tmp_path / "exif").figure("psnr")

@@ -29,10 +29,7 @@ UNUSED = (
     *("rasterizers.gpu", "rasterizers.gsplat_cuda", "rasterizers.gswarp_cuda"),
     *("rasterizers.torch_reference", "rasterizers.reference"),
     *("metrics.perceptual.distance", "metrics.perceptual.weights"),
-    *(
-        f"georeference.{name}"
-        for name in ("ellipsoid", "fit", "frames", "on_earth", "projection", "turned")
-    ),
+    *(f"georeference.{name}" for name in ("ellipsoid", "fit", "frames", "on_earth", "projection")),
     *("prepare", "compare", "sweep", "diagnostics", "authoring"),
 )
 

@@ -106,7 +106,7 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
 def test_of_a_shorter_video_no_longer_one_is_left(run):
     for frames, count in ((4, 4), (3, 3)):
         render.render_path(run, path=ZOOM, frames=frames, out=None)
-        assert len(list(run.glob("renders/*/path_ladder/0*.png"))) == count
+        assert len(list(run.glob("renders/*/path_zoom/0*.png"))) == count
 
 
 def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
@@ -170,7 +170,7 @@ def test_what_does_not_train_may_be_changed(run):
 
 def test_a_video_of_other_frames_does_not_stay(run, monkeypatch, capsys):
     render.render_path(run, path=ZOOM, frames=3, out=None)
-    (made,) = run.glob("renders/*/path_ladder/video.*")
+    (made,) = run.glob("renders/*/path_zoom/video.*")
     monkeypatch.setattr(video, "_LARGEST", 100)
     monkeypatch.setattr(video.shutil, "which", lambda _: None)
     render.render_path(run, path=ZOOM, frames=3, out=None)

@@ -10,7 +10,7 @@ import pytest
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.run.bundled import BUNDLED_SECONDS
+from crossgrad_core.run.app import BUNDLED_SECONDS
 from crossgrad_core.system.yaml_values import read_mapping
 
 FEW = ("--steps", 4, "--threads", 1, "--rasterizer", "torch", "-q")

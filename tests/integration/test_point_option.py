@@ -40,5 +40,5 @@ def test_a_run_without_sfm_points_starts_from_a_cloud_and_goes_on_elsewhere(tmp_
 def test_points_beside_a_start_that_takes_none_are_refused(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=4, width=24, height=16)
     write_cloud(tmp_path / "cloud.ply")
-    with pytest.raises(UserError, match=r"reading\.points"):
+    with pytest.raises(UserError, match=r"data\.points"):
         cg.run(scene, points=tmp_path / "cloud.ply", init="random", out=tmp_path / "run", **SHORT)

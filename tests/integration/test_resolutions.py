@@ -18,9 +18,9 @@ from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.model import model_of
 from crossgrad_core.training.probe_gradients import view_gradients
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.step import model_of
 from crossgrad_plugins.resolutions.octaves import Octaves
 
 SPECTRAL = {"name": "spectral", "smallest": 4, "per_regime": "always"}

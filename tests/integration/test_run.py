@@ -9,9 +9,9 @@ import torch
 from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.contract.blocks import NO_EDIT, Edit, Rows
 from crossgrad_core.contract.contexts import AggregateResult, DensifyResult, RegularizeResult
 from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.run import app
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config

@@ -21,8 +21,8 @@ from crossgrad_core.registry.entries import load as load_plugin
 from crossgrad_core.run import app, assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.testing.checking import checks_of
-from crossgrad_core.training.clock import PHASES
-from crossgrad_core.training.render_callback import RenderCallback
+from crossgrad_core.training.state import PHASES
+from crossgrad_core.training.views import RenderCallback
 
 PLUGINS = {
     "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},

@@ -11,8 +11,8 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics import kernel_cache
-from crossgrad_core.run.bundled import bundled_scene
-from crossgrad_core.training import budget, warmup
+from crossgrad_core.run.app import bundled_scene
+from crossgrad_core.training import budget, start
 
 #: Trains as the command does, and prints which kernels were compiled or loaded after the warm-up.
 SCRIPT = """
@@ -63,7 +63,7 @@ from crossgrad_core.config import ComponentChoice
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.commands import configured
-from crossgrad_core.training.warmup import compile_all
+from crossgrad_core.training.start import compile_all
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 
@@ -115,8 +115,8 @@ class _Process:
 @pytest.fixture
 def started(monkeypatch):
     """What becomes of the other process, on a machine of two cores."""
-    monkeypatch.setattr(warmup.subprocess, "Popen", _Process)
-    monkeypatch.setattr(warmup, "available_cores", lambda: 2)
+    monkeypatch.setattr(start.subprocess, "Popen", _Process)
+    monkeypatch.setattr(start, "available_cores", lambda: 2)
     monkeypatch.setattr(_Process, "started", [])
     return _Process.started
 
@@ -131,7 +131,7 @@ def _miss(*, kept=True):
 
 
 def test_the_other_process_starts_with_the_first_missing_kernel(started):
-    with warmup.compiling_beside(_setup()):
+    with start.compiling_beside(_setup()):
         assert started == []
         _miss()
         _miss()
@@ -143,14 +143,14 @@ def test_the_other_process_starts_with_the_first_missing_kernel(started):
 
 def test_a_process_that_hangs_is_ended(started, monkeypatch):
     monkeypatch.setattr(_Process, "hangs", True)
-    with warmup.compiling_beside(_setup()):
+    with start.compiling_beside(_setup()):
         _miss()
     assert started[1:] == ["waited for", "terminated", "waited for"]
 
 
 def test_the_other_process_ends_with_a_run_that_is_refused(started):
     def refuse():
-        with warmup.compiling_beside(_setup()):
+        with start.compiling_beside(_setup()):
             _miss()
             raise KeyboardInterrupt
 
@@ -161,7 +161,7 @@ def test_the_other_process_ends_with_a_run_that_is_refused(started):
 
 @pytest.mark.parametrize(("settings", "kept"), [({"threads": 1}, True), ({}, False)])
 def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, settings, kept):
-    with warmup.compiling_beside(_setup(**settings)):
+    with start.compiling_beside(_setup(**settings)):
         _miss(kept=kept)
     assert started == []
 
@@ -169,11 +169,11 @@ def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, setting
 def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeypatch):
     # Whether a view draws few rows is found out on the clock.
     asked = []
-    monkeypatch.setattr(warmup, "compile_rows", lambda: asked.append("rows"))
+    monkeypatch.setattr(start, "compile_rows", lambda: asked.append("rows"))
     for sparse_rows in ({}, {"sh_rest": "f_rest"}):
         setup = _setup(threads=1)
         setup.sparse_rows = sparse_rows
-        with warmup.compiling_beside(setup):
+        with start.compiling_beside(setup):
             assert asked == []
     assert asked == ["rows"]
 

@@ -9,7 +9,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.registry.entries import load
-from crossgrad_core.run.missing_plugins import without_missing
+from crossgrad_core.run.load_run import without_missing
 
 #: What only trains, and what only measures or listens.
 TRAINS = {

@@ -19,7 +19,7 @@ from crossgrad_fuzz.limits import memory_limit
 from PIL import Image
 
 from crossgrad_core.run.camera_path import _read as read_camera_path
-from crossgrad_core.run.checkpoint.tensors import read_tensors
+from crossgrad_core.run.checkpoint.checkpoint import read_tensors
 from crossgrad_core.scene.decode import decode_photo
 from crossgrad_core.scene.headers import read_header
 from crossgrad_core.scene.split import _read_list as read_list
@@ -27,7 +27,7 @@ from crossgrad_core.system import input_files
 from crossgrad_core.system.ply_table import read_vertices
 from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.system.yaml_values import read_mapping
-from crossgrad_core.training.photo_file import read_values
+from crossgrad_core.training.per_image_params import read_values
 from crossgrad_plugins.readers import _json, _xml
 
 #: What the address space may grow by, and how long one file may take.

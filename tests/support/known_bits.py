@@ -20,7 +20,7 @@ import torch
 from support.scenes import write_tiny_scene
 
 import crossgrad_core as cg
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 
 PATH = Path(__file__).parents[1] / "integration" / "data" / "bits.json"

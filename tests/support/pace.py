@@ -3,7 +3,7 @@
 import pytest
 
 from crossgrad_core.run.results.machine import Calibration
-from crossgrad_core.training.clock import Clock, PhaseTimer
+from crossgrad_core.training.state import Clock, PhaseTimer
 
 
 def each_step_takes(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:

@@ -11,8 +11,7 @@ from PIL import Image
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.run.results.config_file import write_config
-from crossgrad_core.run.results.panel_layout import Layout, folder_of
-from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.run.results.panels import Layout, flat_names, folder_of
 
 DEFINITIONS = {
     "psnr": "dB; 20 log10(1 / sqrt(mse)) per image over all channels, mean over images",

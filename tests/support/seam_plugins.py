@@ -21,7 +21,7 @@ from crossgrad_core.plugin import (
     ViewSample,
     hookimpl,
 )
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 
 
 class NearAtHalf(Resolution):

@@ -4,36 +4,379 @@
 <run>/checkpoints/step-000700/state.json            everything else, and the tensors' SHA-256
 """
 
-from collections.abc import Mapping
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 from torch import Tensor
 
-from crossgrad_core.contract.state import Json, PluginState
+from crossgrad_core.contract.blocks import Json, PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.checkpoint.contents import Checkpoint
-from crossgrad_core.run.checkpoint.folders import (
-    CHECKPOINTS,
-    STATE,
-    TENSORS,
-    Keep,
-    damaged,
-    discard,
-    is_checkpoint,
-    named_checkpoints,
-    scratch_folder,
-)
-from crossgrad_core.run.checkpoint.state import check_json, read_state, state_text
-from crossgrad_core.run.checkpoint.tensors import (
-    pack,
-    packed_bytes,
-    read_tensors,
-    unpack,
-    write_tensors,
-)
 from crossgrad_core.system.checksums import digest_of
-from crossgrad_core.system.files import disk_errors, is_full, sync_file, write_atomically
+from crossgrad_core.system.files import (
+    disk_errors,
+    is_full,
+    sync_file,
+    sync_folder,
+    write_atomically,
+)
+from crossgrad_core.system.text_files import read_json
+from crossgrad_core.system.version import VERSION
+from crossgrad_core.training.state import no_json
+from crossgrad_core.wording import showable
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Everything from which a run continues bit for bit.
+
+    Attributes:
+        step: Steps done.
+        parameters: Tensor name -> parameter.
+        exp_avg: Tensor name -> Adam's first moment.
+        exp_avg_sq: Tensor name -> Adam's second moment.
+        adam_steps: Tensor name -> number of Adam steps taken.
+        plugins: Plugin name -> its state.
+        generators: Stream name -> `bit_generator.state` of its NumPy generator.
+        scalars: Counters, clocks and whatever else JSON can hold (tuples come back as lists).
+    """
+
+    step: int
+    parameters: Mapping[str, Tensor]
+    exp_avg: Mapping[str, Tensor] = field(default_factory=dict)
+    exp_avg_sq: Mapping[str, Tensor] = field(default_factory=dict)
+    adam_steps: Mapping[str, int] = field(default_factory=dict)
+    plugins: Mapping[str, PluginState] = field(default_factory=dict)
+    generators: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    scalars: Mapping[str, Json] = field(default_factory=dict)
+
+
+CHECKPOINTS = "checkpoints"
+TENSORS = "tensors.safetensors"
+STATE = "state.json"
+_STEP = re.compile(r"step-(\d{6,})")
+_SCRATCH = ".scratch-"
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Which checkpoints survive the writing of a new one.
+
+    Attributes:
+        last: The newest so many, the new one included.
+        every: And those at multiples of this step; None for no others.
+    """
+
+    last: int = 2
+    every: int | None = None
+
+    def drops(self, steps: list[int]) -> list[int]:
+        """Those of `steps` that are to be deleted."""
+        old = sorted(steps)[: -self.last]
+        return [step for step in old if self.every is None or step % self.every]
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Whether this is the folder of a checkpoint, of which files may have been lost since."""
+    return _STEP.fullmatch(folder.name) is not None and folder.is_dir()
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether all files of a checkpoint are there."""
+    return (folder / STATE).is_file() and (folder / TENSORS).is_file()
+
+
+def named_checkpoints(folder: Path) -> dict[int, Path]:
+    """Return step -> folder of the checkpoints in `folder`, in the order of steps.
+
+    A checkpoint gets its name when all of its files are there. One that lacks a file is damaged. It
+    is not passed over, because an older one would then be taken in its place without a word.
+    """
+    if not folder.is_dir():
+        return {}
+    found = [path for path in folder.iterdir() if is_checkpoint(path)]
+    by_step = {int(path.name.removeprefix("step-")): path for path in found}
+    return dict(sorted(by_step.items()))
+
+
+def damaged(folder: Path, found: str) -> UserError:
+    """The error for a checkpoint that cannot be used; points to another one if there is one."""
+    named = named_checkpoints(folder.parent).values()
+    others = [path for path in named if path.name != folder.name and is_complete(path)]
+    return UserError(
+        "damaged checkpoint",
+        where=folder,
+        found=found,
+        todo=f"remove it; the run then goes on from {others[-1].name}"
+        if others
+        else "start the run again",
+    )
+
+
+@contextmanager
+def scratch_folder(final: Path) -> Iterator[Path]:
+    """A folder to write into that gets the name `final` when the block ends without an error."""
+    scratch = final.with_name(f"{_SCRATCH}{final.name}")
+    final.parent.mkdir(parents=True, exist_ok=True)
+    _clear(final.parent)
+    try:
+        scratch.mkdir()
+        yield scratch
+        sync_folder(scratch)
+        _take_name(scratch, final)
+    finally:
+        _clear(final.parent)
+
+
+def discard(folder: Path) -> None:
+    """Deletes a checkpoint in such a way that half of one never looks complete."""
+    doomed = folder.with_name(f"{_SCRATCH}old-{folder.name}")
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
+
+
+def _take_name(scratch: Path, final: Path) -> None:
+    if not final.exists():
+        scratch.rename(final)
+    else:
+        old = final.with_name(f"{_SCRATCH}old-{final.name}")
+        final.rename(old)
+        try:
+            scratch.rename(final)
+        except OSError:
+            old.rename(final)
+            raise
+    sync_folder(final.parent)
+
+
+def _clear(folder: Path) -> None:
+    """Deletes what this or an interrupted run left half-written."""
+    for path in folder.glob(f"{_SCRATCH}*"):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+#: Version of the layout; raised whenever an older reader could misread a newer checkpoint.
+FORMAT = 1
+_DIGEST = "state_sha256"
+
+
+def state_text(state: Mapping[str, Any]) -> str:
+    """The content of state.json: `state`, the versions that wrote it, and a digest of all that."""
+    rest = {key: value for key, value in state.items() if key != _DIGEST}
+    whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
+    return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
+
+
+def digest(state: Mapping[str, Any]) -> str:
+    """SHA-256 of a state, its own digest left out; the same before and after JSON."""
+    rest = {key: value for key, value in state.items() if key != _DIGEST}
+    return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def check_json(value: object, where: str) -> None:
+    """Refuses what JSON would change on the way: keys that are not text, tuples, arrays.
+
+    Raises:
+        UserError: Names the place and the culprit.
+    """
+    if wrong := no_json(value):
+        raise UserError(
+            "state that a checkpoint cannot hold",
+            where=where,
+            expected="numbers, strings, lists, dictionaries with text keys, None",
+            found=wrong,
+            todo="keep arrays as tensors in PluginState.tensors",
+        )
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """The content of a checkpoint's state.json.
+
+    Raises:
+        UserError: The checkpoint is missing, damaged, or of another format version.
+    """
+    if not folder.is_dir():
+        raise UserError(
+            "no such checkpoint",
+            where=folder,
+            todo="name a folder below checkpoints/ in the folder of a run",
+        )
+    try:
+        state = read_json(folder / STATE)
+    except FileNotFoundError as error:
+        raise damaged(folder, f"no {STATE}") from error
+    except ValueError as error:
+        raise damaged(folder, f"{STATE} is not JSON: {error}") from error
+    if not isinstance(state, dict) or "format" not in state:
+        raise damaged(folder, f"{STATE} is not the state of a checkpoint")
+    if state["format"] != FORMAT:
+        raise UserError(
+            "checkpoint of another format version",
+            where=folder,
+            expected=f"version {FORMAT} (crossgrad {VERSION})",
+            found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
+            todo="continue with the version of crossgrad that wrote it",
+        )
+    _check_whole(state, folder)
+    return state
+
+
+def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
+    """Refuses a state that is not what was written, as far as it says so itself.
+
+    Raises:
+        UserError: The digest differs, or something is missing or of another type.
+    """
+    # Runs of before there was a digest go on.
+    if state.get(_DIGEST, digest(state)) != digest(state):
+        raise damaged(folder, f"{STATE} is not what was written (its SHA-256 differs)")
+    wrong = [name for name, holds in _PARTS.items() if not holds(state.get(name))]
+    if wrong:
+        raise damaged(folder, f"{STATE} lacks a valid {', '.join(wrong)}")
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_map(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+#: What a state consists of, and how each part is known.
+_PARTS: Mapping[str, Callable[[Any], bool]] = {
+    "sha256": lambda value: isinstance(value, str),
+    "step": _is_count,
+    "tensors": lambda names: (
+        isinstance(names, list) and all(isinstance(name, str) for name in names)
+    ),
+    "adam_steps": lambda steps: _is_map(steps) and all(map(_is_count, steps.values())),
+    "scalars": _is_map,
+    "generators": lambda states: _is_map(states) and all(map(_is_map, states.values())),
+    "plugins": lambda states: _is_map(states) and all(map(_is_map, states.values())),
+}
+_PLUGIN = "plugin"
+_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+
+
+@dataclass
+class Unpacked:
+    """The tensors of a checkpoint file, sorted by what they belong to."""
+
+    parameters: dict[str, Tensor] = field(default_factory=dict)
+    exp_avg: dict[str, Tensor] = field(default_factory=dict)
+    exp_avg_sq: dict[str, Tensor] = field(default_factory=dict)
+    plugins: dict[str, dict[str, dict[str, Tensor]]] = field(default_factory=dict)
+
+    def plugin(self, name: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """`tensors` and `per_primitive` of a plugin's state."""
+        kinds = self.plugins.get(name, {})
+        return kinds.get("tensors", {}), kinds.get("per_primitive", {})
+
+
+def pack(checkpoint: "Checkpoint") -> dict[str, Tensor]:
+    """Key -> contiguous CPU tensor that shares its memory with no other."""
+    packed: dict[str, Tensor] = {}
+    storages: set[int] = set()
+    for path, tensor in _all(checkpoint):
+        owned = tensor.detach().cpu().contiguous()
+        storage = owned.untyped_storage()
+        partial = storage.nbytes() != owned.numel() * owned.element_size()
+        # safetensors refuses tensors that share memory.
+        if partial or storage.data_ptr() in storages:
+            owned = owned.clone()
+        storages.add(owned.untyped_storage().data_ptr())
+        packed["/".join(quote(part, safe="") for part in path)] = owned
+    return packed
+
+
+def packed_bytes(tensors: Mapping[str, Tensor]) -> int:
+    """Size of the tensors in bytes."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+
+
+def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
+    """The inverse of `pack`.
+
+    Raises:
+        ValueError: A key is none that `pack` makes.
+    """
+    tensors = Unpacked()
+    for key, tensor in packed.items():
+        match [unquote(part) for part in key.split("/")]:
+            case ["parameters", name]:
+                tensors.parameters[name] = tensor
+            case ["exp_avg", name]:
+                tensors.exp_avg[name] = tensor
+            case ["exp_avg_sq", name]:
+                tensors.exp_avg_sq[name] = tensor
+            case ["plugin", plugin, ("tensors" | "per_primitive") as kind, name]:
+                tensors.plugins.setdefault(plugin, {}).setdefault(kind, {})[name] = tensor
+            case _:
+                message = f"unknown tensor {key!r}"
+                raise ValueError(message)
+    return tensors
+
+
+def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
+    """Writes a safetensors file and waits until it is on the disk.
+
+    Raises:
+        OSError: Also where the library wraps what the system said, such as that the disk is full.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    try:
+        path.touch()
+        mode = path.stat().st_mode
+        save_file(packed, path)
+        # The library makes a file of its own, which nobody else may read.
+        path.chmod(mode)
+        sync_file(path)
+    except SafetensorError as error:
+        number = _SYSTEM_ERROR.search(str(error))
+        if number is None:
+            raise
+        raise OSError(int(number.group(1)), str(error)) from error
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Reads a safetensors file into memory of our own.
+
+    Raises:
+        ValueError: It is not a readable safetensors file.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load, load_file
+
+    try:
+        if showable(str(path)) != str(path):  # The library opens names in UTF-8 only.
+            return load(path.read_bytes())
+        # Clones, because the library maps the file, which a later checkpoint may delete.
+        return {key: tensor.clone() for key, tensor in load_file(path).items()}
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
+
+
+def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
+    """Every tensor of a checkpoint with the path that names it."""
+    for kind in ("parameters", "exp_avg", "exp_avg_sq"):
+        tensors: Mapping[str, Tensor] = getattr(checkpoint, kind)
+        for name, tensor in tensors.items():
+            yield (kind, name), tensor
+    for plugin, state in checkpoint.plugins.items():
+        for name, tensor in state.tensors.items():
+            yield (_PLUGIN, plugin, "tensors", name), tensor
+        for name, tensor in state.per_primitive.items():
+            yield (_PLUGIN, plugin, "per_primitive", name), tensor
 
 
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:

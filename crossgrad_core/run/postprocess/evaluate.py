@@ -16,12 +16,10 @@ from crossgrad_core.run.export import drawer, plain_drawer, plain_renderer, rend
 from crossgrad_core.run.load_run import require_checkpoint
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import is_changed, own_name, writing_if_possible
-from crossgrad_core.run.results.cost_totals import Totals
-from crossgrad_core.run.results.panel_names import ending
-from crossgrad_core.run.results.per_view import FILE as PER_VIEW
-from crossgrad_core.run.results.per_view import read_per_view, write_per_view
+from crossgrad_core.run.results.metrics_csv import PER_VIEW, Totals, read_per_view, write_per_view
+from crossgrad_core.run.results.panels import ending
 from crossgrad_core.run.results.sources import name_for
-from crossgrad_core.run.results.table import final_table, metric_lines
+from crossgrad_core.run.results.summary import final_table, metric_lines
 from crossgrad_core.run.session import totals
 from crossgrad_core.system.checksums import relisted, warn_if_changed
 from crossgrad_core.wording import listed

@@ -4,13 +4,13 @@ from pathlib import Path
 from typing import Final
 
 from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.georeference import INPUT, check_coordinates
+from crossgrad_core.contract.scene import INPUT, check_coordinates
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, find
 from crossgrad_core.run.export import Exported, described, export_scene, georef_of
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import own_name, writing
-from crossgrad_core.run.results.panel_names import flat_names
+from crossgrad_core.run.results.panels import flat_names
 from crossgrad_core.run.session import CLOUD
 from crossgrad_core.system.check_writable import check_file, check_new
 from crossgrad_core.system.checksums import relisted

@@ -12,9 +12,7 @@ from crossgrad_core.run.cross_capture import elsewhere
 from crossgrad_core.run.export import camera_renderer, plain_renderer, renderer
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS, Opens
 from crossgrad_core.run.postprocess.output_paths import is_changed, writing
-from crossgrad_core.run.results.panel_layout import folder_of
-from crossgrad_core.run.results.panel_names import ending
-from crossgrad_core.run.results.panels import PanelWriter
+from crossgrad_core.run.results.panels import PanelWriter, ending, folder_of
 from crossgrad_core.run.results.sources import name_for
 from crossgrad_core.run.results.video import (
     ENCODER,

@@ -10,7 +10,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import writer_of
-from crossgrad_core.run.results.panel_layout import FOLDER as RENDERS
+from crossgrad_core.run.results.panels import FOLDER as RENDERS
 from crossgrad_core.system.files import (
     clear_leftovers,
     disk_errors,

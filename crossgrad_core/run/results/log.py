@@ -1,15 +1,153 @@
 """log.txt: plain text of what the terminal showed, with the time of day."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.recipe.lines import full_lines
-from crossgrad_core.run.results.lines import Pace, evaluation_line, length_lines, progress_line
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
+
+#: Share of a new value in the smoothed loss and step rate.
+SMOOTHING = 0.05
+#: A length that changed by a smaller share is no news.
+NEWS_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Smoothed figures of the steps so far.
+
+    Attributes:
+        total: Steps of the whole run.
+        first: The step after which this session began (above 0 for a resumed run).
+        record: The last step; None before the first.
+        loss: Exponentially smoothed mean loss of the step's views.
+        seconds: Exponentially smoothed training seconds of a step; None after a single one.
+        psnr: Overall PSNR of the last evaluation, None where there was none yet.
+        planned: Steps that were planned first, where that changed; None elsewhere.
+    """
+
+    total: int
+    first: int = 0
+    record: StepRecord | None = None
+    loss: float = 0.0
+    seconds: float | None = None
+    psnr: float | None = None
+    planned: int | None = None
+
+    def after(self, record: StepRecord) -> "Pace":
+        """The figures with one more step."""
+        loss = sum(record.losses) / len(record.losses)
+        if self.record is None:
+            return replace(self, first=record.step - 1, record=record, loss=loss)
+        return replace(
+            self,
+            record=record,
+            loss=_smoothed(self.loss, loss),
+            seconds=_smoothed(self.seconds, record.train_seconds - self.record.train_seconds),
+        )
+
+    def with_length(self, total: int) -> "Pace":
+        """The figures of a run that is now to have `total` steps."""
+        planned = self.total if self.planned is None else self.planned
+        return replace(self, total=total, planned=planned)
+
+    def evaluated(self, report: EvaluationReport) -> "Pace":
+        """The figures after an evaluation."""
+        psnr = report.row.get("psnr")
+        return replace(self, psnr=float(psnr)) if isinstance(psnr, int | float) else self
+
+    @property
+    def steps_per_second(self) -> float | None:
+        """Steps per training second, None while unknown."""
+        return 1.0 / self.seconds if self.seconds else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Training seconds until the end at the present rate, None while unknown."""
+        if self.record is None or not self.seconds:
+            return None
+        return (self.total - self.record.step) * self.seconds
+
+
+def progress_line(pace: Pace) -> str:
+    """Step, share, loss, PSNR, primitives, rate and time left; empty before the first step."""
+    record = pace.record
+    if record is None:
+        return ""
+    share = 100.0 * record.step / pace.total
+    parts = [f"step {record.step}/{pace.total} ({share:.0f} %)", *figures(pace)]
+    if pace.steps_per_second is not None and pace.seconds_left is not None:
+        parts.append(f"{pace.steps_per_second:.1f} steps/s")
+        parts.append(f"{duration(pace.seconds_left)} left")
+    return ", ".join(parts)
+
+
+def length_lines(pace: Pace) -> list[str]:
+    """What became of the planned length, where that is worth a line."""
+    planned = pace.planned
+    if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
+        return []
+    return [f"the length followed the clock: {pace.total} steps instead of {planned}"]
+
+
+def figures(pace: Pace) -> list[str]:
+    """Loss, PSNR and primitives, for the end of a progress bar too."""
+    parts = [f"loss {pace.loss:.4f}"]
+    if pace.psnr is not None:
+        parts.append(f"PSNR {pace.psnr:.2f}")
+    if pace.record is not None:
+        parts.append(f"{pace.record.primitives:,} primitives")
+    return parts
+
+
+def evaluation_line(report: EvaluationReport) -> str:
+    """The metrics of an evaluation with those of each regime."""
+    row = report.row
+    parts = [_metric("PSNR", row.get("psnr"), ".2f", " dB"), _metric("SSIM", row.get("ssim"))]
+    if len(report.regimes) > 1:
+        parts += [f"PSNR {_regime(row, regime)}" for regime in report.regimes]
+    parts.append(f"{_number(row.get('train_seconds'), '.1f')} s training")
+    return f"evaluated at step {report.step}: " + ", ".join(parts)
+
+
+def duration(seconds: float) -> str:
+    """Seconds as 45 s, 12:05 or 3:07:09."""
+    whole = round(seconds)
+    minutes, rest = divmod(whole, 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours}:{minutes:02}:{rest:02}"
+    return f"{minutes}:{rest:02}" if minutes else f"{rest} s"
+
+
+def roughly(seconds: float) -> str:
+    """An estimate in whole minutes, with hours where there are several."""
+    minutes = max(1, round(seconds / 60.0))
+    if minutes < 120:  # noqa: PLR2004 - two hours
+        return f"about {minutes} min"
+    return f"about {minutes // 60} h {minutes % 60:02} min"
+
+
+def _smoothed(old: float | None, new: float) -> float:
+    return new if old is None else old + SMOOTHING * (new - old)
+
+
+def _regime(row: Mapping[str, float | int | str | None], regime: str) -> str:
+    return f"{regime} {_number(row.get(f'psnr_{regime}'), '.2f')}"
+
+
+def _metric(label: str, value: float | str | None, form: str = ".4f", unit: str = "") -> str:
+    return f"{label} {_number(value, form)}{unit}" if value is not None else f"no {label}"
+
+
+def _number(value: float | str | None, form: str) -> str:
+    return format(value, form) if isinstance(value, int | float) else "-"
+
 
 FILE = "log.txt"
 #: Progress goes into the log so many times in a run.

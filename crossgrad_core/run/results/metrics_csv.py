@@ -8,17 +8,42 @@ from typing import TypeAlias
 
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.results.cost_totals import Totals
+from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
 from crossgrad_core.system.files import disk_errors, write_atomically
 from crossgrad_core.system.tables import as_cell, csv_bytes
 from crossgrad_core.system.text_files import parse_number, read_rows
 
-FILE = "metrics.csv"
 
+@dataclass(frozen=True)
+class Totals:
+    """The cost side of an evaluation.
+
+    Attributes:
+        step: Optimizer steps.
+        views: Rendered training views.
+        backward_passes: Backward passes.
+        train_seconds: Training seconds; compiling, loading, evaluating and reporting excluded.
+        primitives: Number of primitives.
+        peak_memory_mib: Peak memory, MiB; None where the system does not say.
+        loss: Mean photometric loss of the last step, None before the first.
+        cpu_seconds: CPU seconds of the process in the training seconds, all threads together.
+        peak_primitives: The most primitives that there were after a step; None where unknown.
+    """
+
+    step: int
+    views: int
+    backward_passes: int
+    train_seconds: float
+    primitives: int
+    peak_memory_mib: float | None
+    loss: float | None
+    cpu_seconds: float = 0.0
+    peak_primitives: int | None = None
+
+
+FILE = "metrics.csv"
 #: Column -> value; None where it was not measured.
 Row: TypeAlias = dict[str, int | float | None]
-
 _FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
 _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml"
@@ -171,3 +196,60 @@ def _lines(path: Path) -> list[list[str]]:
 
 def _number(text: str) -> int | float | None:
     return None if text == "" else parse_number(text)
+
+
+PER_VIEW = "per_view.csv"
+_NAMES = ("name", "regime")
+_RESTORE_VIEWS = "restore the file, or write it again: crossgrad eval RUN"
+
+
+def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW) -> None:
+    """Writes one line per view: name, regime, metrics; an empty cell where one is not known.
+
+    Raises:
+        UserError: The disk is full.
+    """
+    figures = [figure.name for figure in result.figures]
+    lines = (
+        [view.name, view.regime, *(as_cell(view.values[each]) for each in figures)]
+        for view in result.views
+    )
+    write_atomically(folder / name, csv_bytes([[*_NAMES, *figures], *lines]))
+
+
+def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
+    """The figures of every held-out view of a run, in the order of the scene.
+
+    Returns:
+        The views; none where there is no such file, as before the first evaluation.
+
+    Raises:
+        UserError: The file is damaged.
+    """
+    path = folder / PER_VIEW
+    if not path.is_file():
+        return ()
+    header, *lines = read_rows(path, PER_VIEW, _RESTORE_VIEWS) or [[]]
+    if tuple(header[:2]) != _NAMES or len(set(header)) < len(header):
+        expected = f"a first line that begins with {','.join(_NAMES)}"
+        raise _unreadable_view(path, ",".join(header) or "an empty file", expected)
+    return tuple(_view(path, header, line) for line in lines)
+
+
+def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
+    if len(line) != len(header):
+        expected = f"{len(header)} cells in each line"
+        raise _unreadable_view(path, f"{len(line)}: {','.join(line)}", expected)
+    try:
+        cells = dict(zip(header[2:], line[2:], strict=True))
+        values = {name: float(parse_number(cell)) if cell else None for name, cell in cells.items()}
+        name, regime = line[:2]
+    except (ValueError, OverflowError) as error:
+        raise _unreadable_view(path, str(error)) from error
+    return ViewMetrics(name, regime, values)
+
+
+def _unreadable_view(path: Path, found: str, expected: str = "") -> UserError:
+    return UserError(
+        f"unreadable {PER_VIEW}", where=path, expected=expected, found=found, todo=_RESTORE_VIEWS
+    )

@@ -1,19 +1,20 @@
 """renders/<step>/<view>.png: photo, render and error side by side, with a legend."""
 
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import View
+from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import Evaluated
 from crossgrad_core.evaluation.result import ViewMetrics
-from crossgrad_core.run.results.panel_layout import Layout, enlargement, folder_of
-from crossgrad_core.run.results.panel_names import chosen_views, flat_names
+from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.files import disk_errors, write_atomically
 
 if TYPE_CHECKING:
@@ -21,13 +22,187 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
+
+_UNSAFE = re.compile(r"[^\w.+-]+")
+_LONGEST = 120  # bytes
+
+
+def flat_names(names: Sequence[str]) -> dict[str, str]:
+    """View name -> file name without folders and suffix, unique even where case does not count.
+
+    `aerial/0001.jpg` becomes `aerial__0001`; what would clash gets -2, -3 and so on.
+    """
+    flat: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in names:
+        path = PurePosixPath(name)
+        parts = [part for part in path.with_suffix("").parts if part not in {"..", "/"}]
+        base = ending(_UNSAFE.sub("_", "__".join(parts)).strip(".")) or "view"
+        unique, number = base, 1
+        while unique.casefold() in taken:
+            number += 1
+            unique = f"{base}-{number}"
+        taken.add(unique.casefold())
+        flat[name] = unique
+    return flat
+
+
+def ending(name: str) -> str:
+    """The end of a name that is too long to be a part of another one."""
+    return name.encode()[-_LONGEST:].decode(errors="ignore")
+
+
+def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
+    """`count` views, or all: every regime in turn, evenly spread over each regime's views."""
+    regimes = sorted({view.regime for view in views})
+    groups = [[view for view in views if view.regime == regime] for regime in regimes]
+    share = [0] * len(groups)
+    for _ in range(min(count, len(views))):
+        # The first of those that have the fewest so far, and one more.
+        unused = [i for i, group in enumerate(groups) if share[i] < len(group)]
+        share[min(unused, key=share.__getitem__)] += 1
+    chosen = {
+        view.name
+        for group, wanted in zip(groups, share, strict=True)
+        for view in _spread(group, wanted)
+    }
+    return tuple(view for view in views if view.name in chosen)
+
+
+def _spread(group: "Sequence[View]", wanted: int) -> "list[View]":
+    wanted = min(wanted, len(group))
+    return [group[(2 * i + 1) * len(group) // (2 * wanted)] for i in range(wanted)]
+
+
+FOLDER = "renders"
+#: Smaller images are enlarged by a whole factor, so that the labels fit.
+_NARROWEST = 360
+_SMALLEST_FONT, _LARGEST_FONT, _FONTS_PER_WIDTH = 12, 26, 38
+_COLUMNS = ("photo", "render", "error")
+_TODO = "draw the panels again: crossgrad render RUN, or remove the file"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Sizes in pixels, all derived from the size of the (enlarged) image."""
+
+    width: int
+    height: int
+
+    @property
+    def font(self) -> int:
+        """Size of the letters."""
+        return min(max(self.width // _FONTS_PER_WIDTH, _SMALLEST_FONT), _LARGEST_FONT)
+
+    @property
+    def margin(self) -> int:
+        """Around everything."""
+        return self.font
+
+    @property
+    def gap(self) -> int:
+        """Between two images."""
+        return max(4, self.font // 2)
+
+    @property
+    def top(self) -> int:
+        """Upper edge of the images."""
+        return self.margin + round(3.2 * self.font)
+
+    @property
+    def captions(self) -> int:
+        """Base line of the captions above the images."""
+        return self.top - self.font // 2
+
+    @property
+    def bar(self) -> int:
+        """Width of the colour bar."""
+        return max(10, self.font)
+
+    @property
+    def canvas(self) -> tuple[int, int]:
+        """Width and height of the panel."""
+        legend = self.gap + self.bar + 5 * self.font
+        width = 2 * self.margin + 3 * self.width + 2 * self.gap + legend
+        return width, self.top + self.height + self.margin
+
+    def left(self, column: int) -> int:
+        """Left edge of the photo (0), render (1), error (2) and colour bar (3)."""
+        return self.margin + column * (self.width + self.gap)
+
+    @classmethod
+    def in_canvas(cls, size: tuple[int, int]) -> "Layout | None":
+        """The layout of a panel of this width and height; None where no panel has that size."""
+        for width in range(size[0] // 3, 0, -1):
+            outside = cls(width, 0)
+            if outside.canvas[0] == size[0]:
+                height = size[1] - outside.canvas[1]
+                return cls(width, height) if height > 0 else None
+        return None
+
+
+def enlargement(width: int) -> int:
+    """The factor by which an image of this width is enlarged."""
+    return -(-_NARROWEST // width)
+
+
+def folder_of(run: Path, step: int) -> Path:
+    """Where the panels of an evaluation lie."""
+    return run / FOLDER / f"{step:06d}"
+
+
+def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
+    """View name -> picture of its photo, render and error, of those held-out views that have one.
+
+    Args:
+        run: The run's folder.
+        step: The step of the evaluation.
+        names: Names of all held-out views, in the order of per_view.csv.
+    """
+    folder = folder_of(run, step)
+    paths = {name: folder / f"{file}.png" for name, file in flat_names(names).items()}
+    return {name: path for name, path in paths.items() if path.is_file()}
+
+
+def read_panel(path: Path) -> "dict[str, Image]":
+    """The images in such a picture by name: `photo`, `render` and `error`.
+
+    Raises:
+        UserError: It is no such picture.
+    """
+    from PIL import Image
+
+    run = path.parents[2]
+    check_unchanged(run, [path.relative_to(run).as_posix()], _TODO)
+    try:
+        with Image.open(path, formats=["PNG"]) as file:
+            panel = file.convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise _unreadable(path, str(error)) from error
+    layout = Layout.in_canvas(panel.size)
+    if layout is None:
+        raise _unreadable(path, f"a picture of {panel.width} x {panel.height} px")
+    lower = layout.top + layout.height
+    left = [layout.left(column) for column in range(len(_COLUMNS))]
+    boxes = [(x, layout.top, x + layout.width, lower) for x in left]
+    return {name: panel.crop(box) for name, box in zip(_COLUMNS, boxes, strict=True)}
+
+
+def _unreadable(path: Path, found: str) -> UserError:
+    return UserError(
+        "unreadable panel",
+        where=path,
+        found=found,
+        todo=_TODO,
+    )
+
+
 #: Errors of this size and above have the last colour; fixed, so that panels compare.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
 _PAPER, _INK, _FAINT = (255, 255, 255), (20, 20, 20), (105, 105, 105)
 _HATCH = ((188, 188, 188), (150, 150, 150))
-
 Pixels = NDArray[np.uint8]
 
 

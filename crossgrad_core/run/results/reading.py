@@ -14,9 +14,7 @@ from crossgrad_core.evaluation.result import ViewMetrics
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
-from crossgrad_core.run.results.metrics_csv import Row, read_metrics
-from crossgrad_core.run.results.per_view import FILE as PER_VIEW
-from crossgrad_core.run.results.per_view import read_per_view
+from crossgrad_core.run.results.metrics_csv import PER_VIEW, Row, read_metrics, read_per_view
 from crossgrad_core.run.results.summary import FILE as SUMMARY
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged

@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal
 from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.results.cost_totals import Totals
-from crossgrad_core.run.results.metrics_csv import Row
+from crossgrad_core.evaluation.result import EvaluationResult, Means
+from crossgrad_core.run.results.metrics_csv import Row, Totals
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
-from crossgrad_core.training.clock import Clock
 
 if TYPE_CHECKING:
-    from crossgrad_core.contract.state import Json
+    from crossgrad_core.contract.blocks import Json
+    from crossgrad_core.training.state import Clock
+
 
 FILE = "summary.json"
-
 Status = Literal["finished", "stopped", "failed"]
-
 #: What holds for every metric; figures compare only with those of the same definition.
 RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
@@ -54,7 +52,7 @@ class Summary:
     totals: Totals
     result: EvaluationResult | None
     rows: Sequence[Row]
-    seconds: Clock
+    seconds: "Clock"
     config: Mapping[str, Any]
     environment: "Mapping[str, Json]"
     ply: "Mapping[str, Json] | None" = None
@@ -169,3 +167,65 @@ def _finite(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return value
+
+
+_NULL = "-"
+
+
+def final_table(result: EvaluationResult | None, totals: Totals) -> str:
+    """Metrics overall and per regime, and what they cost, as plain text without a final newline."""
+    lines = () if result is None else metric_lines(result)
+    return "\n".join([*lines, cost_line(totals)])
+
+
+def metric_lines(result: EvaluationResult) -> list[str]:
+    """Metrics overall and per regime, and why one is missing."""
+    reasons = (f"no {metric}: {reason}" for metric, reason in _shown(result))
+    return [*_aligned(_rows(result)), *reasons]
+
+
+def cost_line(totals: Totals) -> str:
+    """Training seconds, steps, rendered views, primitives and memory in one line."""
+    peak = totals.peak_memory_mib
+    memory = "" if peak is None else f", peak memory {peak:,.0f} MiB"
+    return (
+        f"{totals.train_seconds:,.1f} s training, {totals.step:,} steps, "
+        f"{totals.views:,} views rendered, {totals.backward_passes:,} backward passes, "
+        f"{totals.primitives:,} primitives{memory}"
+    )
+
+
+def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
+    # What is not defined for these views has no column.
+    shown = [each for each in result.figures if result.reasons.get(each.name) != each.undefined]
+    header = ("", "views", *(figure.label for figure in shown))
+    rows = [header, _row("overall", result.overall, shown)]
+    # A single regime would only repeat the first row.
+    if len(result.regimes) > 1:
+        rows += [_row(name, means, shown) for name, means in result.regimes.items()]
+    return rows
+
+
+def _row(name: str, means: Means, figures: Sequence[Figure]) -> tuple[str, ...]:
+    cells = (_number(means[figure.name], figure.form) for figure in figures)
+    return (name, str(means.views), *cells)
+
+
+def _number(value: float | None, form: str) -> str:
+    return _NULL if value is None else format(value, form)
+
+
+def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
+    """Why the figures that are told by regime are missing; of others that is no news."""
+    told = [figure.name for figure in result.figures if figure.per_regime]
+    return [(name, why) for name, why in result.reasons.items() if name in told]
+
+
+def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [row[0].ljust(widths[0])]
+        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return lines

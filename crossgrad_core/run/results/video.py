@@ -9,7 +9,7 @@ from typing import Final
 
 from torch import Tensor
 
-from crossgrad_core.contract.images import to_uint8
+from crossgrad_core.contract.scene import to_uint8
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 from crossgrad_core.system.interrupts import HELPERS

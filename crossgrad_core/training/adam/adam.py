@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.training.adam.coefficients import (
     LARGEST,
     SMALLEST_NORMAL,

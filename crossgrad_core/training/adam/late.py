@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_core.contract.adam_state import AdamState
+from crossgrad_core.contract.blocks import AdamState
 from crossgrad_core.gradients.sparse_rows import rows_of, values_of
 from crossgrad_core.training.adam.coefficients import Coefficients
 

@@ -1,19 +1,154 @@
 """The whole suite: every operator on every case, and every law."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from crossgrad_core.commands import build
 from crossgrad_core.commands import names as installed_names
-from crossgrad_core.plugin import Operator
-from crossgrad_operators.stress.case import Case
+from crossgrad_core.plugin import EMPTY_STATE, Block, LearningRate, MatrixOperator, Operator
+from crossgrad_operators.stress.case import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
-from crossgrad_operators.stress.invariances import LAWS, run_law
-from crossgrad_operators.stress.promises import Promise, promise_of
-from crossgrad_operators.stress.reference import OPTIONS, ORACLES, chained
-from crossgrad_operators.stress.runner import Cell, Reference, run_case
-from crossgrad_operators.stress.verdict import ExactCase, one_sign
+from crossgrad_operators.stress.promises import PROMISED, Promise, promise_of
+from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chained, usual_views
+from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
+from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
+
+#: A law returns its error in units of u times the largest norm, or None where it does not apply.
+Law = Callable[[Operator], float | None]
+_UNIT = 2.0**-24
+
+
+def _rows(views: int) -> Case:
+    rows = np.random.default_rng(70 + views).standard_normal((views, 48))
+    return short("law", rows - 0.6 * rows.mean(axis=0))
+
+
+def _result(operator: Operator, case: Case, views: Views | None = None) -> Tensor:
+    gradient, _, _ = timed(operator, case, views or usual_views(case.views))
+    if gradient is None:
+        raise RuntimeError("no gradient where all views have one")
+    return gradient.double()
+
+
+def _error(found: Tensor, expected: Tensor, case: Case) -> float:
+    longest = float(np.linalg.norm(case.exact_head, axis=1).max())
+    scale = max(longest, float(expected.norm()))
+    return float((found - expected).norm()) / (_UNIT * scale)
+
+
+def _counts(operator: Operator) -> Iterator[int]:
+    yield from (k for k in (2, 3, 4, 8) if operator.views.admits(k))
+
+
+def homogeneity(operator: Operator) -> float | None:
+    """op(c g) = c op(g) for c > 0, from 1e-25 to 1e+25."""
+    worst = 0.0
+    for views in _counts(operator):
+        case = _rows(views)
+        for c in (2.0**-80, 3.0, 2.0**80):
+            scaled = replace(case, head=case.exact_head * c)
+            rounded = replace(case, head=scaled.exact_head / c)
+            found = _result(operator, scaled) / c
+            worst = max(worst, _error(found, _result(operator, rounded), case))
+    return worst
+
+
+def permutation(operator: Operator) -> float | None:
+    """The order of two views, with their labels and distances, does not matter."""
+    if not operator.views.admits(2):
+        return None
+    case, views = _rows(2), usual_views(2)
+    turned = replace(case, head=case.head[::-1].copy())
+    turned_views = Views(views.labels[::-1], views.ratios[::-1], views.seed)
+    found = _result(operator, turned, turned_views)
+    return _error(found, _result(operator, case, views), case)
+
+
+def one_view(operator: Operator) -> float | None:
+    """A single view at the reference distance is left as it is."""
+    if not operator.views.admits(1):
+        return None
+    case = _rows(1)
+    found = _result(operator, case, Views(("near",), (1.0,), 0))
+    return _error(found, torch.from_numpy(case.exact_head[0]), case)
+
+
+def size(operator: Operator) -> float | None:
+    """A gradient repeated 3,001 times, in whatever chunks, gives the same result repeated."""
+    if not isinstance(operator, MatrixOperator):
+        return None
+    worst = 0.0
+    for views in _counts(operator):
+        case = _rows(views)
+        copies = 3001
+        tiled = replace(case, head=np.zeros((views, 0)), pattern=case.head, copies=copies)
+        expected = _result(operator, case)
+        found = _result(operator, tiled).view(copies, -1)
+        worst = max(worst, *(_error(row, expected, case) for row in (found[0], found[-1])))
+    return worst
+
+
+def block_independence(operator: Operator) -> float | None:
+    """Other blocks in the same step change no bit of a block's result."""
+    if not isinstance(operator, MatrixOperator):
+        return None
+    for views in _counts(operator):
+        case, circumstances = _rows(views), usual_views(views)
+        other = Block("scales", ("scales",), False, "geometry", LearningRate(1.0))
+        gradients = [{"means": g, "scales": _reversed(g)} for g in case.gradients()]
+        context = context_of(gradients, (other, BLOCK), circumstances)
+        found = operator.aggregate(context, EMPTY_STATE)[0].gradients["means"]
+        if found is None or not torch.equal(found.double(), _result(operator, case)):
+            return float("inf")
+    return 0.0
+
+
+def threads(operator: Operator) -> float | None:
+    """The number of threads changes no bit."""
+    import numba
+
+    case = replace(_rows(2), pattern=_rows(2).head, copies=8000)
+    if not operator.views.admits(2):
+        return None
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for count in {1, before}:
+            numba.set_num_threads(count)
+            results.append(_result(operator, case))
+    finally:
+        numba.set_num_threads(before)
+    return 0.0 if all(torch.equal(results[0], r) for r in results) else float("inf")
+
+
+LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, block_independence, threads)
+
+
+def run_law(name: str, operator: Operator, law: Law) -> Cell:
+    """One law on one operator."""
+    return Cell(name, law.__name__.replace("_", " "), _judged(operator, law))
+
+
+def _judged(operator: Operator, law: Law) -> Finding:
+    try:
+        error = law(operator)
+    except Exception as problem:
+        # Third-party code may raise anything.
+        return Finding("failed", reason=f"{type(problem).__name__}: {problem}")
+    if error is None:
+        return Finding("refused")
+    if error <= PROMISED:
+        return Finding("ok", error)
+    return Finding("failed", error, f"error {error:.3g} u")
+
+
+def _reversed(gradient: Tensor | None) -> Tensor | None:
+    return None if gradient is None else gradient.flip(0)
 
 
 def installed() -> list[str]:

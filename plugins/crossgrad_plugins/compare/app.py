@@ -1,15 +1,25 @@
 """The command `crossgrad compare`."""
 
 import os.path
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.commands import Progress, UserError, count, one_line, table_bytes, text_bytes
-from crossgrad_plugins.compare.checks.code import differing_code
+from crossgrad_core.commands import (
+    Progress,
+    UserError,
+    count,
+    one_line,
+    showable,
+    table_bytes,
+    text_bytes,
+)
+from crossgrad_plugins.compare import narrative, tables
 from crossgrad_plugins.compare.comparison import Comparison, compared
+from crossgrad_plugins.compare.contrasts import Runs
 from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import (
     draw_curves,
@@ -20,14 +30,211 @@ from crossgrad_plugins.compare.figures.curves import (
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases
 from crossgrad_plugins.compare.figures.profile import draw_profile
-from crossgrad_plugins.compare.figures.style import Drawn
+from crossgrad_plugins.compare.figures.style import Drawn, looks, variables
 from crossgrad_plugins.compare.load_runs import check_places, read_runs
+from crossgrad_plugins.compare.narrative import where_text
 from crossgrad_plugins.compare.options import Options
-from crossgrad_plugins.compare.output import FIGURES, PAGE, check_free, write_files
-from crossgrad_plugins.compare.page import page_of
-from crossgrad_plugins.compare.pictures import with_pictures, worst_views
-from crossgrad_plugins.compare.tables import TABLES, csv_tables
-from crossgrad_plugins.compare.terminal import lines_of
+from crossgrad_plugins.compare.output import FIGURES, MARK, PAGE, check_free, write_files
+from crossgrad_plugins.compare.pictures import WorstView, with_pictures, worst_views
+from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.statistics.estimate import BOOTSTRAP_FROM
+from crossgrad_plugins.compare.statistics.verdict import UNCORRECTED
+from crossgrad_plugins.compare.tables import (
+    TABLES,
+    Table,
+    contrast_table,
+    cost_table,
+    csv_tables,
+    standing_table,
+)
+
+_MEANING: Final = "that they are equally fast is not given, and bits may differ"
+_MOST_SHOWN: Final = 3
+
+
+def differing_code(arms: Mapping[str, Runs]) -> list[str]:
+    """A note where arms, or the two runs of a pair, come from different code; else none.
+
+    Runs that do not say where they come from agree with all.
+
+    Args:
+        arms: Arm -> scene and seed -> the run that stands for them.
+    """
+    used = {arm: _all_code(runs) for arm, runs in arms.items()}
+    groups: dict[str, list[str]] = {}
+    for arm, code in used.items():
+        if code:
+            groups.setdefault(code, []).append(arm)
+    if len(groups) > 1:
+        shown = [f"{_named(own)} ran at {code}" for code, own in groups.items()]
+        more = len(shown) - _MOST_SHOWN
+        parts = [*shown[:_MOST_SHOWN], *([f"{more} more"] if more > 0 else [])]
+        return [f"code differs: {'; '.join(parts)}: {_MEANING}"]
+    if pair := next(_unlike_pairs(arms), None):
+        texts = [f"{run.name} ran at {code_of(run)}" for run in pair]
+        return [f"code differs within pairs: {', '.join(texts)}: {_MEANING}"]
+    return []
+
+
+def code_of(run: Run) -> str:
+    """The commit of a run, or of an installed package its version; empty where it has neither."""
+    environment = run.summary.get("environment") or {}
+    commit, version = environment.get("commit"), environment.get("crossgrad")
+    if commit:
+        return f"commit {commit}"
+    return f"crossgrad {version}" if version else ""
+
+
+def _all_code(runs: Runs) -> str:
+    return " and ".join(sorted({code for run in runs.values() if (code := code_of(run))}))
+
+
+def _named(arms: list[str]) -> str:
+    more = len(arms) - _MOST_SHOWN
+    # Names have commas in them.
+    names = ", ".join(f"'{arm}'" for arm in arms[:_MOST_SHOWN])
+    return names if more <= 0 else f"{names} and {more} more"
+
+
+def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
+    """Runs on one scene with one seed that come from different code."""
+    known: dict[tuple[str, int], Run] = {}
+    for runs in arms.values():
+        for problem, run in runs.items():
+            if code := code_of(run):
+                first = known.setdefault(problem, run)
+                if code_of(first) != code:
+                    yield first, run
+
+
+_TEMPLATE: Final = Path(__file__).with_name("page.html")
+#: Rows of a table that are open; more of them are behind a click.
+_OPEN_ROWS: Final = 12
+#: Series colours on a dark page: the same hues, lighter.
+_DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
+_WORST_NAMED: Final = 8
+#: What a run's environment says about its machine and code -> what is written before it.
+_MACHINE: Final = {
+    "cpu": "",
+    "cpu_cores": "cores: ",
+    "torch_threads": "threads: ",
+    "device": "device: ",
+    "gpu": "GPU: ",
+    "crossgrad": "crossgrad ",
+    "commit": "commit ",
+}
+
+
+def page_of(
+    comparison: Comparison,
+    figures: Sequence[Drawn],
+    pictured: Sequence[WorstView],
+    views: Mapping[str, Sequence[WorstView]],
+    notes: Sequence[str],
+    version: str,
+) -> str:
+    """Return the page.
+
+    Args:
+        comparison: What was found.
+        figures: All figures that could be drawn, in order.
+        pictured: The views that are shown.
+        views: Scene -> all held-out views, the worst first.
+        notes: What is not compared or shown, and why.
+        version: Version of crossgrad.
+    """
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+                              lstrip_blocks=True, finalize=_shown)  # fmt: skip
+    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    look = looks([arm.name for arm in comparison.arms])
+    variable = {color: name for name, color in variables().items()}
+    return template.render(
+        mark=Markup(MARK),
+        version=version,
+        c=comparison,
+        sentences=narrative.headline(comparison),
+        noise=narrative.noise_sentence(comparison),
+        summary=(tables.standing_table(comparison), tables.cost_table(comparison)),
+        figures=[(figure, Markup(figure.svg)) for figure in figures],
+        contrasts=tables.contrast_tables(comparison),
+        others=(tables.reached_table(comparison), tables.settings_table(comparison)),
+        runs=tables.runs_table(comparison),
+        pictured=pictured,
+        worst=[
+            tables.views_table(comparison, scene, own[:_WORST_NAMED])
+            for scene, own in views.items()
+            if own
+        ],
+        notes=notes,
+        machines=machines(comparison),
+        light=variables(),
+        dark={f"series-{number}": color for number, color in enumerate(_DARK)},
+        colors={arm: variable[each.color] for arm, each in look.items()},
+        limits={"bootstrap": BOOTSTRAP_FROM, "holm": UNCORRECTED, "open": _OPEN_ROWS},
+    )
+
+
+def _shown(value: object) -> object:
+    """Return a text with its control characters as escapes, and all else as it is."""
+    if not isinstance(value, str):
+        return value
+    return one_line(value) if type(value) is str else type(value)(showable(value))
+
+
+def machines(comparison: Comparison) -> list[str]:
+    """Return the machines and code of the runs, with the number of runs of each."""
+    runs = Counter(
+        ", ".join(
+            f"{before}{run.environment[key]}"
+            for key, before in _MACHINE.items()
+            if run.environment.get(key) is not None
+        )
+        for run in comparison.runs
+    )
+    return [f"{text} ({count(number, 'run')})" for text, number in runs.items()]
+
+
+_MOST_ROWS = 20
+
+
+def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
+    """Return the lines."""
+    for sentence in narrative.headline(comparison):
+        yield f"{sentence.claim}" + (f" ({sentence.support})" if sentence.support else "")
+    standing, costs = standing_table(comparison), cost_table(comparison)
+    rows = [(*one, *other[1:]) for one, other in zip(standing.rows, costs.rows, strict=True)]
+    yield from _lines(Table((*standing.columns, *costs.columns[1:]), rows))
+    shown = contrast_table(
+        (*comparison.ends, *comparison.equal)[:_MOST_ROWS], first={"where": where_text}
+    )
+    yield from _lines(shown)
+    if more := len(comparison.ends) + len(comparison.equal) - len(shown.rows):
+        yield f"... and {more} more in comparisons.csv"
+    if noise := narrative.noise_sentence(comparison):
+        yield ""
+        yield f"noise floor, standard deviation over seeds: {noise}"
+    for note in notes:
+        yield f"note: {note}"
+    for name, why in comparison.left_out.items():
+        yield f"left out: {name}: {why}"
+
+
+def _lines(table: Table) -> Iterator[str]:
+    """Return columns as wide as their widest cell, the first one to the left."""
+    if not table.rows:
+        return
+    shown = [index for index, column in enumerate(table.columns) if column.in_terminal]
+    titles = [column.title for column in table.columns]
+    cells = [[row[index] for index in shown] for row in (titles, *table.rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    yield ""
+    for first, *rest in cells:
+        right = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        yield "  ".join([first.ljust(widths[0]), *right]).rstrip()
+
 
 #: Where a comparison goes by default, beside the runs.
 FOLDER: Final = "compare"

@@ -1,19 +1,85 @@
 """DC4GS: splits where the directions of a Gaussian's gradients disagree, and where they part."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
-from crossgrad_plugins.densifiers.direction_scores import (
-    PLANES,
-    inconsistency,
-    plane_scores,
-)
 from crossgrad_plugins.densifiers.long_axis_split import child_on_axis
-from crossgrad_plugins.densifiers.split_position import split_positions
+
+#: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
+PLANES = 5
+
+
+def inconsistency(sums: Tensor) -> Tensor:
+    """[N] (1 - R) ga of pixels whose directions, absolute gradients and number are `sums`.
+
+    R is the length of the mean direction, 1 where there is no pixel; ga is the norm of the absolute
+    gradients. So nothing that pulls one way, or not at all, has any.
+
+    Args:
+        sums: [5, N] fields of `Screen.directions`, added up over bins.
+
+    Source: DC4GS.
+    """
+    x, y, absolute_x, absolute_y, number = sums
+    # No pixel: 1 - 0 / 1 times a ga of 0. Rounding can make the mean longer than unit vectors.
+    rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
+    found: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
+    return found
+
+
+def plane_scores(bins: Tensor) -> Tensor:
+    """[5, N] mean of the inconsistencies on both sides of each plane.
+
+    Args:
+        bins: [6, 5, N] from `screen_statistics.directions`.
+    """
+    left, right = [bins[0]], [bins[-1]]
+    for plane in range(1, PLANES):
+        left.append(left[-1] + bins[plane])
+        # From the other end: the whole less the left would leave roundings where there is nothing.
+        right.append(right[-1] + bins[-1 - plane])
+    sides = zip(left, reversed(right), strict=True)
+    return torch.stack([(inconsistency(a) + inconsistency(b)) / 2.0 for a, b in sides])
+
+
+#: The candidate planes as shares of the axis, which is six standard deviations long.
+NODES = np.arange(1, 6) / 6.0
+#: Where the polynomial is evaluated besides.
+GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
+
+
+def split_positions(scores: Tensor) -> Tensor:
+    """[S] share p of the axis that the left child gets, in [1/12, 11/12].
+
+    The polynomial of degree 4 through the scores is searched on a grid and at its nodes. Of equal
+    values the most central one counts, so that no preference means the middle.
+
+    Args:
+        scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.
+
+    Source: DC4GS.
+    """
+    places, weights = _interpolation()
+    lowest = scores.double() - scores.double().amin(dim=1, keepdim=True)
+    values = lowest @ torch.from_numpy(weights).to(lowest)
+    return torch.from_numpy(places).to(scores)[values.argmin(dim=1)]
+
+
+def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places [Q], the central ones first, and Lagrange's weights [5, Q] of the scores there."""
+    places = np.concatenate([NODES, GRID])
+    places = places[np.argsort(np.abs(places - 0.5), kind="stable")]
+    weights = np.ones((len(NODES), len(places)))
+    for i, node in enumerate(NODES):
+        for other in np.delete(NODES, i):
+            weights[i] *= (places - other) / (node - other)
+    return places, weights
 
 
 class DirectionalConsistency(CloneSplit):

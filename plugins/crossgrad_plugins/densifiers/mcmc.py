@@ -1,7 +1,8 @@
 """3DGS-MCMC: relocation, slow growth to a cap, noise and regularisers (Kheradmand et al. 2024)."""
 
-from dataclasses import replace
-from math import log
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import log, pi, sqrt
 from typing import ClassVar
 
 import numpy as np
@@ -26,8 +27,145 @@ from crossgrad_core.plugin import (
     Schedule,
     hookimpl,
 )
-from crossgrad_plugins.densifiers.position_noise import position_noise
-from crossgrad_plugins.densifiers.relocation import Pool
+
+#: Steepness of the gate and the opacity at which it is half open (3DGS-MCMC).
+GATE_STEEPNESS = 100.0
+GATE_OPACITY = 0.005
+#: Shifts below this share of a Gaussian's own size are left out: float32 knows no finer places.
+NEGLIGIBLE = 1e-7
+
+
+def position_noise(
+    parameters: Mapping[str, Tensor], strength: float, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """The rows of `means` that noise moves, and by how much.
+
+    shift = Sigma n sig(-100 (o - 0.005)) strength, with n three standard normal numbers. No number
+    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale: every opaque
+    one, so that the noise costs little once training is under way.
+
+    Args:
+        parameters: With `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit) [N].
+        strength: Learning rate of the positions times the noise's own factor, 1 / local units.
+        rng: The generator.
+
+    Returns:
+        Rows [R] int64 and shifts [R, 3], local units.
+
+    Source: Kheradmand et al. 2024 (3DGS-MCMC), eq. 8.
+    """
+    log_scales = parameters["scales"].detach()
+    opacity = sigmoid(parameters["opacities"].detach())
+    factor = strength * sigmoid(GATE_STEEPNESS * (GATE_OPACITY - opacity))
+    # Column by column: reducing rows of three is much slower on the CPU.
+    a, b, c = log_scales.unbind(1)
+    largest = torch.exp(torch.maximum(torch.maximum(a, b), c))
+    rows = (factor * largest > NEGLIGIBLE).nonzero().squeeze(1)
+    draws = rng.standard_normal((rows.shape[0], 3), dtype=np.float32)
+    noise = torch.from_numpy(draws).to(log_scales, non_blocking=True)
+    axes = torch.nn.functional.normalize(parameters["quats"].detach()[rows], dim=-1)
+    variances = torch.exp(2.0 * log_scales[rows])
+    shifts = rotated(variances * rotated(noise, axes, back=True), axes)
+    return rows, shifts * factor[rows, None]
+
+
+def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
+    """Vectors [R, 3] turned by unit quaternions wxyz [R, 4], or back: v + w t + u x t, t = 2 u x v.
+
+    No matrices are formed.
+    """
+    w, u = quats[:, :1], quats[:, 1:]
+    turned: Tensor = 2.0 * torch.linalg.cross(u, vectors)
+    along: Tensor = vectors + torch.linalg.cross(u, turned)
+    return along - w * turned if back else along + w * turned
+
+
+#: More copies than these count as so many (the published bound).
+MOST_COPIES = 51
+#: Step of the quadrature, in standard deviations. The integrand is entire, so the trapezoidal rule
+#: errs by a factor exp(-c / step): for 51 opaque copies 2e-12 at 0.2, less than rounding at 0.15.
+_STEP = 0.15
+#: Number of steps: at 9.6 standard deviations 51 copies are below 1e-18.
+_STEPS = 64
+
+
+def shared_opacity(opacity: Tensor, copies: Tensor) -> Tensor:
+    """Opacity of each of n copies that together are as opaque as one: 1 - (1 - o)^(1/n).
+
+    Args:
+        opacity: [R] float64 in [0, 1].
+        copies: [R] n >= 1.
+    """
+    return -torch.expm1(torch.log1p(-opacity) / copies)
+
+
+def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
+    """Factor of the scales of each of n copies, so that they together are as wide as one.
+
+    With o' the shared opacity the published factor is o / D with the alternating sums
+    D = sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). They cancel to nothing for
+    many opaque copies, but 1 / sqrt(q+1) is the integral of a Gaussian to the power q+1, and under
+    the integral the sums close:
+
+        D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx,
+
+    a positive, smooth integrand. The trapezoidal rule sums it to rounding.
+
+    Args:
+        opacity: [R] float64 in [0, 1], before it is shared.
+        copies: [R] 1 <= n <= 51.
+
+    Returns:
+        [R] in (0, 1]; 1, the limit, where the opacity is 0 or below the smallest normal number.
+    """
+    nodes = _STEP * torch.arange(_STEPS + 1, dtype=opacity.dtype, device=opacity.device)
+    weights = torch.full_like(nodes, 2.0 * _STEP / sqrt(2.0 * pi))
+    weights[0] /= 2.0
+    each = shared_opacity(opacity, copies)[:, None] * torch.exp(-nodes * nodes / 2.0)
+    covered = -torch.expm1(copies[:, None] * torch.log1p(-each))
+    some = opacity > torch.finfo(opacity.dtype).tiny
+    return torch.where(some, opacity / (covered @ weights), torch.ones_like(opacity))
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Primitives of which some are copies of others.
+
+    Attributes:
+        source: [M] int64, the old primitive of each.
+        opacity: [M] float64.
+        scale: [M] float64, factor of its scales.
+        touched: [M] bool, whether it shares its source with others.
+    """
+
+    source: Tensor
+    opacity: Tensor
+    scale: Tensor
+    touched: Tensor
+
+    @classmethod
+    def of(cls, opacity: Tensor) -> "Pool":
+        """The primitives as they are, of these opacities [M] (float64)."""
+        source = torch.arange(opacity.shape[0], device=opacity.device)
+        untouched = torch.zeros_like(source, dtype=torch.bool)
+        return cls(source, opacity, torch.ones_like(opacity), untouched)
+
+    def copied(self, index: Tensor, lowest: float) -> "Pool":
+        """The primitives at `index` [M']; those that occur more than once share.
+
+        Args:
+            index: [M'] int64.
+            lowest: A shared opacity is not below this, and below 1 by a float32 rounding.
+        """
+        copies = torch.bincount(index, minlength=self.source.shape[0]).clamp(max=MOST_COPIES)
+        rows = (copies > 1).nonzero().squeeze(1)
+        opacity, scale, touched = self.opacity.clone(), self.scale.clone(), self.touched.clone()
+        highest = 1.0 - torch.finfo(torch.float32).eps
+        opacity[rows] = shared_opacity(self.opacity[rows], copies[rows]).clamp(lowest, highest)
+        scale[rows] *= shared_scale(self.opacity[rows], copies[rows])
+        touched[rows] = True
+        return Pool(self.source[index], opacity[index], scale[index], touched[index])
+
 
 #: Relocation and growth end after 25,000 of 30,000 steps (published).
 LAST_EDIT_SHARE = 25 / 30

@@ -6,21 +6,164 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t
 
-from crossgrad_plugins.diagnostics.conflict import conflict
 from crossgrad_plugins.diagnostics.distances import conflict_by_distance
-from crossgrad_plugins.diagnostics.exponent import distance_exponent
 from crossgrad_plugins.diagnostics.grouped import Groups
-from crossgrad_plugins.diagnostics.intervals.interval import Interval
+from crossgrad_plugins.diagnostics.intervals.interval import UNKNOWN, Interval
 from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
-from crossgrad_plugins.diagnostics.noise_scale import noise_scale
 from crossgrad_plugins.diagnostics.plan import ProbePlan
 from crossgrad_plugins.diagnostics.probe import Measurement
 from crossgrad_plugins.diagnostics.ratios import geometric_mean, gradient_ratio
 from crossgrad_plugins.diagnostics.variance import variance_split
 
-Row: TypeAlias = Mapping[str, str | int | float]
 
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """Conflict between near and far views, over all pairs of one near and one far view.
+
+    A pair counts for a block if both gradients are non-zero and overlap; disjoint gradients are
+    orthogonal without agreeing.
+
+    Attributes:
+        per_block: [B] share of the counted pairs whose dot product is negative; NaN without pairs.
+        per_pair: Share of a pair's counted blocks that conflict, averaged over pairs; NaN without.
+        pairs: [B] counted pairs.
+        disjoint: [B] pairs of non-zero gradients that do not overlap.
+        zero: [B] pairs with a zero gradient.
+    """
+
+    per_block: NDArray[np.float64]
+    per_pair: float
+    pairs: NDArray[np.int64]
+    disjoint: NDArray[np.int64]
+    zero: NDArray[np.int64]
+
+
+def conflict(
+    gramians: NDArray[np.float64],
+    near: NDArray[np.bool_],
+    overlap: NDArray[np.bool_] | None = None,
+) -> Conflict:
+    """Both readings of the paper's "33-83 %" conflict rate.
+
+    Args:
+        gramians: [B, V, V].
+        near: [V], the views of the near group; the others are far.
+        overlap: [B, V, V], pairs whose gradients share a non-zero element; by default every pair
+            whose dot product is not exactly zero.
+    """
+    products = gramians[:, near][:, :, ~near]
+    norms = np.einsum("bii->bi", gramians)
+    nonzero = (norms[:, near, None] > 0.0) & (norms[:, None, ~near] > 0.0)
+    meets = products != 0.0 if overlap is None else overlap[:, near][:, :, ~near]
+    counted = nonzero & meets
+    negative = counted & (products < 0.0)
+    return Conflict(
+        per_block=_share(negative.sum(axis=(1, 2)), counted.sum(axis=(1, 2))),
+        per_pair=_mean(_share(negative.sum(axis=0), counted.sum(axis=0))),
+        pairs=counted.sum(axis=(1, 2)),
+        disjoint=(nonzero & ~meets).sum(axis=(1, 2)),
+        zero=(~nonzero).sum(axis=(1, 2)),
+    )
+
+
+def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The quotient, NaN where the whole is empty."""
+    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    """Mean of the values that are not NaN; NaN without any."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
+#: A line and the scatter around it.
+_SMALLEST = 4
+
+
+@dataclass(frozen=True)
+class Exponent:
+    """d_theta of ||gradient|| ~ r^-d_theta; positive where near views have longer gradients.
+
+    Attributes:
+        value: The fitted exponent; NaN where it is undefined.
+        interval: Its confidence interval.
+        views: Number of views with a non-zero gradient and distance.
+    """
+
+    value: float
+    interval: Interval
+    views: int
+
+
+def distance_exponent(
+    squared: NDArray[np.float64], distances: NDArray[np.float64], level: float = 0.95
+) -> Exponent:
+    """Least-squares line of log length over log distance; the interval allows for unequal scatter.
+
+    Args:
+        squared: [V] squared gradient lengths of one block.
+        distances: [V] camera distances, any unit.
+        level: Confidence level.
+
+    Source: the paper, Proposition 1 (P1: larger for geometry than for amplitudes; P4: only where
+    the distance matches the visual scale); HC3 standard error, MacKinnon and White 1985.
+    """
+    kept = (squared > 0.0) & (distances > 0.0)
+    views = int(kept.sum())
+    x, y = np.log(distances[kept]), np.log(squared[kept]) / 2.0
+    if views < _SMALLEST or float(np.ptp(x)) == 0.0:
+        return Exponent(float("nan"), UNKNOWN, views)
+    centred = x - x.mean()
+    spread = float(centred @ centred)
+    slope = float(centred @ y) / spread
+    residuals = y - y.mean() - slope * centred
+    leverage = np.minimum(1.0 / views + centred**2 / spread, 1.0 - 1e-9)
+    error = float(np.sqrt(((centred * residuals / (1.0 - leverage)) ** 2).sum())) / spread
+    reach = float(t.ppf((1.0 + level) / 2.0, views - 2)) * error
+    return Exponent(-slope, Interval(-slope - reach, -slope + reach), views)
+
+
+def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
+    """tr(Sigma) / ||mean gradient||^2 of one block, both estimated without bias.
+
+    Well below the noise scale, K views per step are worth about as much as K steps; well above it
+    further views are wasted. The mean and the variance are those of the mixture of the groups with
+    their shares. Infinite where the mean gradient cannot be told from zero; NaN without variance.
+
+    Args:
+        gramian: [V, V].
+        groups: Which views are near, and the groups' shares.
+
+    Source: McCandlish et al. 2018, the simple noise scale.
+    """
+    split = variance_split(gramian, groups)
+    variance = split.within + split.between
+    signal = _squared_mean(gramian, groups)
+    if variance <= 0.0:
+        return float("nan")
+    return variance / signal if signal > 0.0 else float("inf")
+
+
+def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
+    """Unbiased estimate of ||p near mean + q far mean||^2."""
+    near, (n, m), (p, q) = groups.near, groups.sizes, groups.shares
+    weights = np.where(near, p / n, q / m)
+    plain = float(weights @ gramian @ weights)
+    noise = 0.0
+    for members, size, share, unseen in (
+        (near, n, p, groups.unseen[0]),
+        (~near, m, q, groups.unseen[1]),
+    ):
+        own = gramian[np.ix_(members, members)]
+        spread = (float(np.trace(own)) - float(own.sum()) / size) / (size - 1)
+        noise += share**2 * unseen * spread / size
+    return plain - noise
+
+
+Row: TypeAlias = Mapping[str, str | int | float]
 #: All blocks taken as one vector.
 ALL = "all"
 #: The paper's R_op+DC is taken on these two together.

@@ -1,17 +1,147 @@
 """Probing a run at an interval."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Model, Scene, UserError, hookimpl
-from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
-from crossgrad_plugins.diagnostics.plan import ProbePlan
+from crossgrad_core.commands import names
+from crossgrad_core.plugin import (
+    Model,
+    Scene,
+    UserError,
+    bimodality,
+    footprint_of,
+    hookimpl,
+    radial_distances,
+)
+from crossgrad_plugins.diagnostics.distances import relative_variance
+from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
+from crossgrad_plugins.diagnostics.plan import ProbePlan, labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement, measure
+from crossgrad_plugins.diagnostics.ratios import gradient_ratio
 from crossgrad_plugins.diagnostics.report import Report
-from crossgrad_plugins.diagnostics.table import Row, table
+from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
+from crossgrad_plugins.diagnostics.variance import variance_split
+from crossgrad_plugins.groupings.heights import altitudes, upward
+
+#: Groupings that the one probe is also read by (the paper's prediction P4).
+GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
+
+
+def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
+    """Name -> [N] distances of the training views.
+
+    `radial`: from the mean camera, as in the paper. `depth`: median depth of the SfM points over
+    the focal length relative to the median one, where every view sees some.
+    """
+    views = scene.train_views
+    found = {"radial": radial_distances(scene, views)}
+    footprints = np.array([footprint_of(scene, view) for view in views])
+    if not np.isnan(footprints).any():
+        found["depth"] = np.median(footprints) / footprints
+    return found
+
+
+def camera_rows(scene: Scene) -> list[Row]:
+    """Bimodality of heights and log-distances, and the variance of the distances."""
+    axis, source = upward(scene)
+    # Name -> values, and Var(r) / mean(r)^2 of a distance; heights have an arbitrary origin.
+    heights = altitudes(scene, scene.train_views, axis)
+    samples = {f"height ({source})": (heights, float("nan"))}
+    for name, values in distances_of(scene).items():
+        logs = np.log(values[values > 0.0])
+        samples[f"log {name} distance"] = logs, relative_variance(values)
+    rows: list[Row] = []
+    for name, (values, variance) in samples.items():
+        coefficient = bimodality(values)
+        rows.append(
+            {
+                "quantity": name,
+                "views": coefficient.size,
+                "bimodality_sample": coefficient.sample,
+                "bimodality_population": coefficient.population,
+                "relative_variance": variance,
+                "note": coefficient.reason,
+            }
+        )
+    return rows
+
+
+def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:
+    """The same probe read by several groupings; those that cannot group the scene say why."""
+    rows: list[Row] = []
+    for name, labels, reason in _groupings(scene, seed):
+        if reason:
+            rows.append({"grouping": name, "note": reason})
+            continue
+        plan = plan_probe(scene, name, labels, len(labels), seed)
+        places = [
+            place
+            for place, view in enumerate(measurement.views)
+            if labels[view] in {plan.near_label, plan.far_label}
+        ]
+        near = plan.near([measurement.views[place] for place in places])
+        probed = min(int(near.sum()), int((~near).sum()))
+        if probed < SMALLEST_GROUP:
+            rows.append({"grouping": name, "note": "too few probed views in one of its groups"})
+            continue
+        rows += _read_by(plan.grouping, plan.cameras, _part(measurement, places), near)
+    return rows
+
+
+def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], str]]:
+    """(name, labels, why there are none) of every grouping, and of the reported regimes."""
+    regimes = tuple(view.regime for view in scene.train_views)
+    if len(set(regimes)) > 1:
+        yield "regime", regimes, ""
+    for name in GROUPINGS:
+        if name not in names("groupings"):
+            continue
+        try:
+            yield name, labelled(scene, name, seed)[0], ""
+        except UserError as error:
+            yield name, (), error.what
+
+
+def _part(measurement: Measurement, places: list[int]) -> Measurement:
+    """The measurement of some of its views."""
+    square = np.ix_(range(len(measurement.blocks)), places, places)
+    return Measurement(
+        step=measurement.step,
+        views=tuple(measurement.views[place] for place in places),
+        blocks=measurement.blocks,
+        kinds=measurement.kinds,
+        plain=measurement.plain[square],
+        adam=None if measurement.adam is None else measurement.adam[square],
+        overlap=measurement.overlap[square],
+        dropped=measurement.dropped,
+        share=measurement.share,
+    )
+
+
+def _read_by(
+    grouping: str, cameras: tuple[int, int], measurement: Measurement, near: NDArray[np.bool_]
+) -> Iterator[Row]:
+    per_pair = per_pair_conflict(measurement, near)
+    for block, gramian in zip(measurement.blocks, measurement.plain, strict=True):
+        figures: Mapping[str, float] = {
+            "ratio_of_means": gradient_ratio(np.diag(gramian), near).of_means,
+            "rho": variance_split(gramian, Groups(near)).ratio,
+            "per_pair_conflict": per_pair,
+        }
+        yield {
+            "grouping": grouping,
+            "note": "",
+            "near_cameras": cameras[0],
+            "far_cameras": cameras[1],
+            "near_probed": int(near.sum()),
+            "far_probed": int((~near).sum()),
+            "block": block,
+            **figures,
+        }
 
 
 @dataclass

@@ -2,14 +2,70 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from math import isfinite, log2
+from pathlib import Path
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
-from crossgrad_core.plugin import Scene
-from crossgrad_plugins.exposures.photo_headers import exposure_value
+from crossgrad_core.plugin import Scene, UserError, View
+from crossgrad_core.scene.photos import FilePhoto
+from crossgrad_core.scene.pillow import opened
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+_IFD = 0x8769
+_TIME, _APERTURE, _SENSITIVITY = 33434, 33437, 34855  # ExposureTime, FNumber, ISOSpeedRatings
+#: What cameras write whose sensitivity does not fit into 16 bits.
+_OVERFLOW = 65535
+
+
+def exposure_value(view: View) -> float | None:
+    """log2(t ISO / N^2) of a view's photo: how much brighter than others it shows the same light.
+
+    Args:
+        view: The view; its photo need not come from a file.
+
+    Returns:
+        Stops, comparable between photos of one camera; None where the file does not tell exposure
+        time t, sensitivity and f-number N.
+    """
+    photo = view.photo
+    return _of_file(photo.source.path) if isinstance(photo, FilePhoto) else None
+
+
+def _of_file(path: Path) -> float | None:
+    try:
+        with opened(path, "the photo's EXIF header cannot be read") as image:
+            return _value(image)
+    except UserError:  # Decoding the photo raises it again, if it is one of the photo.
+        return None
+
+
+def _value(image: "Image") -> float | None:
+    tags: Mapping[int, object] = image.getexif().get_ifd(_IFD)
+    time, aperture, sensitivity = (
+        _positive(tags.get(tag)) for tag in (_TIME, _APERTURE, _SENSITIVITY)
+    )
+    if time is None or aperture is None or sensitivity in {None, _OVERFLOW}:
+        return None
+    value = log2(time) + log2(sensitivity or 1.0) - 2.0 * log2(aperture)
+    return value if isfinite(value) else None
+
+
+def _positive(value: object) -> float | None:
+    """The number of a tag; None where it is none, or not above 0."""
+    first = value[0] if isinstance(value, tuple) and value else value
+    try:
+        number = float(first)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if isfinite(number) and number > 0.0 else None
+
 
 #: Headers that are read at once.
 _AT_ONCE = 4
-
 # A run asks at every evaluation, and a scene does not change.
 _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 

@@ -1,11 +1,127 @@
 """The loss of 3DGS: absolute differences and dissimilar structure."""
 
+from typing import Any
+
+import torch
 from pydantic import Field
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
 from crossgrad_core.plugin import Loss
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.photometric.on_device import loss_and_gradient
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
+
+
+def photometric_loss(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    ssim_weight: float = 0.2,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """(1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
+
+    In float32 value and gradient come from one pass (the gradient is first order only): a fused
+    kernel on the CPU, torch's operators elsewhere. Other types, and weights, take the torch path
+    that can be differentiated again.
+
+    Args:
+        image: [H, W, 3] floating point, the render.
+        target: [H, W, 3] floating point or uint8, the photo, on the same device.
+        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        ssim_weight: w in [0, 1].
+        weights: [H, W] floating point, not negative; None weighs all pixels alike.
+
+    Returns:
+        Scalar of the image's type.
+
+    Raises:
+        ValueError: If the shapes do not fit.
+    """
+    _check(image, target, mask)
+    if weights is not None:
+        _check_weights(image, weights)
+        return l1_ssim_loss(image, target, mask, ssim_weight, weights)
+    on_cpu = all(t is None or t.device.type == "cpu" for t in (image, target, mask))
+    if image.dtype == torch.float32 and (on_cpu or image.requires_grad):
+        way = _FusedLoss if on_cpu else _DeviceLoss
+        loss: Tensor = way.apply(image, target, mask, ssim_weight)  # type: ignore[no-untyped-call]
+        return loss
+    return l1_ssim_loss(image, target, mask, ssim_weight)
+
+
+class _FusedLoss(torch.autograd.Function):
+    """Stores the gradient by the image in the forward pass and scales it in the backward pass."""
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
+    ) -> Tensor:
+        from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
+
+        image = image.detach().contiguous()
+        target = target.detach().contiguous()
+        if target.dtype != torch.uint8:
+            target = target.to(torch.float32)
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        absolute, dissimilarity = loss_terms(
+            image.numpy(),
+            target.numpy(),
+            None if mask is None else mask.contiguous().numpy(),
+            None if gradient is None else gradient.numpy(),
+            ssim_weight,
+        )
+        if gradient is not None:
+            ctx.save_for_backward(gradient)
+        return image.new_tensor((1 - ssim_weight) * absolute + ssim_weight * dissimilarity)
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        scaled = gradient if float(upstream) == 1.0 else gradient * upstream
+        return scaled, None, None, None
+
+
+class _DeviceLoss(torch.autograd.Function):
+    """As `_FusedLoss`, by torch's operators: for a GPU, which is not waited for."""
+
+    @staticmethod
+    @override
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
+    ) -> Tensor:
+        loss, gradient = loss_and_gradient(image, target, mask, ssim_weight)
+        ctx.save_for_backward(gradient)
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    @override
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None, None
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.ndim != 3 or image.shape[-1] != 3:  # noqa: PLR2004 - [H, W, 3]
+        raise ValueError(f"`image` must be [H, W, 3]; found {list(image.shape)}")
+    if target.shape != image.shape:
+        shapes = f"{list(target.shape)} and {list(image.shape)}"
+        raise ValueError(f"`target` must have the shape of `image`; found {shapes}")
+    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
+        found = f"{list(mask.shape)} {mask.dtype}"
+        raise ValueError(f"`mask` must be [H, W] bool; found {found} for {list(image.shape)}")
+
+
+def _check_weights(image: Tensor, weights: Tensor) -> None:
+    if weights.shape != image.shape[:2] or not weights.is_floating_point():
+        found = f"{list(weights.shape)} {weights.dtype}"
+        message = f"`weights` must be [H, W] floats; found {found} for {list(image.shape)}"
+        raise ValueError(message)
 
 
 class L1SSIM(Loss):

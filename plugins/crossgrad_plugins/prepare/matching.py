@@ -2,16 +2,78 @@
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from crossgrad_core.commands import UserError, check_folder, write_atomically
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.retrieval import index_of
 from crossgrad_plugins.prepare.subprocess_wait import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+#: Visual words, and features that they are made from: faiss asks for 39 of each word.
+_WORDS, _SAMPLE = 2048, 100_000
+#: Iterations of k-means, once; the words need not be good.
+_ITERATIONS: Final = 20
+#: Numbers of a feature, and of its embedding in the index (pycolmap).
+_SIFT, _EMBEDDED = 128, 64
+
+
+def index_of(layout: Layout, threads: int) -> Path:
+    """The file of the index, made where it is not there.
+
+    Raises:
+        UserError: Pycolmap failed.
+    """
+    path = layout.work / "index.bin"
+    if not path.is_file():
+        scratch = path.with_name(f".{path.name}.tmp")
+        waited("indexing features", lambda _: _build(layout, threads).write(scratch), lambda: "")
+        scratch.replace(path)
+    return path
+
+
+def _build(layout: Layout, threads: int) -> "pycolmap.VisualIndex":
+    import pycolmap
+
+    sample = _sample(layout)
+    options = pycolmap.VisualIndex.BuildOptions()
+    options.num_visual_words = min(_WORDS, max(1, len(sample) // 64))
+    options.num_iterations, options.num_rounds = _ITERATIONS, 1
+    options.num_threads = threads
+    index = pycolmap.VisualIndex.create(_SIFT, _EMBEDDED)
+    index.build(
+        options, pycolmap.FeatureDescriptorsFloat(pycolmap.FeatureExtractorType.SIFT, sample)
+    )
+    return index
+
+
+def _sample(layout: Layout) -> NDArray[np.float32]:
+    """[N, 128] features, as many of each photo."""
+    import pycolmap
+
+    rng = np.random.default_rng(0)
+    with quiet():
+        database = pycolmap.Database.open(layout.database)
+        try:
+            numbers = [image.image_id for image in database.read_all_images()]
+            known = [number for number in numbers if database.exists_descriptors(number)]
+            each = -(-_SAMPLE // len(known))
+            parts = []
+            for number in known:
+                found = np.asarray(database.read_descriptors(number).data)
+                rows = rng.permutation(len(found))[:each]
+                parts.append(found[rows].astype(np.float32))
+        finally:
+            database.close()
+    return np.concatenate(parts)
+
 
 #: Up to so many photos all pairs are compared; without GPS, up to the second, and where they are in
 #: several folders, which few pairs may join, up to the third.

@@ -1,9 +1,12 @@
 """A sweep from its grid to its summary."""
 
+import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from crossgrad_core.commands import (
     FAILED,
@@ -19,11 +22,13 @@ from crossgrad_core.commands import (
     listed,
     locked,
     one_line,
+    signal_names,
+    tell,
     write_mapping,
     writer_of,
 )
 from crossgrad_plugins.sweep.best import best_grid
-from crossgrad_plugins.sweep.engines import Work, check_options, engine
+from crossgrad_plugins.sweep.engines import Stop, Work, check_options, engine
 from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, with_scenes
 from crossgrad_plugins.sweep.layout import Layout
@@ -32,9 +37,34 @@ from crossgrad_plugins.sweep.plan import planned
 from crossgrad_plugins.sweep.progress import Screen
 from crossgrad_plugins.sweep.records import read_records
 from crossgrad_plugins.sweep.run_status import Standing, standings
-from crossgrad_plugins.sweep.stopping import noted
 from crossgrad_plugins.sweep.summary import listing, table, write_plan
 from crossgrad_plugins.sweep.watch import Watch
+
+_WORDS = "stopping: the runs under way save a checkpoint first (once more: without an evaluation)"
+
+
+@contextmanager
+def noted(stop: Stop) -> Iterator[list[int]]:
+    """Counts signals inside the block.
+
+    Yields:
+        The signals that came.
+    """
+    came: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        came.append(number)
+        stop.count += 1
+        if stop.count == 1:
+            tell(_WORDS)
+
+    before = {number: signal.signal(number, note) for number in signal_names()}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
 
 #: Where sweeps are kept, below the working folder.
 SWEEPS = Path("runs/sweeps")

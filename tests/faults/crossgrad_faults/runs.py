@@ -13,7 +13,7 @@ from crossgrad_faults.nursery import ALONE
 
 #: 60 steps with five edits, a reset, six checkpoints and seven evaluations.
 OPTIONS = (
-    *("--steps", "60", "--threads", "1", "--events", "steps"),
+    *("--steps", "60", "--threads", "1", "--schedule-unit", "steps"),
     *("--set", "densify_from=10", "--set", "densify_every=10", "--set", "densify_until=55"),
     *("--set", "reset_every=30", "--save-every", "9", "--eval-every", "8"),
 )

@@ -8,9 +8,9 @@ from support.extremes import jittered
 
 from crossgrad_backbones.anchors import decode as decoding
 from crossgrad_backbones.anchors.activation import Seen
-from crossgrad_backbones.anchors.volume import mean_volume
+from crossgrad_backbones.anchors.base import mean_volume
 from crossgrad_backbones.scaffold import Scaffold
-from crossgrad_core.contract.topology import Edit, apply_to_parameters
+from crossgrad_core.contract.blocks import Edit, apply_to_parameters
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.distance import DistanceConditioned
-from crossgrad_backbones.distances import encoded, fitted_scale
+from crossgrad_backbones.distance import DistanceConditioned, encoded, fitted_scale
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contract.contexts import RegularizeContext
 from crossgrad_core.testing.backbones import created

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.levels.coarse_to_fine import allowed_top, opening_steps
 from crossgrad_backbones.levels.fitting import (
     MOST_LEVELS,
     automatic_root_cell,
@@ -17,8 +16,8 @@ from crossgrad_backbones.levels.fitting import (
     root_above,
     root_cell,
 )
-from crossgrad_backbones.levels.init_anchors import init_anchors, visible_share
 from crossgrad_backbones.levels.lattice import Lattice
+from crossgrad_backbones.octree import allowed_top, init_anchors, opening_steps, visible_share
 
 
 def quantile(values, q):

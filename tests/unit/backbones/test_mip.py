@@ -8,17 +8,16 @@ import pytest
 import torch
 from support.gaussians import posed_camera
 
-from crossgrad_backbones.mip import MipSplatting, renews
-from crossgrad_backbones.smoothing import filter_widths, smoothed
+from crossgrad_backbones.mip import MipSplatting, filter_widths, renews, smoothed
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.blocks import Edit, apply_to_parameters
 from crossgrad_core.contract.contexts import AfterStepContext
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.topology import Edit, apply_to_parameters
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene, step_fields
-from crossgrad_core.training.edits import apply_edit
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.step import apply_edit
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 NEAR = 1e-3

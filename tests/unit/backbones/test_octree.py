@@ -17,7 +17,7 @@ from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 WHOLE = {

@@ -9,7 +9,7 @@ from support.run_folders import RunFolder
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
-from crossgrad_plugins.compare.checks.code import differing_code
+from crossgrad_plugins.compare.app import differing_code
 from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.load_runs import read_runs

@@ -11,8 +11,14 @@ from support.run_folders import RunFolder
 from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.options import Options
-from crossgrad_plugins.compare.statistics.bootstrap import Bootstrap, iqm
-from crossgrad_plugins.compare.statistics.estimate import IQM, MEAN, estimate, pairs_needed
+from crossgrad_plugins.compare.statistics.estimate import (
+    IQM,
+    MEAN,
+    Bootstrap,
+    estimate,
+    iqm,
+    pairs_needed,
+)
 from crossgrad_plugins.compare.statistics.verdict import Verdict, holm, opposed, verdicts
 
 RNG = np.random.default_rng(0)

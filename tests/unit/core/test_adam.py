@@ -6,7 +6,7 @@ import numba
 import pytest
 import torch
 
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.training.adam.adam import (
     adam_step,
     update_on_gpu,

@@ -3,10 +3,9 @@
 import numpy as np
 import torch
 
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import Block, LearningRate, PluginState
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.testing.fixtures import step_fields
 from crossgrad_operators.pcgrad import PCGrad

@@ -11,14 +11,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.checkpoint import checkpoint
-from crossgrad_core.run.checkpoint import tensors as checkpoint_tensors
-from crossgrad_core.run.checkpoint.checkpoint import drop_later, latest, load, load_latest, save
-from crossgrad_core.run.checkpoint.contents import Checkpoint
-from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.checkpoint.state import digest
+from crossgrad_core.run.checkpoint import checkpoint as checkpoints
+from crossgrad_core.run.checkpoint.checkpoint import (
+    Checkpoint,
+    Keep,
+    digest,
+    drop_later,
+    latest,
+    load,
+    load_latest,
+    save,
+)
 
 
 def make_checkpoint(step: int = 700, seed: int = 0) -> Checkpoint:
@@ -205,7 +211,7 @@ def test_where_the_disk_is_full_what_would_be_deleted_anyway_makes_room(
 ):
     for step in (100, 200):
         save(tmp_path, make_checkpoint(step), keep)
-    write = checkpoint_tensors.write_tensors
+    write = checkpoints.write_tensors
 
     def with_room_for_two(path: Path, packed: dict[str, Tensor]) -> None:
         if len(list(path.parents[1].glob("step-*"))) > 1:
@@ -250,7 +256,7 @@ def test_the_library_reports_a_full_disk_as_an_os_error(
 
     monkeypatch.setattr(safetensors.torch, "save_file", fail)
     with pytest.raises(OSError, match="No space left") as told:
-        checkpoint_tensors.write_tensors(tmp_path / "t", {})
+        checkpoints.write_tensors(tmp_path / "t", {})
     assert told.value.errno == errno.ENOSPC
 
 

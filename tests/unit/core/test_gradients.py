@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import EMPTY_STATE, Block, LearningRate
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
-from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients

@@ -15,7 +15,7 @@ from crossgrad_core.system.input_files import is_file, open_file, read_file
 from crossgrad_core.system.ply_table import read_vertices
 from crossgrad_core.system.text_files import read_json, read_rows
 from crossgrad_core.system.yaml_values import read_mapping
-from crossgrad_core.training.photo_file import read_values
+from crossgrad_core.training.per_image_params import read_values
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 

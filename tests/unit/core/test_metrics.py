@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from crossgrad_core.contract.images import to_uint8
+from crossgrad_core.contract.scene import to_uint8
 from crossgrad_core.evaluation.metrics import PSNR_LIMIT, psnr
 from crossgrad_plugins.losses.photometric.reference import ssim_map
 from crossgrad_plugins.metrics.similarity import ssim, ssim_skimage

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from crossgrad_core.contract.pace import ViewsPerStep, ViewsPerStepSpec
+from crossgrad_core.contract.schedule import ViewsPerStep, ViewsPerStepSpec
 
 PLANS = ["1", "2", "7", "1..2@0.5", "2..1@0.3", "1..2@0.25..4@0.75", "4..3@0.01..12@0.99"]
 

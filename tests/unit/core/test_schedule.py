@@ -7,12 +7,12 @@ import pytest
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import LearningRate
-from crossgrad_core.contract.pace import ViewsPerStepSpec
 from crossgrad_core.contract.schedule import (
     SHORTEST_INTERVAL,
     SHORTEST_WARM_UP,
     Counting,
     Schedule,
+    ViewsPerStepSpec,
 )
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
@@ -135,8 +135,8 @@ def test_learning_rate_is_log_linear_and_clipped():
 FEWEST_EDITS = 6
 
 
-def in_views(text="1", photos=24, reference=None):
-    return Counting("views", ViewsPerStepSpec.parsed(text), photos, reference, FEWEST_EDITS)
+def in_views(text="1", photos=24, schedule_length=None):
+    return Counting("views", ViewsPerStepSpec.parsed(text), photos, schedule_length, FEWEST_EDITS)
 
 
 def view_counts(schedule, happens=Schedule.densifies):

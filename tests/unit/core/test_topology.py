@@ -5,10 +5,12 @@ from copy import deepcopy
 import pytest
 import torch
 
-from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import (
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    Block,
     Edit,
+    LearningRate,
+    PluginState,
     Rows,
     apply_to_moment,
     apply_to_parameters,

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.mip import MipSplatting
 from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contract.blocks import NO_EDIT, PluginState, apply_to_parameters
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, apply_to_parameters
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
 from crossgrad_core.testing.records import view_record
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl

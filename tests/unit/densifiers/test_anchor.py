@@ -16,12 +16,16 @@ from crossgrad_backbones.anchors.growth.cells import (
 )
 from crossgrad_backbones.anchors.growth.control import AnchorControl
 from crossgrad_backbones.scaffold import Scaffold
+from crossgrad_core.contract.blocks import (
+    NO_EDIT,
+    PluginState,
+    apply_to_moment,
+    apply_to_parameters,
+)
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_parameters
 from crossgrad_core.testing.records import view_record
 
 SCHEDULE = AnchorControl().window(Schedule.for_run(30_000))

@@ -12,9 +12,9 @@ from support.brute_force import trace
 from support.multiview import TRAIN, VIEWS, Shown, context, recorded
 
 from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.gaussians import Screen
 from crossgrad_core.contract.schedule import Phase
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene
 from crossgrad_plugins.densifiers.error_pixel_counts import (
     ERROR,

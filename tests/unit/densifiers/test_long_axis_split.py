@@ -10,12 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contract.blocks import PluginState, apply_to_parameters
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import apply_to_parameters
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.records import view_record
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl

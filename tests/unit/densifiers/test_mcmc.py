@@ -12,18 +12,27 @@ from scipy.spatial.transform import Rotation
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    NO_EDIT,
+    Edit,
+    apply_to_moment,
+    apply_to_parameters,
+)
 from crossgrad_core.contract.contexts import AfterStepContext, DensifyContext, RegularizeContext
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import EMPTY_STATE
-from crossgrad_core.contract.topology import NO_EDIT, Edit, apply_to_moment, apply_to_parameters
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.fixtures import sample_gaussians, sample_scene, step_fields
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
-from crossgrad_plugins.densifiers.mcmc import MarkovChainMonteCarlo, drawn
-from crossgrad_plugins.densifiers.relocation import shared_opacity, shared_scale
+from crossgrad_plugins.densifiers.mcmc import (
+    MarkovChainMonteCarlo,
+    drawn,
+    shared_opacity,
+    shared_scale,
+)
 
 MEANS_LR = 1e-4
 

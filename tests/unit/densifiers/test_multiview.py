@@ -16,10 +16,13 @@ from support.multiview import TRAIN, VIEWS, Shown, context, parameters_of, recor
 from crossgrad_backbones.mip import MipSplatting
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.pace import ViewsPerStepSpec
-from crossgrad_core.contract.schedule import Counting, Phase, Schedule
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
-from crossgrad_core.contract.topology import apply_to_moment, apply_to_parameters
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    PluginState,
+    apply_to_moment,
+    apply_to_parameters,
+)
+from crossgrad_core.contract.schedule import Counting, Phase, Schedule, ViewsPerStepSpec
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene
 from crossgrad_core.training.loop import timed_step

@@ -9,8 +9,7 @@ import torch
 from crossgrad_backbones.anchors.growth.control import AnchorControl
 from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit
+from crossgrad_core.contract.blocks import Edit, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble

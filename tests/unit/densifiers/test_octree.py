@@ -9,15 +9,23 @@ import torch
 
 from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
 from crossgrad_backbones.levels.lattice import Lattice
-from crossgrad_backbones.levels.octree_control import OctreeControl
-from crossgrad_backbones.levels.octree_growing import Thresholds, grown, seen_from_farther
+from crossgrad_backbones.levels.octree_control import (
+    OctreeControl,
+    Thresholds,
+    grown,
+    seen_from_farther,
+)
 from crossgrad_backbones.octree import Octree
-from crossgrad_core.contract.blocks import primitives_of
+from crossgrad_core.contract.blocks import (
+    Edit,
+    PluginState,
+    apply_to_parameters,
+    gather_indices,
+    primitives_of,
+)
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, apply_to_parameters, gather_indices
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.records import view_record
 

@@ -9,12 +9,11 @@ import torch
 from support.gaussians import posed_camera
 
 from crossgrad_backbones.vanilla import Vanilla
+from crossgrad_core.contract.blocks import NO_EDIT, PluginState
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT
 from crossgrad_core.testing.records import view_record
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl, quantile
 from crossgrad_plugins.densifiers.pixel import PixelDensityControl

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_plugins.densifiers.relocation import Pool, shared_opacity, shared_scale
+from crossgrad_plugins.densifiers.mcmc import Pool, shared_opacity, shared_scale
 
 OPACITIES = (1e-300, 1e-12, 1e-4, 0.005, 0.1, 0.5, 0.9, 0.999, 1 - 1e-9, 1 - 2**-53, 1.0)
 COPIES = (1, 2, 3, 7, 20, 51)

@@ -13,21 +13,27 @@ from support.brute_force import trace
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.blocks import (
+    EMPTY_STATE,
+    NO_EDIT,
+    apply_to_moment,
+    apply_to_parameters,
+)
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.schedule import Phase, Schedule
-from crossgrad_core.contract.state import EMPTY_STATE
-from crossgrad_core.contract.topology import NO_EDIT, apply_to_moment, apply_to_parameters
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene, step_fields
 from crossgrad_core.testing.renders import renders_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
-from crossgrad_plugins.densifiers.error_share import largest_shares, pixel_error, spread_views
 from crossgrad_plugins.densifiers.revising import (
     RevisingDensification,
     halved_logits,
+    largest_shares,
     lowered_logits,
+    pixel_error,
+    spread_views,
 )
 
 VIEWS = len(sample_scene().train)

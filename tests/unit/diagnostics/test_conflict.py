@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from crossgrad_plugins.diagnostics.conflict import conflict
 from crossgrad_plugins.diagnostics.distances import conflict_by_distance
-from crossgrad_plugins.diagnostics.exponent import distance_exponent
 from crossgrad_plugins.diagnostics.ratios import geometric_mean, gradient_ratio
+from crossgrad_plugins.diagnostics.table import conflict, distance_exponent
 
 NEAR = np.array([True, True, False, False])
 

@@ -8,8 +8,7 @@ import pytest
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 from crossgrad_plugins.diagnostics.intervals.interval import Interval
-from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
-from crossgrad_plugins.diagnostics.intervals.pivots import StudentisedGap
+from crossgrad_plugins.diagnostics.intervals.intervals import StudentisedGap, split_intervals
 from crossgrad_plugins.diagnostics.intervals.resampling import Resamples, multiplicities
 from crossgrad_plugins.diagnostics.variance import split_of, variance_split
 

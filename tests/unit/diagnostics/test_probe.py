@@ -7,20 +7,19 @@ import pytest
 import torch
 
 from crossgrad_core.commands import write_table
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.contract.contexts import Model
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_plugins.diagnostics import probe
-from crossgrad_plugins.diagnostics.cameras import camera_rows, distances_of, grouping_rows
 from crossgrad_plugins.diagnostics.plan import labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import ModelProbe, measure
 from crossgrad_plugins.diagnostics.report import read_probes
 from crossgrad_plugins.diagnostics.table import ALL, table
-from crossgrad_plugins.diagnostics.watch import Watch
-from crossgrad_plugins.losses.photometric.loss import photometric_loss
+from crossgrad_plugins.diagnostics.watch import Watch, camera_rows, distances_of, grouping_rows
+from crossgrad_plugins.losses.l1_ssim import photometric_loss
 
 VIEWS = (0, 2, 5, 8)
 

@@ -7,7 +7,7 @@ import pytest
 
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.diagnostics.grouped import Groups
-from crossgrad_plugins.diagnostics.noise_scale import noise_scale
+from crossgrad_plugins.diagnostics.table import noise_scale
 from crossgrad_plugins.diagnostics.variance import variance_split
 
 NEAR_CAMERAS, FAR_CAMERAS, DIMENSION = 5, 6, 4

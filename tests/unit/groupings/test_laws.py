@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from crossgrad_core.contract.poses import radial_distances
-from crossgrad_core.contract.similarity import Similarity
+from crossgrad_core.contract.scene import Similarity, radial_distances
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.posed import posed_scene, posed_view

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crossgrad_core.contract.poses import footprint_of
+from crossgrad_core.contract.scene import footprint_of
 from crossgrad_core.errors import UserError
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.groupings.conflict_signature import (

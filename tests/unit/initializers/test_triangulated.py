@@ -9,8 +9,8 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.initializers import two_views
 from crossgrad_plugins.initializers.triangulated import Triangulated

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from crossgrad_core.contract.blocks import EMPTY_STATE
 from crossgrad_core.contract.contexts import OperatorContext
-from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.registry.entries import build
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.state import EMPTY_STATE
+from crossgrad_core.contract.blocks import EMPTY_STATE
 from crossgrad_operators.graddrop import GradDrop
 from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import BLOCK, context_of

@@ -6,8 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_operators.stress.invariances import LAWS
-from crossgrad_operators.stress.suite import made
+from crossgrad_operators.stress.suite import LAWS, made
 
 OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
 GRAMIAN = [name for name in OURS if name not in {"graddrop", "torchjd"}]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.contract.state import EMPTY_STATE, PluginState
+from crossgrad_core.contract.blocks import EMPTY_STATE, PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 

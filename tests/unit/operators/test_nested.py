@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 from support.selections import selection_of
 
+from crossgrad_core.contract.blocks import EMPTY_STATE
 from crossgrad_core.contract.component import ViewCounts
-from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_operators.chain import Chain

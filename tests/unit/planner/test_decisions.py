@@ -20,17 +20,17 @@ from crossgrad_core.commands import (
     read_scene,
 )
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks import gains as tracks
 from crossgrad_plugins.exposures.tracks.fit import Fit
 from crossgrad_plugins.exposures.tracks.gains import TrackGains
 from crossgrad_plugins.planner import groups, looks, sizes
+from crossgrad_plugins.planner.app import lines_of
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
 from crossgrad_plugins.planner.planner import PARTS, plan_of, planned
 from crossgrad_plugins.planner.probe import Probe
-from crossgrad_plugins.planner.terminal import lines_of
 
 #: A folder with scenes of these names, where there is one.
 SCENES = Path(os.environ.get("CROSSGRAD_SCENES", "no-such-folder"))
@@ -461,7 +461,7 @@ def test_few_photos_without_points(count):
     changes = {"data.init": "random"} if count == 1 else {"initializer": "triangulated"}
     assert plan.settings == changes
     assert plan.of_part("exposure").basis == "default"
-    assert planned(config_of(), scene)[0].reading.init == ("random" if count == 1 else "points")
+    assert planned(config_of(), scene)[0].data.init == ("random" if count == 1 else "points")
 
 
 @pytest.mark.parametrize("photos", [1, 9, 10, 11, 40])

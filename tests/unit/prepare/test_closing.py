@@ -10,9 +10,9 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.commands import configured, merged
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_plugins.prepare import app
-from crossgrad_plugins.prepare.picture import draw
+from crossgrad_plugins.prepare.app import draw
 from crossgrad_plugins.prepare.plan import Settings
 
 

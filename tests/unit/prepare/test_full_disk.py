@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.bundled import bundled_scene
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.system import check_writable
 from crossgrad_plugins.prepare import features, mapping, matching, undistortion
 from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_damaged, clear_leftovers

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from crossgrad_plugins.prepare.model_checks import sound_models
+from crossgrad_plugins.prepare.mapping import sound_models
 
 
 def model_of(tracks, photos):

@@ -14,9 +14,8 @@ from PIL import Image, ImageOps
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene import pillow
 from crossgrad_plugins.prepare import photos
-from crossgrad_plugins.prepare.exif import camera_of, position_of
 from crossgrad_plugins.prepare.masks import counting_pixels
-from crossgrad_plugins.prepare.photos import find_photos
+from crossgrad_plugins.prepare.photos import camera_of, find_photos, position_of
 from crossgrad_plugins.prepare.plan import Settings
 
 GPS = 0x8825

@@ -14,8 +14,8 @@ from support.commands import ended
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
+from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.run.assemble import read_scene
-from crossgrad_core.run.bundled import bundled_scene
 from crossgrad_plugins.prepare import mapping, matching, undistortion
 from crossgrad_plugins.prepare.app import prepared
 from crossgrad_plugins.prepare.earth import local_positions, origin_of

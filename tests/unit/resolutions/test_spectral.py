@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.contract.contexts import ScaleContext, ViewSample
-from crossgrad_core.contract.pace import ViewsPerStepSpec
-from crossgrad_core.contract.schedule import Counting, Schedule
+from crossgrad_core.contract.schedule import Counting, Schedule, ViewsPerStepSpec
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import PluginState
 from crossgrad_core.registry.entries import build

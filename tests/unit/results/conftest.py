@@ -7,7 +7,7 @@ from support.figures import FIGURES, of
 
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.evaluation.result import EvaluationResult, summarised
-from crossgrad_core.run.results.cost_totals import Totals
+from crossgrad_core.run.results.metrics_csv import Totals
 
 
 class ArrayPhoto:

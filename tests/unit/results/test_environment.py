@@ -2,7 +2,7 @@
 
 import subprocess
 
-from crossgrad_core.run.results.environment import commit
+from crossgrad_core.run.results.machine import commit
 
 
 def git(folder, *arguments):

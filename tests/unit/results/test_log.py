@@ -8,8 +8,7 @@ import pytest
 
 from crossgrad_core.contract.contexts import EvaluationReport, StepRecord
 from crossgrad_core.registry.manager import make_manager
-from crossgrad_core.run.results.lines import Pace, duration, evaluation_line, progress_line
-from crossgrad_core.run.results.log import RunLog
+from crossgrad_core.run.results.log import Pace, RunLog, duration, evaluation_line, progress_line
 
 
 def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0.5) -> StepRecord:

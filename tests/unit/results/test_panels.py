@@ -11,14 +11,17 @@ from support.figures import of
 from crossgrad_core.contract.metric import Compared
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import Evaluated
-from crossgrad_core.run.results.panel_layout import (
+from crossgrad_core.run.results.panels import (
+    PanelWriter,
+    chosen_views,
+    draw_panel,
     enlargement,
+    error_map,
+    flat_names,
     folder_of,
     panels_of,
     read_panel,
 )
-from crossgrad_core.run.results.panel_names import chosen_views, flat_names
-from crossgrad_core.run.results.panels import PanelWriter, draw_panel, error_map
 
 
 @pytest.mark.parametrize(

@@ -13,17 +13,16 @@ from support.figures import columns
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.config_file import write_config
-from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row
-from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.metrics_csv import MetricsCsv, metrics_row, write_per_view
 from crossgrad_core.run.results.reading import find_runs, read_run
 from crossgrad_core.run.results.summary import Summary, write_summary
-from crossgrad_core.training.clock import PHASES, Clock, PhaseTimer
+from crossgrad_core.training.state import PHASES, Clock, PhaseTimer
 
 RUNS = 60
 PROGRAM = """
 import sys
 from pathlib import Path
-from crossgrad_core.run.results.per_view import write_per_view
+from crossgrad_core.run.results.metrics_csv import write_per_view
 from crossgrad_core.run.results.reading import find_runs, read_run
 runs = [read_run(folder) for folder in find_runs(Path(sys.argv[1]))]
 assert all(run.regimes == ("far", "near") for run in runs)

@@ -10,7 +10,7 @@ def test_places_of_one_name_get_numbers_and_keep_them(tmp_path):
 
 
 def test_the_name_of_the_path_that_comes_from_no_file_is_taken(tmp_path):
-    assert name_for(tmp_path, "zoom", tmp_path / "ladder.json") == "ladder-2"
+    assert name_for(tmp_path, "zoom", tmp_path / "zoom.json") == "zoom-2"
 
 
 def test_a_damaged_list_is_begun_again(tmp_path):

@@ -11,12 +11,10 @@ import pytest
 import torch
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.results.environment import environment
-from crossgrad_core.run.results.metrics_csv import metrics_row
-from crossgrad_core.run.results.per_view import write_per_view
-from crossgrad_core.run.results.summary import Summary, read_summary, write_summary
-from crossgrad_core.run.results.table import final_table
-from crossgrad_core.training.clock import Clock
+from crossgrad_core.run.results.machine import environment
+from crossgrad_core.run.results.metrics_csv import metrics_row, write_per_view
+from crossgrad_core.run.results.summary import Summary, final_table, read_summary, write_summary
+from crossgrad_core.training.state import Clock
 
 
 @pytest.fixture(name="summary")

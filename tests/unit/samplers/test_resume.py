@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
 

@@ -8,7 +8,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_plugins.exposures.photo_headers import _of_file, exposure_value
+from crossgrad_plugins.exposures.exif import _of_file, exposure_value
 
 TIME, APERTURE, SENSITIVITY = 33434, 33437, 34855
 WHOLE = {TIME: IFDRational(1, 250), APERTURE: IFDRational(8, 1), SENSITIVITY: 200}

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from crossgrad_core.contract.scene import Camera
-from crossgrad_core.scene.regimes import label_by_folder, label_by_footprint
+from crossgrad_core.scene.build import label_by_folder, label_by_footprint
 
 NONE = np.zeros(0, dtype=np.int64)
 

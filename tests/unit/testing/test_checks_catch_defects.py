@@ -22,6 +22,7 @@ from crossgrad_core.testing import (
     exporters,
     exposures,
     groupings,
+    initializers,
     metrics,
     observers,
     operators,
@@ -29,7 +30,6 @@ from crossgrad_core.testing import (
     readers,
     reference,
     samplers,
-    starts,
 )
 from crossgrad_core.testing.contract import ContractError
 
@@ -1010,7 +1010,7 @@ DEFECTS = [
     (metrics.its_columns_are_its_own, CalledPSNR),
     (metrics.its_columns_are_its_own, CalledStep),
     (metrics.its_columns_are_its_own, CalledRegime),
-    (starts.adds_points, FillsBareScenesWithNothing),
+    (initializers.adds_points, FillsBareScenesWithNothing),
 ]
 
 #: What the component itself raises is not caught by the check: `plugins check` reports it.

@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.blocks import LearningRate
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit, Rows
+from crossgrad_core.contract.blocks import Edit, LearningRate, PluginState, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
 from crossgrad_core.run.export import renderer
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import step as stepping

@@ -8,16 +8,14 @@ import torch
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import NO_EDIT, Block, Edit, LearningRate, PluginState
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.run import decisions as deciding
 from crossgrad_core.run import select as selecting
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state

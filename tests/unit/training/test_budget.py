@@ -17,19 +17,21 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import budget
 from crossgrad_core.training.budget import (
     Planned,
+    PrimitiveCounts,
     Timed,
     _fitting,
     _without_edits,
+    cost_of_run,
+    growth_ahead,
     replay_length,
     seconds_ahead,
     steps_for,
     with_length,
 )
-from crossgrad_core.training.clock import Clock
-from crossgrad_core.training.expected_cost import PrimitiveCounts, cost_of_run, growth_ahead
 from crossgrad_core.training.growth_budget import curve
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.schedules import growth_note
+from crossgrad_core.training.state import Clock
 from crossgrad_plugins.recipes.budget import budget as usual_budget
 
 

@@ -8,18 +8,17 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.blocks import Edit, Rows
 from crossgrad_core.contract.contexts import DensifyResult
 from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.topology import Edit, Rows
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.failure import TrainingFailedError
-from crossgrad_core.training.loop import CHECK_EVERY, train
+from crossgrad_core.training.loop import CHECK_EVERY, Stopper, train
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.stopper import Stopper
+from crossgrad_core.training.state import TrainingFailedError
 
 STEPS = 18
 

@@ -10,15 +10,14 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import ViewSample
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_core.training.dropout import dropped, photos_per_point
-from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
-from crossgrad_core.training.views import render_views
+from crossgrad_core.training.views import RenderCallback, render_views
 from crossgrad_plugins.recipes.auto import DROPOUT, FEW_PHOTOS
 
 

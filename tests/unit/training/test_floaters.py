@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
@@ -18,7 +18,6 @@ from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_core.training.averaging import STATE, eval_parameters
-from crossgrad_core.training.edits import keep
 from crossgrad_core.training.floaters import (
     EMPTY,
     FEWEST_SEEN,
@@ -28,7 +27,7 @@ from crossgrad_core.training.floaters import (
     told_of,
 )
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.step import take_step
+from crossgrad_core.training.step import keep, take_step
 
 BACKBONES = sorted(n for n, e in entries("backbones").items() if e.distribution == "crossgrad")
 #: On a scene of forty points the published cells of anchors would hold nothing.

@@ -9,13 +9,12 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.decisions import with_decisions
-from crossgrad_core.run.eta import LOOK_STEPS, Forecast
-from crossgrad_core.run.results.lines import roughly
+from crossgrad_core.run.finish import LOOK_STEPS, Forecast
+from crossgrad_core.run.results.log import roughly
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.budget import Planned
-from crossgrad_core.training.clock import Clock
-from crossgrad_core.training.expected_cost import COST_PER_EDIT, COUNTED_EDITS
+from crossgrad_core.training.budget import COST_PER_EDIT, COUNTED_EDITS, Planned
 from crossgrad_core.training.numbers import Numbers
+from crossgrad_core.training.state import Clock
 
 RUN = make_dataclass(
     "Run",

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.blocks import EMPTY_STATE
 from crossgrad_core.contract.contexts import StepRecord, ViewSample
-from crossgrad_core.contract.state import EMPTY_STATE
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import WIDTH, sample_scene
-from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.loop import Prefetcher, timed_step
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.view_prefetch import Prefetcher
 
 SAMPLERS = ("random", "epoch", "near-far", "fps", "horizon", "random-split", "three-way")
 

@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.pace import ViewsPerStepSpec
-from crossgrad_core.contract.schedule import Counting, Schedule
-from crossgrad_core.contract.state import PluginState
+from crossgrad_core.contract.blocks import PluginState
+from crossgrad_core.contract.schedule import Counting, Schedule, ViewsPerStepSpec
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
-from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint.checkpoint import Keep, latest, load, save
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import growth_budget

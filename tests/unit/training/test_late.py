@@ -10,25 +10,23 @@ import torch
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.adam_state import AdamRule, AdamState
+from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.contract.contexts import RegularizeResult
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.sparse_rows import coalesced, dense, rows_of, sparse_rows, values_of
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load, save
-from crossgrad_core.run.checkpoint.folders import Keep
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint.checkpoint import Keep, latest, load, save
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.rollback import RollbackGuard
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_core.training.state import RollbackGuard, Snapshot, TrainState
 from crossgrad_operators.graddrop import GradDrop
 from crossgrad_operators.pcgrad import PCGrad
 from crossgrad_operators.sum import Sum

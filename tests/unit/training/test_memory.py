@@ -12,8 +12,8 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.results.cost_totals import Totals
-from crossgrad_core.run.results.table import cost_line
+from crossgrad_core.run.results.metrics_csv import Totals
+from crossgrad_core.run.results.summary import cost_line
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import growth_budget, memory, step
 from crossgrad_core.training.memory import Demand, available_bytes, peak_mebibytes

@@ -21,10 +21,10 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training.failure import NonFiniteError
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import NonFiniteError
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors

@@ -16,8 +16,8 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 from crossgrad_core.testing.contract import admitted
-from crossgrad_core.training.operator_scale import OperatorScale, Scale, neutral
-from crossgrad_core.training.regularize import joined
+from crossgrad_core.training.setup import OperatorScale, Scale, neutral
+from crossgrad_core.training.views import joined
 
 TENSORS = ("means", "f_dc", "net.weight", "net.bias")
 #: methods.md 8 and 11.11.

@@ -4,16 +4,13 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.blocks import Block, LearningRate
-from crossgrad_core.contract.state import PluginState
-from crossgrad_core.contract.topology import Edit
+from crossgrad_core.contract.blocks import Block, Edit, LearningRate, PluginState
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import morton_order
-from crossgrad_core.training.edits import apply_edit, put_in_order
+from crossgrad_core.training import step
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.morton_order import along_curve, in_order, ordered
 from crossgrad_core.training.start import first_state
+from crossgrad_core.training.step import along_curve, apply_edit, in_order, ordered, put_in_order
 
 BLOCKS = (
     Block("means", ("means",), True, "geometry", LearningRate(0.1)),
@@ -24,7 +21,7 @@ BLOCKS = (
 
 @pytest.fixture(autouse=True)
 def few_are_many(monkeypatch):
-    monkeypatch.setattr(morton_order, "FEWEST", 2)
+    monkeypatch.setattr(step, "FEWEST_SORTED", 2)
 
 
 def code(position):
@@ -118,7 +115,7 @@ def test_a_run_is_in_order_after_each_of_its_edits():
 
 
 def test_few_stay_in_their_order(monkeypatch):
-    monkeypatch.setattr(morton_order, "FEWEST", 51)
+    monkeypatch.setattr(step, "FEWEST_SORTED", 51)
     parameters = random_parameters(50)
     assert in_order(parameters, BLOCKS, "means") is None
     assert in_order(random_parameters(51), BLOCKS, "means") is not None

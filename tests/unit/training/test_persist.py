@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import AdamState, Block, LearningRate
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.state import TrainState
 

@@ -8,7 +8,7 @@ import pytest
 from crossgrad_core.config import RunConfig
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import NoisePhoto, sample_scene
-from crossgrad_core.training.photos_ahead import decoded_meanwhile
+from crossgrad_core.training.scaled_photos import decoded_meanwhile
 from crossgrad_core.training.start import warm_up
 
 

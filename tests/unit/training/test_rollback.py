@@ -11,13 +11,12 @@ from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint_io import to_checkpoint
+from crossgrad_core.run.load_run import to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import rollback
-from crossgrad_core.training.loop import train
+from crossgrad_core.training import state as states
+from crossgrad_core.training.loop import Stopper, train
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.stopper import Stopper
 
 STEPS, SAVE_EVERY, FAILS_IN = 20, 5, 13
 #: Edits before and after the step that fails.
@@ -244,7 +243,7 @@ def test_a_look_that_fails_does_not_keep_the_state_from_going_back(monkeypatch):
 
     setup = assembled(trap("densify", before, BrokenError()))
     state = first_state(setup)
-    monkeypatch.setattr(rollback, "are_parameters_finite", lost)
+    monkeypatch.setattr(states, "are_parameters_finite", lost)
     with pytest.raises(BrokenError):
         train(setup, state, Results(), Stopper())
     assert_same(state, trained_until(WHILE))

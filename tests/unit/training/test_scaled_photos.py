@@ -11,7 +11,7 @@ from crossgrad_core.contract.screen_statistics import ndc_gradient, pixels, radi
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.records import view_record
 from crossgrad_core.training.scaled_photos import ScaledPhotos, _bytes, reduced
-from crossgrad_core.training.view_target import camera_at
+from crossgrad_core.training.views import camera_at
 
 RNG = np.random.default_rng(0)
 IMAGE = torch.from_numpy(RNG.integers(0, 256, (23, 37, 3), dtype=np.uint8))

@@ -51,7 +51,7 @@ def test_file_and_degree_are_written_down(trained, monkeypatch):
     monkeypatch.chdir(path.parent)
     config = RunConfig.model_validate({"steps": 1000, "data": {"init": path.name}})
     written = resolved(assemble(config, sample_scene(), "none"))
-    assert (written.reading.init, written.sh_from) == (str(path.resolve()), 3)
+    assert (written.data.init, written.sh_from) == (str(path.resolve()), 3)
 
 
 @pytest.mark.parametrize(("asked", "degree"), [(None, 0), (2, 2)])

@@ -9,15 +9,14 @@ import torch
 from support.gaussians import posed_camera, random_gaussians
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import ScaleContext, ViewSample
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.render_callback import RenderCallback
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.strided_rendering import (
     as_in_full,
@@ -26,7 +25,7 @@ from crossgrad_core.training.strided_rendering import (
     pixels_of,
     stride_of,
 )
-from crossgrad_core.training.view_target import target_at
+from crossgrad_core.training.views import RenderCallback, target_at
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 CORNERS = [(2, 0, 0), (2, 1, 0), (2, 0, 1), (2, 1, 1), (3, 2, 1), (4, 3, 3), (5, 1, 4)]

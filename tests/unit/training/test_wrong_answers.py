@@ -9,25 +9,30 @@ import torch
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract import densifier, operator, resolution, sampler
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import (
+    NO_EDIT,
+    TAKEN,
+    Block,
+    Edit,
+    LearningRate,
+    PluginState,
+    Rows,
+)
 from crossgrad_core.contract.contexts import DensifyResult, RegularizeResult, ViewSample
 from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting, _kinds
 from crossgrad_core.contract.initializer import MorePoints
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.objections import objections_to
-from crossgrad_core.contract.state import TAKEN, PluginState
-from crossgrad_core.contract.topology import NO_EDIT, Edit, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run import select as selecting
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import averaging, growth_budget, per_image_params, relabel, start
-from crossgrad_core.training.edits import apply_edit
+from crossgrad_core.training import averaging, growth_budget, per_image_params, start, step
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.step import take_step
+from crossgrad_core.training.step import apply_edit, take_step
 
 
 def setup_of(replaced=None, **observers):
@@ -247,7 +252,7 @@ def test_a_state_that_is_none_is_refused_at_once():
 
 def test_the_names_of_the_core_are_those_that_it_uses():
     slots = {each.STATE for each in (sampler, operator, densifier, resolution)}
-    own = {each.STATE for each in (per_image_params, relabel, growth_budget, averaging)}
+    own = {each.STATE for each in (per_image_params, growth_budget, averaging)} | {step.GROUPING}
     assert slots | own | {start.THINNED} == TAKEN
 
 
@@ -446,7 +451,7 @@ def more_points(**changed):
 def test_what_a_start_adds_can_be_points(changed, found):
     start = of_slot("initializers", "points", "more_points", more_points(**changed))
     error = refused(setup_of({"initializer": start}))
-    assert error.what == "start sfm adds what cannot be points"
+    assert error.what == "initializer points adds what cannot be points"
     assert "Wrong.more_points" in error.where
     assert found in error.found
 

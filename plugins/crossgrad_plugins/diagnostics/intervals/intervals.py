@@ -1,16 +1,155 @@
 """Confidence intervals of the variance split by a studentised bootstrap over cameras."""
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 from crossgrad_plugins.diagnostics.intervals.interval import UNKNOWN, Interval
-from crossgrad_plugins.diagnostics.intervals.inversion import inverted
-from crossgrad_plugins.diagnostics.intervals.pivots import StudentisedGap
+from crossgrad_plugins.diagnostics.intervals.inversion import Pivot, inverted
 from crossgrad_plugins.diagnostics.intervals.resampling import Resamples
 from crossgrad_plugins.diagnostics.variance import split_of
+
+#: How much of the error of the ratio's interval is moved from its lower to its upper end at most,
+#: and the share of sigma_w^2 in the variance from which on all of that is moved. Too few long
+#: gradients in the sample make sigma_w^2 too small and the ratio too large.
+_MOVED = 0.4
+_WITHIN_RULES = 1.0 / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class StudentisedGap:
+    """One block's resamples with what is known of the noise.
+
+    Attributes:
+        draws: The resamples, row 0 the sample itself; shifts as along the true gap.
+        estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
+        plain_gap: Squared distance of the sample means.
+        floor: Variance of the estimate at theta = 0.
+        floors: [R] the same in each resample.
+    """
+
+    draws: Resamples
+    estimate: float
+    plain_gap: float
+    floor: float
+    floors: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, parts: GroupedGramian, groups: Groups, draws: Resamples) -> "StudentisedGap":
+        """From the split Gramian and its resamples."""
+        noise = draws.noise[1:]
+        # The scale of a resample's noise goes with the square of its spread.
+        relative = (draws.spread[1:] / draws.spread[0]) ** 2
+        floors = relative * (float(noise.var()) / float(relative.mean()))
+        floor = _variance_without_gap(parts, groups)
+        return cls(
+            draws=draws.along_gap(_along_the_true_gap(draws, parts.gap, floor)),
+            estimate=parts.gap + float(draws.noise[0]),
+            plain_gap=parts.gap,
+            floor=floor,
+            floors=floors,
+        )
+
+    def within(self, tails: tuple[float, float]) -> Interval:
+        """sigma_w^2 by bootstrap-t of its logarithm."""
+        values = self.draws.within
+        errors = np.sqrt(self.draws.within_variance) / values
+        if errors[0] == 0.0:
+            return Interval(float(values[0]), float(values[0]))
+        pivots = np.log(values[1:] / values[0]) / np.maximum(errors[1:], np.finfo(np.float64).tiny)
+        low, high = np.quantile(pivots, tails)
+        return Interval(
+            float(values[0] * np.exp(-high * errors[0])),
+            float(values[0] * np.exp(-low * errors[0])),
+        )
+
+    def gap_pivot(self, gap: float) -> Pivot:
+        """The studentised estimate if `gap` is the true one, and its resamples."""
+        draws, root = self.draws, sqrt(gap)
+        variance = 4.0 * gap * draws.shift_variance
+        numerators = 2.0 * root * draws.shift[1:] + (draws.noise[1:] - draws.noise[0])
+        observed = _studentised(self.estimate - gap, float(variance[0]) + self.floor)
+        return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
+
+    def ratio_pivot(self, ratio: float) -> Pivot:
+        """The studentised estimate of gap - ratio * sigma_w^2 if the true ratio is `ratio`."""
+        draws = self.draws
+        gap = ratio * float(draws.within[0])
+        root = sqrt(gap)
+        of_gap = 4.0 * gap * draws.shift_variance
+        of_within = ratio**2 * draws.within_variance
+        variance = of_gap + of_within - 4.0 * ratio * root * draws.covariance
+        numerators = (
+            gap
+            + 2.0 * root * draws.shift[1:]
+            + (draws.noise[1:] - draws.noise[0])
+            - ratio * draws.within[1:]
+        )
+        whole = float(of_gap[0]) + self.floor + float(of_within[0])
+        moved = min(1.0, float(of_within[0]) / (_WITHIN_RULES * whole)) if whole > 0.0 else 0.0
+        return Pivot(
+            observed=_studentised(self.estimate - gap, float(variance[0]) + self.floor),
+            resampled=numerators / np.sqrt(_positive(variance[1:] + self.floors)),
+            lower_share=0.5 - _MOVED * moved,
+        )
+
+    @property
+    def start(self) -> float:
+        """Where to start looking for the upper end of an interval; positive."""
+        return max(self.estimate, self.plain_gap, sqrt(self.floor))
+
+
+def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
+    """The variance of the shift along the true gap, relative to that along the sample's.
+
+    The sample's gap d is the true one plus noise, and noise points where gradients vary most. Its
+    part in d' Sigma d is tr(Sigma^2), half the `floor`, and its part in |d|^2 is tr(Sigma), Sigma
+    the covariance of the difference of the means. Half of both is taken off, less where the whole
+    gap could be noise: what is left is itself uncertain with a dozen views. Where few directions
+    dominate, 95 % intervals of sigma_b^2 hold the truth in up to 99.5 % if nothing is taken off,
+    and in 84 to 97 % if all is.
+    """
+    noise, along = float(draws.spread[0]), float(draws.shift_variance[0]) * gap
+    if noise <= 0.0 or along <= 0.0:
+        return 1.0
+    taken = 0.5 * min(1.0, gap / (2.0 * noise))
+    return max(along - taken * floor / 2.0, 0.0) / (gap - taken * noise) * (gap / along)
+
+
+def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
+    """Variance of the estimated gap where the true gap is zero, in units of the scale squared."""
+    (n, m), (f, g) = groups.sizes, groups.unseen
+    near = max(_squared_covariance(parts.near), 0.0)
+    far = max(_squared_covariance(parts.far), 0.0)
+    meeting = float((parts.cross**2).sum()) / ((n - 1) * (m - 1))
+    own = f**2 * near / (n * (n - 1)) + g**2 * far / (m * (m - 1))
+    return 2.0 * own + 4.0 * f * g * meeting / (n * m)
+
+
+def _squared_covariance(deviations: NDArray[np.float64]) -> float:
+    """Unbiased estimate of tr(Sigma^2) from dot products of deviations [n, n], any distribution.
+
+    Source: Himeno and Yamada 2014.
+    """
+    n = len(deviations)
+    squared = np.diag(deviations)
+    trace = float(squared.sum()) / (n - 1)
+    plain = float((deviations**2).sum()) / (n - 1) ** 2
+    fourth = float((squared**2).sum()) / (n - 1)
+    factor = (n - 1) / (n * (n - 2) * (n - 3))
+    return factor * ((n - 1) * (n - 2) * plain + trace**2 - n * fourth)
+
+
+def _studentised(numerator: float, variance: float) -> float:
+    return numerator / sqrt(max(variance, np.finfo(np.float64).tiny))
+
+
+def _positive(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.maximum(values, np.finfo(np.float64).tiny)
+
 
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4

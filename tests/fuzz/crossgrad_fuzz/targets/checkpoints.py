@@ -13,20 +13,21 @@ from typing import Any, cast
 
 import torch
 
-from crossgrad_core.contract.adam_state import AdamState
-from crossgrad_core.contract.blocks import Block, LearningRate
+from crossgrad_core.contract.blocks import AdamState, Block, LearningRate, PluginState
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.state import PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import checkpoint_io
+from crossgrad_core.run import load_run
 from crossgrad_core.run.checkpoint import checkpoint
-from crossgrad_core.run.checkpoint import folders as checkpoint_folders
-from crossgrad_core.run.checkpoint import state as checkpoint_state
-from crossgrad_core.run.checkpoint import tensors as checkpoint_tensors
-from crossgrad_core.run.checkpoint.checkpoint import Checkpoint, latest, load, save
-from crossgrad_core.run.checkpoint.folders import STATE, TENSORS
-from crossgrad_core.run.checkpoint.state import digest
-from crossgrad_core.run.checkpoint_io import from_checkpoint, to_checkpoint
+from crossgrad_core.run.checkpoint.checkpoint import (
+    STATE,
+    TENSORS,
+    Checkpoint,
+    digest,
+    latest,
+    load,
+    save,
+)
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.system import text_files
 from crossgrad_core.training import rngs
 from crossgrad_core.training.rngs import make_streams
@@ -36,6 +37,11 @@ from crossgrad_fuzz.case import load as load_case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
+#: What reads a checkpoint into a run.
+_READS = {
+    *("settings_of", "from_checkpoint", "check_settings", "_restored", "_clock", "_figures"),
+    *("_check_tensors", "_misfit", "_record"),
+}
 _FOLDER = "checkpoints/step-000007"
 _STATE, _TENSORS = f"{_FOLDER}/{STATE}", f"{_FOLDER}/{TENSORS}"
 _BLOCKS = (
@@ -175,11 +181,12 @@ TARGET = Target(
     seeds=_seeds,
     parse=_parse,
     parser={
-        checkpoint: ("save", "_write", "_drop", "drop_later", "load_latest", "_plain_state"),
-        checkpoint_folders: ("Keep", "scratch_folder", "discard", "_take_name", "_clear"),
-        checkpoint_state: ("state_text", "check_json"),
-        checkpoint_tensors: ("pack", "packed_bytes", "write_tensors", "_all"),
-        checkpoint_io: ("to_checkpoint",),
+        checkpoint: (
+            *("save", "_write", "_drop", "drop_later", "load_latest", "_plain_state"),
+            *("Keep", "scratch_folder", "discard", "_take_name", "_clear"),
+            *("state_text", "check_json", "pack", "packed_bytes", "write_tensors", "_all"),
+        ),
+        load_run: tuple(name for name in vars(load_run) if name not in _READS),
         rngs: ("make_streams", "stream_states"),
         text_files: ("read_rows", "parse_number"),
     },

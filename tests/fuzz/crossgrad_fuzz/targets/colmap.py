@@ -14,7 +14,6 @@ from crossgrad_fuzz.target import Target
 from crossgrad_plugins.readers import (
     _colmap_binary,
     _colmap_model,
-    _colmap_text,
     _colmap_types,
     colmap,
 )
@@ -144,7 +143,7 @@ TEXT = Target(
     name="colmap-text",
     seeds=_text,
     parse=_parse,
-    parser={_colmap_model: (), _colmap_text: (), _colmap_types: (), colmap: _READER},
+    parser={_colmap_model: (), _colmap_types: (), colmap: _READER},
     mutators=(matcher(rb"\n(\d+) ", (b"1", b"2", b"3")), matcher(rb" ([-\d.e]+)", NUMBERS)),
     words=_WORDS,
 )

@@ -10,12 +10,14 @@ import torch
 
 from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.run import camera_path
-from crossgrad_core.training import photo_file
+from crossgrad_core.training import per_image_params
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
 _FILE = "named.json"
+#: What reads a file of values.
+_READS = ("read_values", "_content", "_is_of_photos", "_value", "_misfit")
 _LIKE = {"gain": torch.zeros(3), "matrix": torch.zeros(3, 2, 2)}
 _WORDS = (
     *(b"{", b"}", b"[", b"]", b"[" * 5000, b'"a": ', b",", b"NaN", b"Infinity", b"1e999", b"null"),
@@ -52,14 +54,15 @@ def _values() -> Sequence[Case]:
     photos = {
         name: {"gain": 0.25, "matrix": [[1.0, 0.0], [0.0, 1.0]]} for name in ("a.jpg", "b/c.jpg")
     }
+    version = per_image_params.PHOTO_VALUES_FORMAT
     return [
-        _file({"format": photo_file.FORMAT, "exposure": "affine", "photos": photos}),
-        _file({"format": photo_file.FORMAT, "photos": {}}),
+        _file({"format": version, "exposure": "affine", "photos": photos}),
+        _file({"format": version, "photos": {}}),
     ]
 
 
 def _parse_values(folder: Path) -> None:
-    for values in photo_file.read_values(folder / _FILE, _LIKE).values():
+    for values in per_image_params.read_values(folder / _FILE, _LIKE).values():
         assert values.keys() == _LIKE.keys()
         for name, value in values.items():
             assert value.shape == _LIKE[name].shape[1:]
@@ -87,7 +90,7 @@ VALUES = Target(
     name="photo-values",
     seeds=_values,
     parse=_parse_values,
-    parser={photo_file: ("write_values",)},
+    parser={per_image_params: tuple(name for name in vars(per_image_params) if name not in _READS)},
     words=_WORDS,
     mutators=_FORMAT,
 )

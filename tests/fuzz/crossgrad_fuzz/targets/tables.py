@@ -6,7 +6,7 @@ from pathlib import Path
 
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.results import metrics_csv, per_view, summary
+from crossgrad_core.run.results import metrics_csv, summary
 from crossgrad_core.run.results.metrics_csv import MetricsCsv, read_metrics
 from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system import text_files
@@ -17,7 +17,8 @@ from crossgrad_plugins.diagnostics import report
 from crossgrad_plugins.diagnostics.report import read_probes
 
 _METRICS, _SUMMARY, _TABLE = metrics_csv.FILE, summary.FILE, "table.csv"
-_PER_VIEW = per_view.FILE
+_PER_VIEW = metrics_csv.PER_VIEW
+_READS_VIEWS = ("read_per_view", "_view", "_unreadable_view")
 _REGIMES = ("far", "near")
 
 
@@ -69,7 +70,7 @@ def _views() -> bytes:
 
 
 def _parse_views(folder: Path) -> None:
-    views = per_view.read_per_view(folder)
+    views = metrics_csv.read_per_view(folder)
     for view in views:
         assert view.values.keys() == views[0].values.keys()
         assert all(value is None or isinstance(value, float) for value in view.values.values())
@@ -86,7 +87,13 @@ METRICS = Target(
     parse=_parse_metrics,
     parser={
         text_files: ("read_json",),
-        metrics_csv: ("metrics_row", "MetricsCsv.append", "_append"),
+        metrics_csv: (
+            "metrics_row",
+            "MetricsCsv.append",
+            "_append",
+            "write_per_view",
+            *_READS_VIEWS,
+        ),
     },
     words=(b",", b"\n", b'"', b"step", b"psnr_far", b"nan", b"inf", b"1_0", b"-1"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
@@ -118,7 +125,10 @@ PER_VIEW = Target(
     name="per-view",
     seeds=lambda: [{_PER_VIEW: _views()}, {_PER_VIEW: _views() + b"b.jpg,near,,,\n"}],
     parse=_parse_views,
-    parser={text_files: ("read_json",), per_view: ("write_per_view",)},
+    parser={
+        text_files: ("read_json",),
+        metrics_csv: tuple(name for name in vars(metrics_csv) if name not in _READS_VIEWS),
+    },
     words=(b",", b"\n", b'"', b"name", b"regime", b"psnr", b"nan", b"inf", b"1_0"),
     mutators=(matcher(rb"[,\n]([\d.]*)", NUMBERS),),
 )
