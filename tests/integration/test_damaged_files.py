@@ -5,10 +5,13 @@ file that is added later is among them by itself.
 """
 
 import csv
+import json
 import shutil
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+from PIL import Image
 from support.commands import ended
 from support.damage import DAMAGES, cases, command, files_of
 from support.scenes import write_tiny_scene
@@ -158,18 +161,89 @@ def test_a_comparison_has_the_same_tables_or_is_refused(finished, tmp_path, thor
             assert compared_tables(runs) == wanted, (file, damage)
 
 
+def moved(finished, scene, folder):
+    """Copies of a run and of its scene, which belong together."""
+    run = shutil.copytree(finished, folder / "run")
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace(str(scene), str(folder / "scene")))
+    return run, shutil.copytree(scene, folder / "scene")
+
+
 @THOROUGH
 def test_a_scene_is_the_one_that_was_trained_on_or_refused(
     scene, finished, tmp_path, capsys, thorough
 ):
-    run = shutil.copytree(finished, tmp_path / "run")
-    config = run / "config.yaml"
-    config.write_text(config.read_text().replace(str(scene), str(tmp_path / "scene")))
-    shutil.copytree(scene, tmp_path / "scene")
+    run, place = moved(finished, scene, tmp_path)
     wanted = command(capsys, "eval", run)
     assert wanted.code == 0
     files = files_of(scene)
     for file, damage in cases(files if thorough else files[::5], thorough=thorough):
-        damaged(scene, tmp_path / "scene", file, damage)
+        damaged(scene, place, file, damage)
         found = command(capsys, "eval", run)
         assert found.is_refused or (found.code, found.out) == (0, wanted.out), (file, damage)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A scene with what `prepare` adds to a COLMAP model: masks, and its place on Earth."""
+    folder = write_tiny_scene(tmp_path_factory.mktemp("prepared") / "tiny", views=9)
+    (folder / "masks").mkdir()
+    mask = Image.new("L", (48, 32), 255)
+    mask.paste(0, (0, 0, 12, 32))
+    for photo in (folder / "images").iterdir():
+        mask.save(folder / "masks" / photo.name)
+    origin = {"latitude": 52.25, "longitude": 21.0, "altitude": 110.0}
+    place = {"origin": origin, "transform": np.diag([2.0, 2.0, 2.0, 1.0]).tolist()}
+    (folder / "georef.json").write_text(json.dumps(place))
+    return folder
+
+
+@THOROUGH
+def test_a_prepared_scene_is_the_one_that_was_trained_on_or_refused(
+    prepared, tmp_path, capsys, thorough
+):
+    trained = tmp_path / "trained"
+    assert ended("run", prepared, "--out", trained, "--steps", 3, "--threads", 1, "-q") == 0
+    run, place = moved(trained, prepared, tmp_path)
+    wanted = command(capsys, "export", run, "--coordinates", "enu", "--out", tmp_path / "a.ply")
+    assert wanted.code == 0
+    exported = (tmp_path / "a.ply").read_bytes()
+    files = [file for file in files_of(prepared) if "images" not in file.parts]
+    for file, damage in cases(files if thorough else files[::2], thorough=thorough):
+        damaged(prepared, place, file, damage)
+        (tmp_path / "a.ply").unlink(missing_ok=True)
+        found = command(capsys, "export", run, "--coordinates", "enu", "--out", tmp_path / "a.ply")
+        if found.code == 0:
+            assert (tmp_path / "a.ply").read_bytes() == exported, (file, damage)
+        else:
+            assert found.is_refused and not (tmp_path / "a.ply").exists(), (file, damage, found)
+
+
+@THOROUGH
+def test_a_sweep_has_the_same_table_or_is_refused(tmp_path, capsys, thorough):
+    scene = write_tiny_scene(tmp_path / "tiny", views=4, width=32, height=24, points=60)
+    grid, whole, out = tmp_path / "grid.yaml", tmp_path / "whole", tmp_path / "out"
+    grid.write_text(json.dumps({"scenes": [str(scene)], "base": {"steps": 2}}))
+    assert ended("sweep", grid, "--out", whole) == 0
+    shutil.copytree(whole, out)
+    wanted = command(capsys, "sweep", grid, "--out", out)
+    assert wanted.code == 0
+    files = [file for file in files_of(whole) if thorough or file.parts[0] != "runs"]
+    for file, damage in cases(files, thorough=thorough):
+        damaged(whole, out, file, damage)
+        before = contents(out)
+        found = command(capsys, "sweep", grid, "--out", out)
+        if found.code == 0:
+            same = found.out.replace(str(out), "") == wanted.out.replace(str(out), "")
+            assert same, (file, damage, found)
+        elif file.parts[0] == "runs":
+            # A run that is refused is one that failed, with its reason; others go on.
+            assert found.code == 1 and "error: " in found.err, (file, damage, found)
+            assert contents(out / "runs") == {
+                path.relative_to("runs"): content
+                for path, content in before.items()
+                if path.parts[0] == "runs"
+            }, (file, damage)
+        else:
+            assert found.is_refused, (file, damage, found)
+            assert contents(out) == before, (file, damage)
