@@ -159,6 +159,8 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         UserError: A name or option is wrong, or the components cannot work together.
     """
     config, of_device = with_device(config)
+    for note in of_device:
+        _LOG.info("%s", note)
     scene = replace(scene, notes=(*of_device, *scene.notes))
     plan = None
     if config.plan != "off":

@@ -264,7 +264,7 @@ def exit_messages(course: RunLoop) -> list[str]:
         lines.append(f"the traceback is in {one_line(folder / LOG)}")
     lines += _kept(course)
     if ending.status == "finished":
-        return [*lines, *overdone(read_metrics(folder))]
+        return [*lines, *overdone(read_metrics(folder)), next_line(folder)]
     return [*lines, resume_line(folder)]
 
 
@@ -279,6 +279,12 @@ def overdone(rows: Sequence[Row]) -> list[str]:
         f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
         "may be enough (--max-views N, or --plan auto)"
     ]
+
+
+def next_line(folder: Path) -> str:
+    """Return the commands that show and deliver the results of a finished run."""
+    run = one_line(quote(str(folder)))
+    return f"next: crossgrad render {run} (pictures), crossgrad export {run} (a file for viewers)"
 
 
 def resume_line(folder: Path) -> str:

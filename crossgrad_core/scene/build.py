@@ -1,5 +1,6 @@
 """From what a reader found to a `Scene`: checks, photos, split, local frame, regimes."""
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +35,7 @@ from crossgrad_core.scene.wording import count, name_some
 from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
 
+_LOG = logging.getLogger(__name__)
 #: A photo of whose stored pixels at least this share counts keeps some whatever is done to it.
 #: Undistorting and resizing could take the last ones of others, so these are decoded.
 _SURE = 0.05
@@ -215,6 +217,9 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
     frame = make_frame(camera_centers(poses), points.xyz)
     kept = replace(raw, views=tuple(used))
     points, far_notes = check_distances(kept, points, frame)
+    doubtful = (*far_notes, *_note_stray([used[i].name for i in train], frame))
+    for note in doubtful:
+        _LOG.warning("%s", note)
     local = frame.points(points.xyz)
     cameras = [_localize(view, photos, frame) for view in used]
     seen = [points.rows(view.seen) for view in used]
@@ -240,11 +245,10 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
         notes=(
             *raw.notes,
             *point_notes,
-            *far_notes,
             *photos.notes,
             *split.notes,
             frame.note,
-            *_note_stray([used[i].name for i in train], frame),
+            *doubtful,
             _note_regimes(regimes, train, "image folder" if by_folder else "footprint"),
             *_note_unmeasured(regimes, train, options),
         ),

@@ -43,8 +43,8 @@ class Progress(Observer):
 
     level: Literal["quiet", "normal", "verbose"] = Field(
         "normal",
-        description="quiet: nothing; normal: notes of the run, progress, evaluations, messages; "
-        "verbose: also every change of density control",
+        description="quiet: nothing; normal: scene, decisions, progress, evaluations, messages; "
+        "verbose: also all notes and every change of density control",
     )
     interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
 
@@ -56,19 +56,23 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Shows the scene, and what was chosen or left out and why."""
+        """Shows the scene, the length, the device and the decisions; with `verbose` all notes."""
         self._pace = Pace(run.schedule.total)
         self._tenth = max(1, self._pace.total // 10)
         self._last_line = monotonic()
         if self.level == "quiet":
             return
         train, test = len(run.scene.train), len(run.scene.test)
-        self._say(f"{run.scene.name}: {train} training views, {test} held out")
+        length = f"{run.schedule.total:,} steps on {run.config['device']}"
+        self._say(f"{run.scene.name}: {train} training views, {test} held out; {length}")
         if run.folder is not None:
             self._say(f"results in {run.folder}")
-        told = full_lines if self.level == "verbose" else short_lines
-        for note in (*told(run.decisions), *run.notes):
-            self._say(f"- {note}")
+        verbose = self.level == "verbose"
+        shown = (*full_lines(run.decisions), *run.notes) if verbose else short_lines(run.decisions)
+        for line in shown:
+            self._say(f"- {line}")
+        if run.notes and not verbose:
+            self._say(f"- further notes: {len(run.notes)} (in log.txt, or with -v)")
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:

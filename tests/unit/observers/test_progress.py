@@ -27,7 +27,12 @@ def run_with(progress: Progress, steps: int = 20, first: int = 1) -> None:
     schedule = SimpleNamespace(total=steps)
     hook.crossgrad_run_start(
         run=SimpleNamespace(
-            scene=scene, schedule=schedule, folder=Path("runs/x"), notes=("no masks",), decisions=()
+            scene=scene,
+            schedule=schedule,
+            folder=Path("runs/x"),
+            config={"device": "cpu"},
+            notes=("no masks",),
+            decisions=(),
         )
     )
     for step in range(first, steps + 1):
@@ -47,8 +52,11 @@ def test_plain_lines_at_every_tenth(capsys: pytest.CaptureFixture[str]):
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == ""
-    assert lines[:2] == ["boruszyn: 24 training views, 4 held out", "results in runs/x"]
-    assert lines[2] == "- no masks"
+    assert lines[:3] == [
+        "boruszyn: 24 training views, 4 held out; 20 steps on cpu",
+        "results in runs/x",
+        "- further notes: 1 (in log.txt, or with -v)",
+    ]
     assert lines[3] == ("step 2/20 (10 %), loss 0.2500, 1,000 primitives, 10.0 steps/s, 2 s left")
     assert len([line for line in lines if line.startswith("step ")]) == 10
     assert "evaluated at step 10: PSNR 21.50 dB, SSIM 0.7000, 1.0 s training" in lines
@@ -117,6 +125,7 @@ def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
     run = SimpleNamespace(
         scene=SimpleNamespace(name="s", train=(), test=()),
         schedule=SimpleNamespace(total=20),
+        config={"device": "cpu"},
         folder=None,
         notes=(),
         decisions=(),
