@@ -1,4 +1,4 @@
-"""The door for command rooms: what a command of a plugin needs of the core, from one place.
+"""The public module for commands: what a command of a plugin package imports from the core.
 
 Importing it is quick; what takes long (torch, numba) is imported when a function below is called
 or a class is asked for, so that a command says within two seconds that it has started: import this

@@ -1,6 +1,6 @@
 """The plugins that the core names: what a run takes where the user names none, and examples.
 
-No other file of the core names a plugin of a shelf.
+No other file of the core names a plugin.
 """
 
 from typing import Final

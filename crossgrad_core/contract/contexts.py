@@ -185,14 +185,14 @@ def unexposed(_view: View, image: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class StepContext:
-    """The context of a step, common to all seams.
+    """The context of a step, common to all hooks.
 
     Attributes:
         step: 1-based number of the step.
         schedule: The schedule of the run.
         scene: The scene.
         states: State of every plugin by the plugin's name; read only.
-        rng: The generator of the seam. Every random number of a plugin must come from it.
+        rng: The generator of the hook. Every random number of a plugin must come from it.
         photo: Gives the photo and the mask of a view on the run's device. The time for decoding
             them counts as loading; `view.photo` would decode them in training time.
     """
@@ -366,7 +366,7 @@ class AfterStepContext(StepContext):
 
 @dataclass(frozen=True)
 class Answer:
-    """The part common to the answers of all seams: new states by plugin name."""
+    """The part common to the answers of all hooks: new states by plugin name."""
 
     states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
 

@@ -61,7 +61,7 @@ class Densifier(Component):
 
     @hookimpl
     def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
-        """Answers the seam with this densifier's edit."""
+        """Answers the hook with this densifier's edit."""
         answer = self.densify(context, context.state(STATE))
         edit, state = with_state(answer, Edit, self, "densify")
         return DensifyResult(edit, states={STATE: state})

@@ -186,7 +186,7 @@ def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float6
 def operator_context(
     context: AggregateContext, granularity: Granularity, present: NDArray[np.bool_]
 ) -> OperatorContext:
-    """What a Gramian operator may know, from what the seam is offered."""
+    """What a Gramian operator may know, from what the hook is offered."""
     names = context.separate.names(granularity)
     return OperatorContext(
         step=context.step,

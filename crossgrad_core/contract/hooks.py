@@ -1,8 +1,8 @@
 """The hooks: specifications that plugins implement or wrap.
 
-The three seams of a training step, `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and
+The three hooks of a training step, `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and
 `crossgrad_densify`, stop at the first answer: the selected component gives it. Any other plugin may
-wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A seam must answer
+wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A hook must answer
 with a value; None is an error.
 """
 
@@ -50,7 +50,7 @@ class HookSpecs:
 
     @hookspec(firstresult=True)
     def crossgrad_sample_views(self, context: "SampleContext") -> "SampleResult | None":
-        """Seam 1: the K views of this step. Answered by the selected sampler."""
+        """Hook 1: the K views of this step. Answered by the selected sampler."""
 
     @hookspec(firstresult=True)
     def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
@@ -75,11 +75,11 @@ class HookSpecs:
     def crossgrad_aggregate_gradients(
         self, context: "AggregateContext"
     ) -> "AggregateResult | None":
-        """Seam 2: one gradient per tensor from the gradients of K views. The selected operator."""
+        """Hook 2: one gradient per tensor from the gradients of K views. The selected operator."""
 
     @hookspec(firstresult=True)
     def crossgrad_densify(self, context: "DensifyContext") -> "DensifyResult | None":
-        """Seam 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
+        """Hook 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
 
     @hookspec
     def crossgrad_after_step(self, context: "AfterStepContext") -> "DensifyResult | None":

@@ -1,4 +1,4 @@
-"""The observer slot: watches run events and may wrap the seams."""
+"""The observer slot: watches run events and may wrap the hooks."""
 
 from typing import ClassVar
 
@@ -6,7 +6,7 @@ from crossgrad_core.contract.component import Component
 
 
 class Observer(Component):
-    """A plugin that implements event hooks or wraps seams (`@hookimpl(wrapper=True)`).
+    """A plugin that implements event hooks or wraps hooks (`@hookimpl(wrapper=True)`).
 
     It ends no run: it catches what can fail. It changes the model through answers only, answers
     finite numbers to finite ones, keeps at most 0.1 MB of each step in memory, and holds up a step

@@ -79,7 +79,7 @@ class Operator(Component):
 
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
-        """Answers the seam with this operator's directions."""
+        """Answers the hook with this operator's directions."""
         answer = self.aggregate(context, context.state(STATE))
         aggregated, state = with_state(answer, AggregateResult, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}

@@ -56,7 +56,7 @@ class Sampler(Component):
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
-        """Answers the seam with this sampler's draw."""
+        """Answers the hook with this sampler's draw."""
         answer = self.sample(context, context.state(STATE))
         draw, state = with_state(answer, ViewSample, self, "sample")
         return SampleResult(draw, states={STATE: state})

@@ -1,4 +1,4 @@
-"""One plugin manager per run, and seams that must answer.
+"""One plugin manager per run, and hooks that must answer.
 
 pluggy is quiet about a hook that is not specified, a hook method without its mark and a second
 plugin that answers first. All three are errors here, with the plugin's name.
@@ -56,11 +56,11 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
     """A fresh manager with the hooks and the given plugins registered.
 
     Args:
-        plugins: Name -> plugin. Of two wrappers of one seam the later one is the outer one.
+        plugins: Name -> plugin. Of two wrappers of one hook the later one is the outer one.
 
     Raises:
         UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, a
-            hook with other arguments than the hook's, or answers a seam that another plugin
+            hook with other arguments than the hook's, or answers a hook that another plugin
             answers.
     """
     manager = _Manager(PROJECT)
@@ -81,8 +81,8 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
     return manager
 
 
-def call_seam(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
-    """The answer of a seam, checked.
+def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
+    """The answer of a hook, checked.
 
     Args:
         hook: A hook that stops at the first answer, such as `manager.hook.crossgrad_densify`.
@@ -96,17 +96,17 @@ def call_seam(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) ->
     if isinstance(result, answer) and _complete(result):
         return result
     raise UserError(
-        f"the seam {hook.name} was not answered",
+        f"the hook {hook.name} was not answered",
         where=f"plugins {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
-        expected=f"a value of type {answer.__name__}; a seam must answer",
+        expected=f"a value of type {answer.__name__}; a hook must answer",
         found=repr(result),
         todo="return an explicit answer, NO_EDIT where nothing changes; "
         "a wrapper must return what `yield` gave it or a replacement",
     )
 
 
-def call_question(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
-    """The answers to a question, checked.
+def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
+    """The answers of all plugins to a hook, checked.
 
     Args:
         hook: One that all answer who have it, such as `manager.hook.crossgrad_after_step`.
@@ -250,7 +250,7 @@ def _no_such_hook(name: str, plugin: object, hook: str) -> UserError:
 
 
 def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
-    """Raises where two plugins answer one seam: the later one would silently replace the other."""
+    """Raises where two plugins answer one hook: the later one would silently replace the other."""
     for hook in _HOOKS:
         caller: pluggy.HookCaller = getattr(manager.hook, hook)
         spec = caller.spec
@@ -261,7 +261,7 @@ def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
         ]
         if spec is not None and spec.opts["firstresult"] and len(answering) > 1:
             raise UserError(
-                f"{len(answering)} plugins answer the seam {hook}: {listed(answering)}",
+                f"{len(answering)} plugins answer the hook {hook}: {listed(answering)}",
                 expected="one answer, from the component that fills the slot",
                 todo="let the others wrap it with @hookimpl(wrapper=True), or leave them out",
             )

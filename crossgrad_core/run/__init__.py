@@ -1,7 +1,7 @@
 """A run from its settings to its results, and what is done with it afterwards.
 
-The module can be called: `crossgrad_core.run("SCENE", operator="pcgrad")` is `door.run`. A function
-of that name in `crossgrad_core` would hide this room, or be hidden by it.
+The module can be called: `crossgrad_core.run("SCENE", operator="pcgrad")` is `api.run`. A function
+of that name in `crossgrad_core` would hide this package, or be hidden by it.
 """
 
 import sys

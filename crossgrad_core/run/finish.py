@@ -264,7 +264,7 @@ def exit_messages(course: RunLoop) -> list[str]:
         lines.append(f"the traceback is in {one_line(folder / LOG)}")
     lines += _kept(course)
     if ending.status == "finished":
-        return [*lines, *overdone(read_metrics(folder)), next_line(folder)]
+        return [*lines, *overdone(read_metrics(folder))]
     return [*lines, resume_line(folder)]
 
 

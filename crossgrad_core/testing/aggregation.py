@@ -57,7 +57,7 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
 def aggregate_context(
     gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateContext:
-    """What the seam offers for these gradients.
+    """What the hook offers for these gradients.
 
     Args:
         gradients: The gradients of each view.
@@ -87,14 +87,14 @@ def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients
 def aggregated(
     operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateResult:
-    """What the operator answers at the seam; see `aggregate_context`."""
+    """What the operator answers at the hook; see `aggregate_context`."""
     return _answer(operator, aggregate_context(gradients, summed=summed))
 
 
 def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
     answer: object = operator.crossgrad_aggregate_gradients(context)
     if not isinstance(answer, AggregateResult):
-        require(False, f"the operator answers {answer!r} at the seam, not Aggregated")
+        require(False, f"the operator answers {answer!r} at the hook, not Aggregated")
         raise TypeError
     return answer
 

@@ -62,7 +62,7 @@ class DensifierRun:
         backbone: A backbone that it can work on.
         parameters: The parameters.
         state: The densifier's state.
-        rng: The generator of the seam.
+        rng: The generator of the hook.
     """
 
     densifier: Densifier

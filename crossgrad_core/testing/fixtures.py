@@ -1,4 +1,4 @@
-"""A small scene in memory, and what the seams offer about it."""
+"""A small scene in memory, and what the hooks offer about it."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -107,7 +107,7 @@ def sample_phase(step: int = STEPS, *, training: bool = True) -> Phase:
 
 
 def step_fields(step: int = 1) -> dict[str, Any]:
-    """The fields that every seam's context shares."""
+    """The fields that every hook's context shares."""
     return {
         "step": step,
         "schedule": Schedule.for_run(STEPS),

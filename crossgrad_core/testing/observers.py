@@ -1,4 +1,4 @@
-"""Contract checks of observers: they survive every event and leave every seam answered."""
+"""Contract checks of observers: they survive every event and leave every hook answered."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -45,7 +45,7 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
-from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_core.registry.manager import call_first_result, make_manager
 from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.select import select
 from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
@@ -131,7 +131,7 @@ def _start(hooks: Hooks, folder: Path | None) -> None:
         run=RunInfo(
             folder=folder,
             scene=sample_scene(),
-            config={"steps": STEPS, "seed": 0},
+            config={"steps": STEPS, "seed": 0, "device": "cpu"},
             schedule=Schedule.for_run(STEPS),
             blocks=BLOCKS,
             notes=("a note",),
@@ -171,7 +171,7 @@ def survives_every_event(make: Make[Observer]) -> None:
 def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
     """Requires that the hooks of a step raise nothing; what they answer is looked at elsewhere."""
     try:
-        _step_end(hooks, step, _seams(hooks, observer, step))
+        _step_end(hooks, step, _step_hooks(hooks, observer, step))
         hooks.crossgrad_model_ready(model=_model(step))
     except ContractError:
         raise
@@ -212,13 +212,13 @@ def survives_an_early_end(make: Make[Observer]) -> None:
             hooks.crossgrad_run_end(status=status)
 
 
-def seams_stay_answered(make: Make[Observer]) -> None:
-    """Around each seam the observer returns an answer of the right kind and shape, and finite."""
+def hooks_stay_answered(make: Make[Observer]) -> None:
+    """Around each hook the observer returns an answer of the right kind and shape, and finite."""
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
         for step in _STEPS:
-            sampled, scaled, aggregated, densified = _seams(hooks, observer, step)
+            sampled, scaled, aggregated, densified = _step_hooks(hooks, observer, step)
             _require_views(step, cast("SampleResult", sampled), cast("ScaleResult", scaled))
             _require_gradients(step, cast("AggregateResult", aggregated))
             edit = cast("DensifyResult", densified).edit
@@ -326,13 +326,13 @@ def _model(step: int) -> Model:
     )
 
 
-def _seams(
+def _step_hooks(
     hooks: Hooks,
     observer: Observer,
     step: int,
     states: Mapping[str, PluginState] = MappingProxyType({}),
 ) -> list[Answer]:
-    """The answers of the seams of a step, as the training loop asks for them.
+    """The answers of the hooks of a step, as the training loop asks for them.
 
     Gradients of single views are there only if the observer asks for them. The first step has no
     record of a step before it, and its views have no labels.
@@ -355,7 +355,7 @@ def _seams(
     ]
     answers = []
     for hook, context, kind in asked:
-        answers.append(call_seam(hook, replace(context, states=states), kind))
+        answers.append(call_first_result(hook, replace(context, states=states), kind))
         states = {**states, **answers[-1].states}
     return answers
 
@@ -372,7 +372,7 @@ def _states(hooks: Hooks, observer: Observer) -> Iterator[Mapping[str, PluginSta
     """All states after each step of a run without an end."""
     states: Mapping[str, PluginState] = {}
     for step in count(1):
-        for answer in _seams(hooks, observer, step, states):
+        for answer in _step_hooks(hooks, observer, step, states):
             states = {**states, **answer.states}
         yield states
 
@@ -412,7 +412,7 @@ def steps_are_not_held_up(make: Make[Observer]) -> None:
     with _hooks(observer, seconds) as hooks:
         _start(hooks, None)
         for step in range(1, _CALLS + 1):
-            _seams(hooks, observer, step)
+            _step_hooks(hooks, observer, step)
             _require_usable(hooks, run, step, 1.0)
     for name in _ON_THE_CLOCK & seconds.keys():
         require(
@@ -428,7 +428,7 @@ OBSERVER_CHECKS: tuple[Check[Observer], ...] = (
     survives_every_event,
     survives_an_early_end,
     the_model_stays_untouched,
-    seams_stay_answered,
+    hooks_stay_answered,
     questions_are_answered_in_kind,
     states_stay_bounded,
     nothing_piles_up,

@@ -65,7 +65,7 @@ class SamplerRun:
         views_per_step: K; the sampler's usual one where None.
         steps: Length of the schedule.
         losses: [N] what each training view's loss is said to be.
-        rng: The generator of the seam.
+        rng: The generator of the hook.
         state: The sampler's state.
         step: Number of steps taken.
         last: The last step's record.

@@ -41,7 +41,7 @@ from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.gradients.sparse_rows import coalesced, dense
-from crossgrad_core.registry.manager import call_question, call_seam
+from crossgrad_core.registry.manager import call_all, call_first_result
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.adam.axes import step_along_axes
@@ -362,7 +362,7 @@ def check_largest_draw(setup: Setup) -> None:
 
 def _sample(setup: Setup, state: TrainState) -> ViewSample:
     context = sample_context(setup, state, state.step)
-    answer = call_seam(setup.hook.crossgrad_sample_views, context, SampleResult)
+    answer = call_first_result(setup.hook.crossgrad_sample_views, context, SampleResult)
     state.accept(answer.states, setup.hook.crossgrad_sample_views)
     counts, photos = setup.sampler.counts(context.views_per_step), len(setup.train_views)
     views = answer.draw.views
@@ -413,7 +413,7 @@ def _aggregate_context(
 
 
 def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> AggregateResult:
-    answer = call_seam(setup.hook.crossgrad_aggregate_gradients, context, AggregateResult)
+    answer = call_first_result(setup.hook.crossgrad_aggregate_gradients, context, AggregateResult)
     state.accept(answer.states, setup.hook.crossgrad_aggregate_gradients)
     wanted = {name: state.tensors[name] for b in setup.trained_blocks for name in b.tensors}
     if misfit := _misfit(answer, wanted):
@@ -528,7 +528,7 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
         room=max_new_gaussians(setup, state, rendered),
         render=RenderCallback(setup, state, counted=True),
     )
-    answer = call_seam(setup.hook.crossgrad_densify, context, DensifyResult)
+    answer = call_first_result(setup.hook.crossgrad_densify, context, DensifyResult)
     state.accept(answer.states, setup.hook.crossgrad_densify)
     edited = apply_edit(setup, state, answer.edit)
     if edited or answer.edit.values:
@@ -547,7 +547,7 @@ def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
         means_lr=means_rate_at(setup, state.step),
         edited=edited,
     )
-    for answer in call_question(setup.hook.crossgrad_after_step, context, DensifyResult):
+    for answer in call_all(setup.hook.crossgrad_after_step, context, DensifyResult):
         state.accept(answer.states, setup.hook.crossgrad_after_step)
         # Noise and filters, which change in every step, are what an average takes away.
         if apply_edit(setup, state, answer.edit):

@@ -34,7 +34,7 @@ from crossgrad_core.gradients.deferred import DeferredSums
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.sparse_rows import coalesced, dense
 from crossgrad_core.gradients.summed import SummedGradients
-from crossgrad_core.registry.manager import call_question, call_seam
+from crossgrad_core.registry.manager import call_all, call_first_result
 from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.per_image_params import Leaves, apply, leaves_of
 from crossgrad_core.training.scaled_photos import Pair, on_device
@@ -208,7 +208,7 @@ def add_regularization(
         gaussians=gaussians,
         view=view,
     )
-    for answer in call_question(setup.hook.crossgrad_regularize, context, RegularizeResult):
+    for answer in call_all(setup.hook.crossgrad_regularize, context, RegularizeResult):
         state.accept(answer.states, setup.hook.crossgrad_regularize)
         _add(into, _gradients_of(answer.loss, state.tensors, keep=gaussians is not None))
 
@@ -301,7 +301,7 @@ class _Drawn:
 def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float, ...]:
     """The scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
-    answer = call_seam(setup.hook.crossgrad_choose_scales, context, ScaleResult)
+    answer = call_first_result(setup.hook.crossgrad_choose_scales, context, ScaleResult)
     state.accept(answer.states, setup.hook.crossgrad_choose_scales)
     scales = answer.scales
     if len(scales) == len(draw.views) and all(

@@ -17,7 +17,7 @@ from crossgrad_core.registry.slots import COMMANDS, OFFERED
 from crossgrad_plugins.authoring.new import examples
 
 #: What every package may import.
-DOORS = ("crossgrad_core.plugin", "crossgrad_core.numerics", "crossgrad_core.testing")
+PUBLIC = ("crossgrad_core.plugin", "crossgrad_core.numerics", "crossgrad_core.testing")
 
 
 @pytest.fixture
@@ -62,13 +62,13 @@ def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
 def test_it_imports_the_core_through_its_doors(ran, tmp_path, slot):
     ran("plugins", "new", "made-new", "--slot", slot)
     own = {"readers": "crossgrad_core.scene", COMMANDS: "crossgrad_core.commands"}
-    doors = (*DOORS, own.get(slot, DOORS[0]))
+    public = (*PUBLIC, own.get(slot, PUBLIC[0]))
     for file in (tmp_path / "made-new").rglob("*.py"):
         text = file.read_text()
         assert "example" not in text
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and "crossgrad" in node.module:
-                assert node.module.startswith(doors)
+                assert node.module.startswith(public)
 
 
 def test_its_own_test_runs(ran, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""docs/architecture.md names what there is: rooms, shelves, files, and the picture of them."""
+"""docs/architecture.md names the packages, the plugin packages and the files that there are."""
 
 import re
 from pathlib import Path
@@ -8,29 +8,29 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 CORE = ROOT / "crossgrad_core"
-SHELVES = ("backbones", "operators", "plugins")
+PLUGIN_PACKAGES = ("backbones", "operators", "plugins")
 
 
-def rooms():
+def packages():
     """The files and folders with code at the top of the core."""
     folders = {path.parent.name for path in CORE.glob("*/__init__.py")}
     return folders | {path.stem for path in CORE.glob("*.py")}
 
 
-def test_every_room_is_named_and_every_named_room_exists():
+def test_every_package_is_named_and_every_named_package_exists():
     rows = re.findall(r"^\| \d+ \| (.+?) \|", PAGE, re.MULTILINE)
     named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
-    assert sorted(named) == sorted(rooms())
+    assert sorted(named) == sorted(packages())
 
 
-def test_every_shelf_is_named():
+def test_every_plugin_package_is_named():
     rows = re.findall(r"^\| `(\w+)/` \| `(\w+)` \|", PAGE, re.MULTILINE)
-    assert tuple(shelf for shelf, _ in rows) == SHELVES
-    assert all((ROOT / shelf / package).is_dir() for shelf, package in rows)
-    for shelf, package in rows:
-        line = next(line for line in PAGE.splitlines() if line.startswith(f"| `{shelf}/`"))
+    assert tuple(folder for folder, _ in rows) == PLUGIN_PACKAGES
+    assert all((ROOT / folder / package).is_dir() for folder, package in rows)
+    for top, package in rows:
+        line = next(line for line in PAGE.splitlines() if line.startswith(f"| `{top}/`"))
         inside = re.findall(r"`(\w+)/`", line)[1:]
-        assert all((ROOT / shelf / package / folder).is_dir() for folder in inside)
+        assert all((ROOT / top / package / folder).is_dir() for folder in inside)
 
 
 FILES = sorted(set(re.findall(r"`((?:\w+/)+\w+\.\w+)`", PAGE)))
@@ -41,15 +41,15 @@ def test_every_file_that_is_named_exists(name):
     assert (ROOT / name).is_file()
 
 
-def test_both_paths_name_files_of_the_core_and_of_a_shelf():
+def test_both_paths_name_files_of_the_core_and_of_a_plugin_package():
     for title in ("The path of a photo", "The path of `--operator pcgrad`"):
         path = PAGE.partition(f"## {title}")[2].partition("\n## ")[0]
         named = re.findall(r"^\| `(\w+)/", path, re.MULTILINE)
         assert len(named) > 6
-        assert "crossgrad_core" in named and set(named) & set(SHELVES)
+        assert "crossgrad_core" in named and set(named) & set(PLUGIN_PACKAGES)
 
 
-def test_the_picture_shows_the_rooms():
+def test_the_picture_shows_the_packages():
     picture = (ROOT / "docs" / "layers.svg").read_text(encoding="utf-8")
     shown = re.findall(r"<text[^>]*>(\w+)</text>", picture)
-    assert sorted(shown) == sorted(rooms() | set(SHELVES))
+    assert sorted(shown) == sorted(packages() | set(PLUGIN_PACKAGES))

@@ -1,4 +1,4 @@
-"""The core names no plugin of a shelf, except in defaults.py."""
+"""The core names no plugin, except in defaults.py."""
 
 import ast
 import re

@@ -13,7 +13,7 @@ from crossgrad_core.registry.commands import load_command
 from crossgrad_core.registry.slots import COMMANDS, GROUPS
 from crossgrad_core.testing.checking import checks_of
 
-SHELVES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
+PLUGIN_PACKAGES = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
 OURS = [
     entry for slot in GROUPS for entry in registry.offers(slot) if entry.distribution == "crossgrad"
 ]
@@ -24,7 +24,7 @@ COMMANDS_OF_OURS = [each for each in registry.offers(COMMANDS) if each.distribut
 def test_each_entry_point_loads(entry):
     component = registry.load(entry.slot, entry.name)
     assert component.__doc__
-    assert component.__module__.partition(".")[0] in SHELVES
+    assert component.__module__.partition(".")[0] in PLUGIN_PACKAGES
 
 
 @pytest.mark.parametrize("entry", OURS, ids=lambda entry: f"{entry.slot}-{entry.name}")
@@ -35,17 +35,17 @@ def test_each_name_is_easy_to_type(entry):
 
 
 @pytest.mark.parametrize("entry", COMMANDS_OF_OURS, ids=lambda entry: entry.name)
-def test_each_command_loads_from_a_shelf(entry):
-    assert entry.package in SHELVES
+def test_each_command_loads_from_a_plugin_package(entry):
+    assert entry.package in PLUGIN_PACKAGES
     assert load_command(entry)
     for check in checks_of(COMMANDS):
         check(load_command(entry))
 
 
-@pytest.mark.parametrize("shelf", SHELVES)
-def test_each_component_has_an_entry_point(shelf):
+@pytest.mark.parametrize("folder", PLUGIN_PACKAGES)
+def test_each_component_has_an_entry_point(folder):
     offered = {entry.value for entry in OURS}
-    for module in modules_of(shelf):
+    for module in modules_of(folder):
         for name, kind in inspect.getmembers(import_module(module), is_component):
             if kind.__module__ == module:
                 assert f"{module}:{name}" in offered

@@ -11,7 +11,7 @@ from crossgrad_core.registry.slots import OFFERED
 EXAMPLE = ROOT / "examples" / "plugin"
 PROJECT = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 GROUPS = PROJECT["entry-points"]
-DOORS = ("plugin", "numerics", "commands", "scene", "testing")
+PUBLIC = ("plugin", "numerics", "commands", "scene", "testing")
 
 
 def lines(group):
@@ -39,4 +39,4 @@ def test_it_comes_through_the_doors(file):
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module.startswith("crossgrad_"):
             package, *rest = node.module.split(".")
-            assert package == "crossgrad_example" or rest[0] in DOORS
+            assert package == "crossgrad_example" or rest[0] in PUBLIC

@@ -1,15 +1,15 @@
-"""The rooms of the core and the doors of the shelves: who may import whom."""
+"""Layers of the core and public modules for plugin packages: who may import whom."""
 
 import re
 import subprocess
 import sys
 
 import pytest
-from support.imports import CORE, ROOT, SHELVES, circle, import_graph, imports, modules
+from support.imports import CORE, PLUGIN_PACKAGES, ROOT, circle, import_graph, imports, modules
 
-#: The rooms and files of the core from the lowest floor to the highest; imports go down. Those of
-#: one floor do not import each other.
-FLOORS = (
+#: The packages and files of the core from the lowest layer to the highest. A layer imports lower
+#: ones only.
+LAYERS = (
     ("wording", "defaults"),
     ("errors",),
     ("system",),
@@ -24,11 +24,11 @@ FLOORS = (
     ("cli",),
     ("__init__", "__main__"),
 )
-FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-#: What every shelf may import of the core: components and kernels, readers, command rooms.
-DOORS = (f"{CORE}.plugin", f"{CORE}.numerics")
-READERS = (*DOORS, f"{CORE}.scene")
-COMMAND_ROOMS = (*DOORS, f"{CORE}.commands")
+LAYER = {package: number for number, packages in enumerate(LAYERS) for package in packages}
+#: What a plugin package may import of the core: components and kernels, readers, commands.
+PUBLIC = (f"{CORE}.plugin", f"{CORE}.numerics")
+READERS = (*PUBLIC, f"{CORE}.scene")
+COMMANDS_IMPORT = (*PUBLIC, f"{CORE}.commands")
 PLACES = {
     "crossgrad_plugins.readers": READERS,
     # Reads the headers of photo files.
@@ -36,17 +36,17 @@ PLACES = {
     # Finds features with pycolmap, which is imported with care.
     "crossgrad_plugins.initializers.triangulated": READERS,
     # Checks packages, and writes one for each slot, readers and tests included.
-    "crossgrad_plugins.authoring": (*COMMAND_ROOMS, *READERS, f"{CORE}.testing"),
-    "crossgrad_plugins.compare": COMMAND_ROOMS,
-    "crossgrad_plugins.diagnostics": COMMAND_ROOMS,
-    "crossgrad_plugins.planner": COMMAND_ROOMS,
+    "crossgrad_plugins.authoring": (*COMMANDS_IMPORT, *READERS, f"{CORE}.testing"),
+    "crossgrad_plugins.compare": COMMANDS_IMPORT,
+    "crossgrad_plugins.diagnostics": COMMANDS_IMPORT,
+    "crossgrad_plugins.planner": COMMANDS_IMPORT,
     # Reads photos and their headers, which is what comes before a scene.
-    "crossgrad_plugins.prepare": (*COMMAND_ROOMS, *READERS),
+    "crossgrad_plugins.prepare": (*COMMANDS_IMPORT, *READERS),
     # `crossgrad recipes`.
-    "crossgrad_plugins.recipes.cli": COMMAND_ROOMS,
-    "crossgrad_plugins.scene_check": COMMAND_ROOMS,
-    "crossgrad_plugins.sweep": COMMAND_ROOMS,
-    "crossgrad_operators.stress": COMMAND_ROOMS,
+    "crossgrad_plugins.recipes.cli": COMMANDS_IMPORT,
+    "crossgrad_plugins.scene_check": COMMANDS_IMPORT,
+    "crossgrad_plugins.sweep": COMMANDS_IMPORT,
+    "crossgrad_operators.stress": COMMANDS_IMPORT,
 }
 #: Files at the top of the core.
 MOST_FILES = 9
@@ -57,7 +57,7 @@ def graph():
     return import_graph()
 
 
-def room(module):
+def package(module):
     return [*module.split("."), "__init__"][1]
 
 
@@ -76,45 +76,45 @@ def test_a_circle_would_be_found(tmp_path):
 
 
 def test_every_room_has_a_floor():
-    inside = {room(name) for name in modules() if name.split(".")[0] == CORE}
-    assert inside == set(FLOOR)
+    inside = {package(name) for name in modules() if name.split(".")[0] == CORE}
+    assert inside == set(LAYER)
 
 
-@pytest.mark.parametrize("here", FLOOR)
+@pytest.mark.parametrize("here", LAYER)
 def test_imports_go_down(here, graph):
     upward = [
         f"{module} -> {other}"
         for module, others in graph.items()
-        if module.split(".")[0] == CORE and room(module) == here
+        if module.split(".")[0] == CORE and package(module) == here
         for other in others
-        # What the core's own __init__ holds, its version, is no room.
-        if other.split(".")[0] == CORE and room(other) not in {here, "__init__"}
-        if FLOOR[room(other)] >= FLOOR[here]
+        # The core's own __init__ holds its version.
+        if other.split(".")[0] == CORE and package(other) not in {here, "__init__"}
+        if LAYER[package(other)] >= LAYER[here]
     ]
     assert not upward
 
 
-def test_the_core_imports_no_shelf(graph):
+def test_the_core_imports_no_plugin_package(graph):
     assert not [
         f"{module} -> {other}"
         for module, others in graph.items()
         if module.split(".")[0] == CORE
         for other in others
-        if other.split(".")[0] in SHELVES
+        if other.split(".")[0] in PLUGIN_PACKAGES
     ]
 
 
-@pytest.mark.parametrize("shelf", SHELVES)
-def test_shelves_come_through_the_doors(shelf, graph):
+@pytest.mark.parametrize("folder", PLUGIN_PACKAGES)
+def test_plugin_packages_import_public_modules_only(folder, graph):
     beside = []
     for module, others in graph.items():
-        if module.split(".")[0] != shelf:
+        if module.split(".")[0] != folder:
             continue
-        doors = next((doors for place, doors in PLACES.items() if _in(module, place)), DOORS)
+        public = next((public for place, public in PLACES.items() if _in(module, place)), PUBLIC)
         beside += [
             f"{module} -> {other}"
             for other in others
-            if other.split(".")[0] == CORE and not any(_in(other, door) for door in doors)
+            if other.split(".")[0] == CORE and not any(_in(other, module) for module in public)
         ]
     assert not beside
 
@@ -123,19 +123,19 @@ def _in(module, place):
     return module == place or module.startswith(f"{place}.")
 
 
-def test_the_hallway_is_short():
+def test_the_core_has_few_files_at_its_top():
     files = sorted(path.name for path in (ROOT / CORE).glob("*.py"))
     assert len(files) <= MOST_FILES, files
 
 
-def test_the_page_on_the_architecture_shows_these_floors():
+def test_the_page_on_the_architecture_shows_these_layers():
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| (.+?) \|", page, re.MULTILINE)
     shown = {int(number): tuple(re.findall(r"`([\w_]+)", cell)) for number, cell in rows}
-    assert shown == dict(enumerate(FLOORS, 1))
+    assert shown == dict(enumerate(LAYERS, 1))
 
 
-def test_the_door_of_components_opens_quickly():
+def test_the_public_module_for_components_is_imported_quickly():
     program = "import sys, crossgrad_core.plugin; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, check=True, text=True

@@ -8,7 +8,7 @@ import pytest
 HEAVY = ("torch", "numba", "numpy", "scipy", "PIL", "pycolmap", "matplotlib", "yaml", "rich")
 OURS = ("crossgrad_backbones", "crossgrad_operators", "crossgrad_plugins")
 #: Where `crossgrad plugins` itself is.
-ROOM = ("crossgrad_plugins", "crossgrad_plugins.authoring", "crossgrad_plugins.authoring.cli")
+COMMAND = ("crossgrad_plugins", "crossgrad_plugins.authoring", "crossgrad_plugins.authoring.cli")
 PROGRAM = """
 import sys
 from crossgrad_core.cli.main import main
@@ -30,7 +30,7 @@ def test_nothing_heavy_is_imported(arguments):
         [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True
     )
     modules = ended.stderr.splitlines()
-    own = ROOM if arguments[0] == "plugins" else ()
+    own = COMMAND if arguments[0] == "plugins" else ()
     imported = {module.partition(".")[0] for module in modules if module not in own}
     assert "typer" in imported
     assert imported.isdisjoint({*HEAVY, *OURS})

@@ -8,12 +8,12 @@ import pytest
 ROOT = Path(__file__).parents[2]
 #: What decodes on whatever clock is running.
 DECODES = re.compile(r"\.photo\.(image|mask)\(")
-SHELVES = ("backbones", "operators", "plugins")
+PLUGIN_PACKAGES = ("backbones", "operators", "plugins")
 
 
-@pytest.mark.parametrize("shelf", SHELVES)
-def test_no_plugin_decodes_photos_itself(shelf):
-    sources = sorted((ROOT / shelf).rglob("*.py"))
+@pytest.mark.parametrize("folder", PLUGIN_PACKAGES)
+def test_no_plugin_decodes_photos_itself(folder):
+    sources = sorted((ROOT / folder).rglob("*.py"))
     assert sources
     assert not [path.name for path in sources if DECODES.search(path.read_text(encoding="utf-8"))]
 

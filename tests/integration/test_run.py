@@ -161,8 +161,9 @@ def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkey
     assert summary["step"] == 60
     assert not any("no density control" in note for note in summary["notes"])
     assert f"followed the clock: {summary['step']} steps instead of 28" in summary["notes"][-1]
-    assert len(told) == 2 and told[0].startswith("- no density control")
-    assert told[1].startswith("density control after all") and told[1] in logged
+    assert "no density control" in logged
+    (line,) = told
+    assert line.startswith("density control after all") and line in logged
 
 
 def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_path):
@@ -356,7 +357,7 @@ def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
 
 
 class Louder:
-    """Wraps all three seams and adds a loss term; counts what it saw."""
+    """Wraps all three hooks and adds a loss term; counts what it saw."""
 
     def __init__(self):
         self.seen = []
@@ -387,7 +388,7 @@ class Louder:
         return RegularizeResult(context.parameters["opacities"].sum())
 
 
-def test_wrappers_replace_what_the_seams_answer(scene, tmp_path, monkeypatch):
+def test_wrappers_replace_what_the_hooks_answer(scene, tmp_path, monkeypatch):
     watcher = Louder()
     poisoned(monkeypatch, watcher)
     run(scene, tmp_path / "run", steps=4, eval_every=4)

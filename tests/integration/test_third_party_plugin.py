@@ -131,7 +131,7 @@ def test_a_broken_one_fails_with_the_reasons(python):
     assert "operator equal-length FAIL" in report
     assert "compare lengths with each other, never with a constant" in report
     assert "draws from the global generator of numpy" in report
-    assert "the seam crossgrad_aggregate_gradients was not answered" in report
+    assert "the hook crossgrad_aggregate_gradients was not answered" in report
     assert "13 of 16 plugins keep the contract of their slot" in report
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 CORE = "crossgrad_core"
-SHELVES = {
+PLUGIN_PACKAGES = {
     "crossgrad_backbones": ROOT / "backbones" / "crossgrad_backbones",
     "crossgrad_operators": ROOT / "operators" / "crossgrad_operators",
     "crossgrad_plugins": ROOT / "plugins" / "crossgrad_plugins",
@@ -17,7 +17,7 @@ SHELVES = {
 def modules() -> dict[str, Path]:
     """Dotted name -> file of every module that ships."""
     found = {}
-    for name, folder in {CORE: ROOT / CORE, **SHELVES}.items():
+    for name, folder in {CORE: ROOT / CORE, **PLUGIN_PACKAGES}.items():
         for file in sorted(folder.rglob("*.py")):
             parts = [name, *file.relative_to(folder).with_suffix("").parts]
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file

@@ -1,4 +1,4 @@
-"""Gradient clipping, block by block: a wrapper of the aggregation seam."""
+"""Gradient clipping, block by block: a wrapper of the aggregation hook."""
 
 from collections.abc import Generator
 from dataclasses import replace

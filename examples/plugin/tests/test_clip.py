@@ -6,14 +6,14 @@ from crossgrad_example.clip import STATE, Clip
 from crossgrad_example.equal_length import EqualLength
 
 from crossgrad_core.contract.contexts import AggregateResult
-from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_core.registry.manager import call_first_result, make_manager
 from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
 
 
 def answered(max_norm: float) -> AggregateResult:
     plugins = {"operator": EqualLength(), "clip": Clip(max_norm=max_norm)}
     hook = make_manager(plugins).hook.crossgrad_aggregate_gradients
-    return call_seam(hook, aggregate_context(sample_gradients(2)), AggregateResult)
+    return call_first_result(hook, aggregate_context(sample_gradients(2)), AggregateResult)
 
 
 def test_long_gradients_are_shortened_and_counted() -> None:
@@ -31,9 +31,9 @@ def test_long_gradients_are_shortened_and_counted() -> None:
 
 def test_short_gradients_keep_their_bits() -> None:
     hook = make_manager({"operator": EqualLength()}).hook.crossgrad_aggregate_gradients
-    expected = call_seam(hook, aggregate_context(sample_gradients(2)), AggregateResult).gradients[
-        "means"
-    ]
+    expected = call_first_result(
+        hook, aggregate_context(sample_gradients(2)), AggregateResult
+    ).gradients["means"]
     clipped = answered(1e9).gradients["means"]
     assert expected is not None
     assert clipped is not None

@@ -144,7 +144,7 @@ def timed(
 def context_of(
     gradients: Sequence[Mapping[str, Tensor | None]], blocks: tuple[Block, ...], views: Views
 ) -> AggregateContext:
-    """What the seam is offered; no operator may need the scene or the schedule."""
+    """What the hook is offered; no operator may need the scene or the schedule."""
     return AggregateContext(
         step=1,
         schedule=cast("Any", None),

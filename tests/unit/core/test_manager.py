@@ -1,4 +1,4 @@
-"""One manager per run; hooks that pluggy would silently never call; seams that must answer."""
+"""One manager per run; hooks that pluggy would silently never call; hooks that must answer."""
 
 import types
 
@@ -10,7 +10,7 @@ from crossgrad_core.contract.contexts import DensifyResult, SampleResult, ViewSa
 from crossgrad_core.contract.markers import PROJECT
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
-from crossgrad_core.registry.manager import call_seam, make_manager
+from crossgrad_core.registry.manager import call_first_result, make_manager
 from crossgrad_operators.pcgrad import PCGrad
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 
@@ -25,7 +25,7 @@ class Densifier:
 
 
 class Recorder:
-    """Wraps the seam and notes the order of events."""
+    """Wraps the hook and notes the order of events."""
 
     def __init__(self, name, events):
         self.name, self.events = name, events
@@ -121,7 +121,7 @@ def test_wrong_arguments_are_refused_with_the_signature():
     assert "message" in error.found
 
 
-def test_two_answers_to_one_seam_are_refused_with_both_names():
+def test_two_answers_to_one_hook_are_refused_with_both_names():
     error = refusal(selected=Densifier(1), intruder=Densifier(2))
     assert "crossgrad_densify: selected, intruder" in error.what
     assert "wrapper=True" in error.todo
@@ -164,23 +164,23 @@ def test_later_wrappers_are_outer_wrappers():
             "second": Recorder("second", events),
         }
     )
-    assert call_seam(manager.hook.crossgrad_densify, None, DensifyResult) is answer
+    assert call_first_result(manager.hook.crossgrad_densify, None, DensifyResult) is answer
     assert events == ["second before", "first before", "first after", "second after"]
 
 
 @pytest.mark.parametrize("answer", [DensifyResult(NO_EDIT), DensifyResult(Edit())])
-def test_a_seam_gives_its_answer(answer):
+def test_a_hook_gives_its_answer(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
-    assert call_seam(hook, None, DensifyResult) is answer
+    assert call_first_result(hook, None, DensifyResult) is answer
 
 
 @pytest.mark.parametrize(
     "answer", [None, NO_EDIT, DensifyResult(None), SampleResult(ViewSample((0,)))], ids=str
 )
-def test_a_seam_that_is_not_answered_is_an_error(answer):
+def test_a_hook_that_is_not_answered_is_an_error(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
-    with pytest.raises(UserError, match="a seam must answer") as caught:
-        call_seam(hook, None, DensifyResult)
+    with pytest.raises(UserError, match="a hook must answer") as caught:
+        call_first_result(hook, None, DensifyResult)
     assert caught.value.where == "plugins densifier"
     assert "NO_EDIT" in caught.value.todo
 
@@ -193,13 +193,13 @@ def test_a_draw_of_nothing_is_no_answer():
 
     hook = make_manager({"sampler": Sampler()}).hook.crossgrad_sample_views
     with pytest.raises(UserError, match="crossgrad_sample_views"):
-        call_seam(hook, None, SampleResult)
+        call_first_result(hook, None, SampleResult)
 
 
 def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
     plugins = {"densifier": Densifier(DensifyResult(NO_EDIT)), "forgetful": Forgetful()}
     with pytest.raises(UserError, match="was not answered") as caught:
-        call_seam(make_manager(plugins).hook.crossgrad_densify, None, DensifyResult)
+        call_first_result(make_manager(plugins).hook.crossgrad_densify, None, DensifyResult)
     assert "forgetful" in caught.value.where
     assert "yield" in caught.value.todo
 
@@ -234,9 +234,9 @@ def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers
     assert "of plugin after, " in note
 
 
-def test_a_seam_without_plugins_is_an_error():
+def test_a_hook_without_plugins_is_an_error():
     with pytest.raises(UserError, match="plugins none"):
-        call_seam(make_manager({}).hook.crossgrad_densify, None, DensifyResult)
+        call_first_result(make_manager({}).hook.crossgrad_densify, None, DensifyResult)
 
 
 class Marked:

@@ -1,4 +1,4 @@
-"""Plugins of the smaller seams in short runs: each does what it says, also stopped and resumed."""
+"""Plugins of the smaller hooks in short runs: each does what it says, also stopped and resumed."""
 
 import csv
 import json
@@ -25,12 +25,12 @@ from crossgrad_core.training.state import PHASES
 from crossgrad_core.training.views import RenderCallback
 
 PLUGINS = {
-    "resolutions": {"near-at-half": "support.seam_plugins:NearAtHalf"},
-    "densifiers": {"unseen": "support.seam_plugins:PrunesTheUnseen"},
-    "samplers": {"one-then-two": "support.seam_plugins:OneThenTwo"},
-    "exposures": {"stops": "support.seam_plugins:GainPerPhoto"},
-    "losses": {"centre": "support.seam_plugins:CentreWeighted"},
-    "metrics": {"brightness": "support.seam_plugins:BrightnessError"},
+    "resolutions": {"near-at-half": "support.hook_plugins:NearAtHalf"},
+    "densifiers": {"unseen": "support.hook_plugins:PrunesTheUnseen"},
+    "samplers": {"one-then-two": "support.hook_plugins:OneThenTwo"},
+    "exposures": {"stops": "support.hook_plugins:GainPerPhoto"},
+    "losses": {"centre": "support.hook_plugins:CentreWeighted"},
+    "metrics": {"brightness": "support.hook_plugins:BrightnessError"},
 }
 #: Two edits and a reset in a few steps.
 WINDOW = {"densify_from": 4, "densify_until": 22, "densify_every": 6}
@@ -191,7 +191,7 @@ def test_an_operator_without_a_meaning_for_some_step_is_refused():
 
 
 class Quarter(Observer):
-    """Wraps the seam of the scales: everything at a quarter."""
+    """Wraps the hook of the scales: everything at a quarter."""
 
     @hookimpl(wrapper=True)
     def crossgrad_choose_scales(self, context):
@@ -199,7 +199,7 @@ class Quarter(Observer):
         return replace(answer, scales=tuple(0.25 for _ in answer.scales))
 
 
-def test_the_seam_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
+def test_the_hook_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
     build = assemble.make_manager
     monkeypatch.setattr(
         assemble, "make_manager", lambda plugins: build({**plugins, "quarter": Quarter()})
@@ -282,7 +282,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path):
 
 
 def test_scales_out_of_bounds_end_the_run_by_name(scene, tmp_path, monkeypatch, capsys):
-    from support.seam_plugins import NearAtHalf
+    from support.hook_plugins import NearAtHalf
 
     monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))
     with pytest.raises(UserError, match="does not give each view a scale"):

@@ -1,4 +1,4 @@
-"""Small plugins that use the contracts of the training seams for real."""
+"""Small plugins that use the contracts of the training hooks for real."""
 
 import torch
 
