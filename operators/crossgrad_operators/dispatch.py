@@ -59,7 +59,7 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 class Dispatch(GramianOperator):
     """Each block goes to the operator of its own rule, else of its kind's, else of the variant.
 
-    Presets (the paper's two variants): `geometry-confgate` gates the geometry and adds the
+    Variants of the paper: `geometry-confgate` gates the geometry and adds the
     appearance; `geometry-projection` projects the geometry and gates the appearance.
     """
 
