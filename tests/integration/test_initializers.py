@@ -71,19 +71,19 @@ def sparse(tmp_path_factory):
 
 @pytest.mark.parametrize("points", [0, 1, 2])
 @pytest.mark.parametrize("initializer", sorted(entries("initializers")))
-def test_every_start_trains_a_scene_with_no_points_or_few_of_them(
-    sparse, tmp_path, capsys, start, points
+def test_every_initializer_trains_a_scene_with_no_points_or_few_of_them(
+    sparse, tmp_path, capsys, initializer, points
 ):
     given = ("--steps", "4", "--threads", "1", "-q", "--out", tmp_path / "run")
-    trains = points or load("initializers", start).alone
-    assert ended("run", sparse(points), *given, "--initializer", start) == (0 if trains else 2)
+    trains = points or load("initializers", initializer).alone
+    assert ended("run", sparse(points), *given, "--initializer", initializer) == (0 if trains else 2)
     if trains:
         assert primitives(tmp_path / "run") >= max(points, 1)
     else:
         assert "the scene has no SfM points to start from" in capsys.readouterr().err
 
 
-def test_points_of_its_own_make_a_start_do_nothing(scene, tmp_path, capsys):
+def test_points_of_its_own_make_an_initializer_do_nothing(scene, tmp_path, capsys):
     assert run(scene, tmp_path / "run", "--init", "random", "--initializer", "fill-gaps") == 2
-    assert "start: --init random has points of its own" in capsys.readouterr().err
+    assert "initializer: --init random has points of its own" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
