@@ -76,7 +76,9 @@ def test_every_initializer_trains_a_scene_with_no_points_or_few_of_them(
 ):
     given = ("--steps", "4", "--threads", "1", "-q", "--out", tmp_path / "run")
     trains = points or load("initializers", initializer).alone
-    assert ended("run", sparse(points), *given, "--initializer", initializer) == (0 if trains else 2)
+    assert ended("run", sparse(points), *given, "--initializer", initializer) == (
+        0 if trains else 2
+    )
     if trains:
         assert primitives(tmp_path / "run") >= max(points, 1)
     else:
