@@ -34,7 +34,7 @@ class Evidence:
         Args:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
-        known = _set_in(self.config, "") | _set_in(self.config.data, "reading.")
+        known = _set_in(self.config, "") | _set_in(self.config.data, "data.")
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
         return not known.isdisjoint(names)
 

@@ -25,7 +25,7 @@ from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks import gains as tracks
 from crossgrad_plugins.exposures.tracks.fit import Fit
 from crossgrad_plugins.exposures.tracks.gains import TrackGains
-from crossgrad_plugins.planner import groups, looks, sizes
+from crossgrad_plugins.planner import groups, looks, reading, sizes
 from crossgrad_plugins.planner.app import lines_of
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.modes import DEPTH, Modes, modes_of
@@ -621,3 +621,16 @@ def test_no_scene_breaks_the_planner(centers, points, asked, notes):
         assert len(plan["decisions"]) == parts
         for name in config.model_fields_set - {"backbone", "scene"}:
             assert getattr(decided, name) == getattr(config, name)
+
+
+@pytest.mark.parametrize(
+    ("decides", "setting", "value"),
+    [
+        (reading.start, "init", "random"),
+        (reading.held_out, "split", "stratified"),
+        (reading.held_out, "test_every", 4),
+    ],
+)
+def test_settings_of_the_data_that_the_user_set_are_not_decided(decides, setting, value):
+    evidence = Evidence(config_of(data={setting: value}), posed_scene([]))
+    assert decides(evidence).basis == "given"
