@@ -1,26 +1,26 @@
-"""The plugins that the core names: what a run takes where the user names none, and examples.
+"""The plugins that the core names: the defaults of a run, and examples in help and in messages.
 
 No other file of the core names a plugin.
 """
 
 from typing import Final
 
-#: What a run takes where the user names nothing.
+#: The component of a slot if the user names none.
 BACKBONE: Final = "vanilla"
 SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
-#: The start of published runs, and of those that begin with points of their own: it adds nothing.
-BARE_START: Final = "points"
-#: The start that has points for a scene without any: a hint.
-START_ALONE: Final = "triangulated"
+#: The initializer of published runs, and of runs whose points come from a file: it adds nothing.
+PLAIN_INITIALIZER: Final = "points"
+#: The initializer that finds points for a scene without any; messages name it.
+INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
 #: Also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
 #: The densifier of a backbone that names none.
 DENSIFIER: Final = "adc"
-#: The reader that says what is missing in a folder that no reader accepts.
+#: The reader whose error says what is missing if no reader accepts a folder.
 READER: Final = "colmap"
 #: The reader of `--prepare`, which finds the cameras of a folder of photos.
 PREPARING_READER: Final = "photos-alone"
@@ -30,14 +30,14 @@ CHAIN: Final = "chain"
 RECIPE: Final = "auto"
 #: The planner of `--plan`.
 PLANNER: Final = "scene"
-#: The observer that every run has.
+#: The observer of every run.
 PROGRESS: Final = "progress"
 
-#: What contract checks draw with, and the densifier that they switch edits off with.
+#: The rasterizer of contract checks, and the densifier that makes no edits.
 REFERENCE_RASTERIZER: Final = "torch"
 NO_DENSIFIER: Final = "none"
 
-#: A sampler that draws from groups, an operator and a chain: examples in help and in hints.
+#: Examples in help and in messages: a sampler that draws from groups, an operator and a chain.
 GROUP_SAMPLER: Final = "near-far"
 EXAMPLE_OPERATOR: Final = "symmetric"
 EXAMPLE_CHAIN: Final = "preconditioner+symmetric"

@@ -2,8 +2,8 @@
 
 The three hooks of a training step, `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and
 `crossgrad_densify`, stop at the first answer: the selected component gives it. Any other plugin may
-wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A hook must answer
-with a value; None is an error.
+wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A first-result hook
+must answer with a value; None is an error.
 """
 
 from typing import TYPE_CHECKING

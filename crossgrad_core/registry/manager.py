@@ -1,4 +1,4 @@
-"""One plugin manager per run, and hooks that must answer.
+"""One plugin manager per run, and first-result hooks, which must answer.
 
 pluggy is quiet about a hook that is not specified, a hook method without its mark and a second
 plugin that answers first. All three are errors here, with the plugin's name.
@@ -98,7 +98,7 @@ def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: typ
     raise UserError(
         f"the hook {hook.name} was not answered",
         where=f"plugins {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
-        expected=f"a value of type {answer.__name__}; a hook must answer",
+        expected=f"a value of type {answer.__name__}; a first-result hook must answer",
         found=repr(result),
         todo="return an explicit answer, NO_EDIT where nothing changes; "
         "a wrapper must return what `yield` gave it or a replacement",

@@ -194,7 +194,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     way = Way(verbosity, _print_results, check)
     if resume is not None:
         accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-        return _exit_code(resumed(resume, settings, way, **accepted), way)
+        return _end(resumed(resume, settings, way, **accepted), way)
     if accept_plugins:
         raise UserError(
             "only a run that is continued has something to compare with",
@@ -206,11 +206,11 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     if dry_run:
         _print_dry_run(_with_remarks(_checked(settings, way)[0])[0])
         return 0
-    return _exit_code(new(settings, way), way)
+    return _end(new(settings, way), way)
 
 
-def _exit_code(outcome: "Outcome", way: "Way") -> int:
-    """Return the exit code of a run; name the next commands if the run is complete."""
+def _end(outcome: "Outcome", way: "Way") -> int:
+    """Print the next commands of a complete run; return the exit code."""
     if outcome.ending.status == "finished" and way.verbosity >= 0 and outcome.folder.is_dir():
         print(next_line(outcome.folder))  # noqa: T201
     return outcome.exit_code

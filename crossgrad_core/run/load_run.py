@@ -282,7 +282,7 @@ _PLAIN: Final = {
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
     # It asks for no points, of which the scene may have none.
-    "initializer": defaults.START_ALONE,
+    "initializer": defaults.INITIALIZER_WITHOUT_POINTS,
     "resolution": defaults.RESOLUTION,
 }
 #: Slots (singular words) whose components a run can be looked at without.

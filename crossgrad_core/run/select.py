@@ -19,7 +19,7 @@ from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, is_in_image
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.defaults import METRICS, START_ALONE
+from crossgrad_core.defaults import INITIALIZER_WITHOUT_POINTS, METRICS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
@@ -104,9 +104,9 @@ def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None
             "the scene has no SfM points to start from",
             where=config.scene or scene.name,
             found=_clouds_in(config.scene),
-            todo=f"find some in the photos (--initializer {START_ALONE}), or start from those of a "
-            "point cloud (--points FILE), from the Gaussians of a file (--init FILE.ply) or from "
-            "random points (--init random)",
+            todo=f"find some in the photos (--initializer {INITIALIZER_WITHOUT_POINTS}), or start "
+            "from those of a point cloud (--points FILE), from the Gaussians of a file (--init "
+            "FILE.ply) or from random points (--init random)",
         )
 
 
@@ -126,7 +126,8 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -
             where=config.scene or scene.name,
             expected="points and cameras in one frame, with the cameras looking at the points",
             found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
-            todo=f"mend the model, or find points in the photos (--initializer {START_ALONE})",
+            todo="mend the model, or find points in the photos "
+            f"(--initializer {INITIALIZER_WITHOUT_POINTS})",
         )
 
 

@@ -117,7 +117,7 @@ def with_recipe(settings: Mapping[str, Any]) -> Settings:
 
 
 def _flat(layer: Mapping[str, object]) -> Settings:
-    """The layer with one entry for each setting of a group, which is no component: `reading`."""
+    """The layer with one entry for each setting of a group, which is no component: `data`."""
     flat: Settings = {}
     for name, value in layer.items():
         if name in GROUPS_OF_SETTINGS and isinstance(value, dict):

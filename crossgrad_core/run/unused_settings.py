@@ -10,7 +10,7 @@ from pathlib import Path
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.objections import set_for_nothing
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.defaults import BARE_START, GROUP_SAMPLER, PROGRESS
+from crossgrad_core.defaults import GROUP_SAMPLER, PLAIN_INITIALIZER, PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
@@ -210,7 +210,7 @@ def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
-    asked = config.initializer is not None and config.initializer.name != BARE_START
+    asked = config.initializer is not None and config.initializer.name != PLAIN_INITIALIZER
     if asked and config.data.init != "points":
         yield (
             "initializer",

@@ -164,7 +164,7 @@ def label_by_footprint(
 ) -> tuple[str, ...]:
     """Near where the scene is drawn at least as large as in the median training view, else far.
 
-    See `contract.poses.footprint`. A view without one takes that of the nearest camera that has
+    See `contract.scene.footprint`. A view without one takes that of the nearest camera that has
     one. Without a footprint at all, every view is in one regime `all`.
 
     Args:

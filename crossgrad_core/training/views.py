@@ -78,7 +78,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: i
         index: The training view.
         scale: The scale.
         slot: The place of the view in the draw, which has a part in the lot that decides on the
-            pixels of an strided view.
+            pixels of a strided view.
     """
     view = setup.train_views[index]
     stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)

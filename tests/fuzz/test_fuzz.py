@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,25 @@ def test_a_defect_that_is_put_back_is_found(name, tmp_path):
         budget = Budget(executions=DIRECT, findings=1, shrinking=0)
         found = search(target, bench, budget, 0, known_of(target.name))
     assert found.findings
+
+
+def test_functions_that_are_left_out_of_a_search_exist():
+    unknown = [
+        f"{target}: {module.__name__}.{name}"
+        for target, parser in ((name, found.parser) for name, found in TARGETS.items())
+        for module, names in parser.items()
+        for name in names
+        if not _has(module, name)
+    ]
+    assert not unknown
+
+
+def _has(module, name):
+    try:
+        attrgetter(name)(module)
+    except AttributeError:
+        return False
+    return True
 
 
 def test_the_makefile_finds_the_search():

@@ -12,7 +12,7 @@ from crossgrad_plugins.compare.settings import ABSENT, Settings
 #: What names an arm if it can, before anything else that differs.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
-    *("rate_factor", "densify_views", "schedule", "reference", "schedule_unit"),
+    *("rate_factor", "densify_views", "schedule", "schedule_length", "schedule_unit"),
     *("exposure", "loss", "resolution", "recipe", "backward"),
 )
 #: Settings that people know by another name.

@@ -16,7 +16,8 @@ from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Target
 
 _FILE = "named.json"
-#: What reads a file of values.
+#: The functions that read a camera path, and the ones that read a file of values.
+_READS_PATH = ("_read", "_camera", "_Frame", "_Path")
 _READS = ("read_values", "_content", "_is_of_photos", "_value", "_misfit")
 _LIKE = {"gain": torch.zeros(3), "matrix": torch.zeros(3, 2, 2)}
 _WORDS = (
@@ -80,9 +81,7 @@ PATH = Target(
     name="camera-path",
     seeds=_paths,
     parse=_parse_path,
-    parser={
-        camera_path: ("flight", "zoom", "_distance", "_ends", "_way", "_between", "_unit"),
-    },
+    parser={camera_path: tuple(name for name in vars(camera_path) if name not in _READS_PATH)},
     words=_WORDS,
     mutators=_FORMAT,
 )

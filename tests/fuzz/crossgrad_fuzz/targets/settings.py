@@ -38,7 +38,7 @@ background: 0.1,0.2,0.3
 _CHAIN = (
     b"operator: pcgrad+cagrad\nobservers: {diagnostics: {every: 10}, progress: }\nseconds: 1e2\n"
 )
-_ALIASES = b"a: &a {x: 1}\nreading: &r {split: none}\nb: [*a, *a]\n"
+_ALIASES = b"a: &a {x: 1}\ndata: &r {split: none}\nb: [*a, *a]\n"
 _MANY = b"operator.c=0.4\noperator.name=cagrad\nviews=2\nseed=7\nobservers=progress\n"
 
 
@@ -47,7 +47,7 @@ def _seeds() -> Sequence[Case]:
     return [
         {_FILE: _USER, _SETS: b"data.max_size=320\n"},
         {_FILE: _CHAIN, _SETS: b"operator.cagrad.c=0.3\nobservers.diagnostics.every=5"},
-        {_FILE: _ALIASES, _SETS: b"reading=null\n"},
+        {_FILE: _ALIASES, _SETS: b"data=null\n"},
         {_FILE: b"", _SETS: _MANY},
         {_FILE: b"recipe: published\n", _SETS: b"rasterizer.max_alpha=0.99\noperator=a+b\n"},
         {_FILE: resolved, _SETS: b""},

@@ -116,7 +116,7 @@ SUMMARY = Target(
     parse=_parse_summary,
     parser={
         text_files: ("read_rows", "parse_number"),
-        summary: ("write_summary", "_as_data", "_metrics", "_best", "_finite"),
+        summary: tuple(name for name in vars(summary) if name != "read_summary"),
     },
     words=(b"{", b"}", b"[" * 5000, b"]", b'"a": ', b",", b"NaN", b"Infinity", b"1e999"),
     mutators=(matcher(rb"([\d.]+)", NUMBERS),),
