@@ -80,7 +80,8 @@ def make_scene(folder: Path, photos: int, *, distorted: bool) -> None:
 def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     """Takes as many steps as each line of stdin asks for; answers with what they cost, as JSON."""
     begun = monotonic()
-    from crossgrad_core.run.load_run import parsed, set_up
+    from crossgrad_core.run.load_run import set_up
+    from crossgrad_core.run.settings import parsed
     from crossgrad_core.scene.photo_check import check_photos, fits
     from crossgrad_core.training.loop import Prefetcher, timed_step
     from crossgrad_core.training.start import first_state, warm_up

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Scene
     from crossgrad_core.gradients.separate import DenseGradients as gathered  # noqa: N813
     from crossgrad_core.run.assemble import accepts, assemble
-    from crossgrad_core.run.decisions import DEFAULT_STEPS, edits_of, facts_of, table_of
+    from crossgrad_core.run.decisions import DEFAULT_STEPS, facts_of, table_of
     from crossgrad_core.run.load_run import opened as open_run
     from crossgrad_core.run.results.panels import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
@@ -125,7 +125,6 @@ __all__ = [
     "disk_errors",
     "disk_full",
     "drop_checksums",
-    "edits_of",
     "entries",
     "exit_code",
     "facts_of",
@@ -199,7 +198,6 @@ _LATE: Final = {
     "accepts": "run.assemble",
     "assemble": "run.assemble",
     "begin": "training.start:first_state",
-    "edits_of": "run.decisions",
     "facts_of": "run.decisions",
     "find_runs": "run.results.reading",
     "gathered": "gradients.separate:DenseGradients",
@@ -267,8 +265,7 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
         UserError: A setting does not exist or has a wrong value.
     """
     from crossgrad_core.run.app import with_defaults
-    from crossgrad_core.run.load_run import parsed
-    from crossgrad_core.run.settings import with_recipe
+    from crossgrad_core.run.settings import parsed, with_recipe
 
     return with_defaults(parsed(with_recipe(settings)))
 

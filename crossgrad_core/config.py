@@ -264,13 +264,10 @@ class RunConfig(BaseModel):
         f"Default: {defaults.RECIPE}.",
     )
     decided: dict[str, str] = Field({}, description="what the recipe decided -> why")
-    plan: Annotated[
-        Literal["auto", "turns", "off"], Flag("auto|turns|off", CONFIGURATION, common=True)
-    ] = Field(
-        "off",
-        description="auto: what the scene does not need is left out, on evidence that is shown; "
-        "turns: far views come first if drone and street meet, and nothing else is decided. "
-        "What is set here wins. Default: off.",
+    plan: Annotated[Literal["auto", "off"], Flag("auto|off", CONFIGURATION, common=True)] = Field(
+        "auto",
+        description="auto: leaves out what the scene does not need, on evidence that is shown; "
+        "what is set here wins. Default: auto.",
     )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",

@@ -20,7 +20,6 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.lines import short_lines
 from crossgrad_core.recipe.table import open_again
 from crossgrad_core.registry.entries import failed_plugin, notes_on
-from crossgrad_core.run.apply_plan import seconds_of
 from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.finish import (
     Ending,
@@ -31,10 +30,10 @@ from crossgrad_core.run.finish import (
     reason_of,
     resume_line,
 )
-from crossgrad_core.run.load_run import continued, parsed, set_up
+from crossgrad_core.run.load_run import continued, set_up
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import FILE as CONFIG
-from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config, write_plan
+from crossgrad_core.run.results.config_file import as_yaml, read_config, write_config
 from crossgrad_core.run.results.folder import (
     RUNS,
     SMALLEST_NEED,
@@ -56,7 +55,7 @@ from crossgrad_core.run.results.plugins_file import (
 from crossgrad_core.run.results.scene_file import write_scene
 from crossgrad_core.run.results.summary import final_table, summarised_step
 from crossgrad_core.run.session import CLOUD, Session, totals
-from crossgrad_core.run.settings import layered, with_recipe
+from crossgrad_core.run.settings import layered, parsed, with_recipe
 from crossgrad_core.run.unused_settings import (
     refuse_labels_for_nothing,
     refuse_settings_for_nothing,
@@ -109,7 +108,6 @@ def check_clock(config: RunConfig) -> None:
 #: seconds, and 100 views of each of its training photos, which more teach by heart
 #: (docs/few-photos.md).
 BUNDLED_SECONDS = 120.0
-BUNDLED_VIEWS = 2_400
 
 
 def bundled_scene() -> Path:
@@ -255,7 +253,6 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))
         write_config(folder, setup.config, setup.notes)
-        write_plan(folder, setup.plan)
         write_plugins(folder, packages_of(setup))
         write_scene(folder, fingerprint_of(setup.scene, cast("Path", setup.config.scene)))
         with resume_hint(resume_line(folder)):
@@ -281,7 +278,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
     refuse_settings_for_nothing(open_again(config), setup)
     known_starts(setup)
     check_largest_draw(setup)
-    return setup, load_seconds + seconds_of(setup.plan) + _decoded(setup, way)
+    return setup, load_seconds + _decoded(setup, way)
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
@@ -306,10 +303,7 @@ def with_defaults(config: RunConfig) -> RunConfig:
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
         if not given:
-            # A plan bounds the views of a photo by itself, and says so.
-            views = None if config.plan == "auto" else BUNDLED_VIEWS
-            length = {"seconds": BUNDLED_SECONDS, "max_views": views}
-            config = config.model_copy(update=length)
+            config = config.model_copy(update={"seconds": BUNDLED_SECONDS})
     return config
 
 

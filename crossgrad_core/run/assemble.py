@@ -28,7 +28,6 @@ from crossgrad_core.registry.entries import (
 )
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS
-from crossgrad_core.run.apply_plan import notes_of, planned
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.select import select
@@ -162,10 +161,6 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     for note in of_device:
         _LOG.info("%s", note)
     scene = replace(scene, notes=(*of_device, *scene.notes))
-    plan = None
-    if config.plan != "off":
-        config, plan = planned(config, scene)
-        scene = replace(scene, notes=(*scene.notes, *notes_of(plan)))
     config, decisions, decide = with_decisions(_with_first_degree(config), scene)
     selection, notes = select(config, scene, reader)
     observers = {
@@ -193,7 +188,6 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         device=choose_device(config.device),
         notes=tuple(notes),
         scaled_photos=_photos(config),
-        plan=plan,
         decisions=decisions,
         decide=decide,
     )

@@ -1,6 +1,9 @@
 """The facts that a recipe decides from, and the one call that makes the table of decisions."""
 
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from typing import Any, TypeAlias, cast
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.decision import Decide, Decision, Length, repeats
@@ -8,7 +11,7 @@ from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.recipe import Facts
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.contract.schedule import Counting
+from crossgrad_core.defaults import PLANNER
 from crossgrad_core.recipe.table import (
     applied,
     decide,
@@ -17,16 +20,21 @@ from crossgrad_core.recipe.table import (
     open_again,
     rows_of,
 )
-from crossgrad_core.registry.entries import load
+from crossgrad_core.registry.entries import find, load, resolve_entry
+from crossgrad_core.registry.slots import PLANNERS
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.select import chosen, fitted_backbone
+from crossgrad_core.run.settings import layered, parsed
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.run.usual_views import views_per_step_of
 from crossgrad_core.training.dropout import photos_per_point
 from crossgrad_core.training.numbers import Numbers
-from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import Setup
 
+_LOG = logging.getLogger(__name__)
+#: A planner: the configuration, with the settings of the user alone, and the scene -> the rows of
+#: the settings that the scene decides.
+Planner: TypeAlias = Callable[[RunConfig, Scene], Sequence[Decision]]
 #: Length of a run for which neither steps nor views nor seconds are set (3DGS).
 DEFAULT_STEPS = 30_000
 
@@ -75,21 +83,41 @@ def with_decisions(
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
     """Return the configuration with all settings decided, the table, and what makes it again.
 
+    With `--plan auto` the planner's rows about the scene come first, and count as given for the
+    recipe.
+
     Raises:
-        UserError: See `facts_of`; or the recipe leaves a setting open.
+        UserError: See `facts_of`; there is no planner, a photo cannot be decoded, or the recipe
+            leaves a setting open.
     """
     if config.seconds is not None:
         # The seconds are planned anew, and with them all that follows the length.
         config = open_again(config)
     if is_complete(config):
         return config, rows_of(config), repeats
+    of_scene: tuple[Decision, ...] = ()
+    if config.plan != "off":
+        _LOG.info("looking at what the scene needs")
+        planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
+        of_scene = tuple(planner(config, scene))
+        config = _planned(config, of_scene)
     facts = facts_of(config, scene)
     rows = decide(config, facts)
 
     def again(length: Length) -> tuple[Decision, ...]:
         return decide(config, replace(facts, **vars(length)))
 
-    return applied(config, rows), rows, again
+    return applied(config, rows), (*of_scene, *rows), again
+
+
+def _planned(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
+    """Return the configuration with the settings that the scene decides, and their reasons."""
+    settings: dict[str, Any] = {row.setting: row.value for row in rows}
+    if "max_views" in settings and config.seconds is not None:
+        # A layer with a length replaces the lengths of the layers before.
+        settings["seconds"] = config.seconds
+    planned = parsed(layered([config.model_dump(exclude_unset=True), settings]))
+    return planned.model_copy(update={"decided": {row.setting: row.because for row in rows}})
 
 
 def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[str, Decision]:
@@ -107,22 +135,6 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
     return {row.setting: row for row in rows}
 
 
-def edits_of(config: RunConfig, scene: Scene) -> int:
-    """Return the edits of density control in a run.
-
-    Raises:
-        UserError: See `with_decisions`.
-    """
-    config, _, _ = with_decisions(config, scene)
-    views, _ = views_per_step_of(config)
-    steps = config.steps if config.max_views is None else max(1, views.steps_of(config.max_views))
-    densifier = chosen(Densifier, config.densifier)
-    counting = Counting(
-        views=views, photos=len(scene.train_views), schedule_length=config.schedule_length
-    )
-    return schedule_of(config, densifier, steps or DEFAULT_STEPS, counting).edits()
-
-
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
     """Return the run with the numbers of the length that is planned now; components stay.
 
@@ -134,6 +146,6 @@ def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
     numbers = {each.name for each in fields(Numbers)}
     rows = {row.setting: row for row in setup.decide(Length(planned, planned, start))}
     table = {row.setting: row for row in setup.decisions}
-    table |= {name: row for name, row in rows.items() if name in numbers}
-    config = applied(setup.config, tuple(table.values()))
-    return replace(setup, config=config, decisions=tuple(table.values()))
+    changed = {name: row for name, row in rows.items() if name in numbers}
+    config = applied(setup.config, tuple(changed.values()))
+    return replace(setup, config=config, decisions=tuple((table | changed).values()))

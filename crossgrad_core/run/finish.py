@@ -277,7 +277,7 @@ def overdone(rows: Sequence[Row]) -> list[str]:
     return [
         f"the last evaluation is {gap:.2f} dB below that of step {step:.0f}, "
         f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
-        "may be enough (--max-views N, or --plan auto)"
+        "may be enough (--max-views N)"
     ]
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, cast
 
-from pydantic import ValidationError
-
 from crossgrad_core import defaults
 from crossgrad_core.config import CHANGEABLE, ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import AdamState, Json
@@ -19,7 +17,6 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.slots import LISTS
-from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.assemble import assemble, check_names, read_and_check, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import (
     CHECKPOINTS,
@@ -45,6 +42,7 @@ from crossgrad_core.run.results.plugins_file import (
 )
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
+from crossgrad_core.run.settings import parsed
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
@@ -335,23 +333,6 @@ _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
 
 
-def parsed(settings: Mapping[str, Any]) -> RunConfig:
-    """The validated configuration.
-
-    Raises:
-        UserError: A setting does not exist or has a wrong value.
-    """
-    try:
-        return RunConfig.model_validate(settings)
-    except ValidationError as error:
-        raise as_user_error(
-            error,
-            RunConfig,
-            subject="a run",
-            todo="docs/settings.md lists every setting, crossgrad run --help-all every option",
-        ) from error
-
-
 def set_up(
     config: RunConfig,
     verbosity: int,
@@ -359,7 +340,7 @@ def set_up(
     *,
     looks: bool = False,
 ) -> tuple[Setup, float]:
-    """The assembled run and the seconds that reading the scene took.
+    """The assembled run, and the seconds of reading the scene and of assembling.
 
     Args:
         config: The configuration, with a scene.
@@ -382,12 +363,12 @@ def set_up(
     )
     notes = () if check is None else check(fingerprint_of(scene, path))
     scene = replace(scene, notes=(*notes, *scene.notes))
-    seconds = perf_counter() - start
     level = {-1: "quiet", 0: "normal", 1: "verbose"}[verbosity]
     if not any(choice.name == PROGRESS for choice in config.observers):
         progress = ComponentChoice.model_validate({"name": PROGRESS, "level": level})
         config = config.model_copy(update={"observers": (*config.observers, progress)})
-    return assemble(config, scene, reader), seconds
+    setup = assemble(config, scene, reader)
+    return setup, perf_counter() - start
 
 
 def _refuse_lost_checkpoints(folder: Path) -> None:

@@ -13,7 +13,6 @@ from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.checkpoint.checkpoint import Keep, drop_later, latest, renew_scalars, save
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.load_run import to_checkpoint
-from crossgrad_core.run.results.config_file import read_plan
 from crossgrad_core.run.results.curve import draw_curve
 from crossgrad_core.run.results.kept import KEY as KEPT
 from crossgrad_core.run.results.kept import kept_files
@@ -199,7 +198,6 @@ class Session:
             notes=setup.notes,
             decisions=setup.decisions,
             check=setup.scene.check,
-            plan=read_plan(self.folder),
             error=error,
         )
         write_summary(self.folder, summary)

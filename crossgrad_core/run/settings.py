@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import yaml
+from pydantic import ValidationError
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.contract.component import Component
@@ -18,6 +19,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import without_decided
 from crossgrad_core.registry.entries import installed_as, load
 from crossgrad_core.registry.slots import GROUPS, LISTS
+from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.config_version import unmarked
 from crossgrad_core.run.options import OPTIONS
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
@@ -114,6 +116,23 @@ def with_recipe(settings: Mapping[str, Any]) -> Settings:
         return dict(settings)
     fixed = load(Recipe, choice["name"]).settings
     return layered([fixed, settings]) if fixed else dict(settings)
+
+
+def parsed(settings: Mapping[str, Any]) -> RunConfig:
+    """The validated configuration.
+
+    Raises:
+        UserError: A setting does not exist or has a wrong value.
+    """
+    try:
+        return RunConfig.model_validate(settings)
+    except ValidationError as error:
+        raise as_user_error(
+            error,
+            RunConfig,
+            subject="a run",
+            todo="docs/settings.md lists every setting, crossgrad run --help-all every option",
+        ) from error
 
 
 def _flat(layer: Mapping[str, object]) -> Settings:

@@ -12,7 +12,7 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.blocks import EMPTY_STATE, Block, Json
+from crossgrad_core.contract.blocks import EMPTY_STATE, Block
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.decision import FOLLOWING, Decide, Decision, Length, repeats
 from crossgrad_core.contract.densifier import Densifier
@@ -136,7 +136,6 @@ class Setup:
         notes: What was chosen or left out, and why.
         scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
         photos_ahead: The threads that decode photos beside the steps.
-        plan: What a planner decided and why, as plain data; None where nothing was.
         decisions: The table of decided settings.
         decide: Makes the table for another length; a run that repeats another one decides nothing.
         revised: The settings that the clock has changed with the length of the run.
@@ -154,7 +153,6 @@ class Setup:
     notes: tuple[str, ...]
     scaled_photos: ScaledPhotos | DevicePhotos
     photos_ahead: PhotosAhead = field(default_factory=PhotosAhead)
-    plan: Mapping[str, Json] | None = None
     decisions: tuple[Decision, ...] = ()
     decide: Decide = repeats
     revised: Mapping[str, Any] = field(default_factory=dict)

@@ -10,9 +10,8 @@ from crossgrad_core.cli.main import app
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.flags import HEADINGS
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.options import OPTIONS
-from crossgrad_core.run.settings import merged
+from crossgrad_core.run.settings import merged, parsed
 
 #: What is no setting: asked of one start of the command.
 OWN = {

@@ -7,8 +7,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import Observer
 from crossgrad_core.registry.entries import entries, load
 from crossgrad_core.registry.slots import GROUPS, LISTS
-from crossgrad_core.run.load_run import parsed
-from crossgrad_core.run.settings import merged
+from crossgrad_core.run.settings import merged, parsed
 from crossgrad_core.wording import singular
 
 CONFIG = """

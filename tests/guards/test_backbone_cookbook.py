@@ -49,6 +49,7 @@ def test_the_shown_backbone_trains(shown, monkeypatch):
     monkeypatch.setattr(selecting, "build", with_spheres)
     config = RunConfig(
         steps=60,
+        plan="off",
         backbone=ComponentChoice(name="spheres"),
         operator=ComponentChoice(name="pcgrad"),
         sampler=ComponentChoice(name="random"),

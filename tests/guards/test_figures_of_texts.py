@@ -8,7 +8,7 @@ import pytest
 from crossgrad_core.commands import configured
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
-from crossgrad_plugins.planner.groups import views_per_step
+from crossgrad_plugins.planner.grouping import views_per_step
 
 ROOT = Path(__file__).parents[2]
 PAPER, TWO_VIEWS = (

@@ -14,12 +14,12 @@ from crossgrad_core.run import app
 from crossgrad_core.run.app import check_clock
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.results import machine
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.machine import WORTH_A_CALIBRATION, Machine, calibrated
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.session import totals
+from crossgrad_core.run.settings import parsed
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import state as states
 from crossgrad_core.training.budget import Timed

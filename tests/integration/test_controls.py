@@ -13,7 +13,7 @@ from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.recipe.lines import short_lines
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import redecided
-from crossgrad_core.run.load_run import parsed
+from crossgrad_core.run.settings import parsed
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step

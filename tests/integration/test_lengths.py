@@ -10,13 +10,12 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.app import BUNDLED_SECONDS, BUNDLED_VIEWS
+from crossgrad_core.run.app import BUNDLED_SECONDS
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
-from crossgrad_core.run.load_run import parsed
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import read_config
-from crossgrad_core.run.settings import merged
+from crossgrad_core.run.settings import merged, parsed
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.budget import PrimitiveCounts, cost_ahead, cost_of_run, seconds_ahead
 from crossgrad_core.training.loop import timed_step
@@ -173,8 +172,7 @@ def test_a_run_has_one_length(lengths):
 @pytest.mark.parametrize(
     ("asked", "seconds", "views"),
     [
-        ({}, BUNDLED_SECONDS, BUNDLED_VIEWS),
-        ({"plan": "auto"}, BUNDLED_SECONDS, None),
+        ({}, BUNDLED_SECONDS, None),
         ({"seconds": 5.0}, 5.0, None),
         ({"max_views": 7}, None, 7),
     ],

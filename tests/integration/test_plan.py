@@ -1,4 +1,4 @@
-"""`crossgrad plan` and `--plan auto`: the table, and runs without what is left out."""
+"""`crossgrad plan` and the plan of a run: the table, and runs without what is left out."""
 
 import json
 import shlex
@@ -10,6 +10,7 @@ import pytest
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
+from crossgrad_core.run import decisions
 from crossgrad_core.run.app import BUNDLED_SECONDS
 from crossgrad_core.system.yaml_values import read_mapping
 
@@ -21,6 +22,12 @@ def scene(tmp_path_factory):
     return write_tiny_scene(tmp_path_factory.mktemp("scene"), views=8, points=120)
 
 
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """A scene without points, which the planner has points found for."""
+    return write_tiny_scene(tmp_path_factory.mktemp("bare"), views=8, points=0)
+
+
 def summary(folder):
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
@@ -30,10 +37,10 @@ def settings(folder):
 
 
 @pytest.fixture(scope="module")
-def trained(scene, tmp_path_factory):
-    """A planned run that stopped half-way and was gone on with."""
+def trained(bare, tmp_path_factory):
+    """A planned run that stopped half-way and was continued."""
     out = tmp_path_factory.mktemp("runs") / "planned"
-    assert ended("run", scene, *FEW, "--plan", "auto", "--stop-after", 2, "--out", out) == 0
+    assert ended("run", bare, *FEW, "--stop-after", 2, "--out", out) == 0
     assert ended("run", "--resume", out, "-q") == 0
     return out
 
@@ -54,8 +61,8 @@ def test_the_command_that_follows_has_what_was_asked_for(scene, tmp_path, capsys
     assert ended("plan", scene, *asked) == 0
     (way,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("run it")]
     command = shlex.split(way.removeprefix("run it: crossgrad run "))
-    assert command[:3] == [str(scene), "--plan", "auto"]
-    pairs = set(zip(command[3::2], command[4::2], strict=True))
+    assert command[0] == str(scene)
+    pairs = set(zip(command[1::2], command[2::2], strict=True))
     assert pairs == {(flag, str(each)) for flag, each in zip(asked[::2], asked[1::2], strict=True)}
 
 
@@ -77,13 +84,13 @@ def test_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
     capsys.readouterr()
     assert ended("plan", "--max-size", 64) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last == "run it: crossgrad run --plan auto --max-size 64"
+    assert last == "run it: crossgrad run --max-size 64"
 
 
-def test_json_has_every_figure(scene, capsys):
-    assert ended("plan", scene, "--json", "--steps", 4) == 0
+def test_json_has_every_figure(bare, capsys):
+    assert ended("plan", bare, "--json", "--steps", 4) == 0
     plan = json.loads(capsys.readouterr().out)
-    assert plan["settings"] == {"densifier": "none"}
+    assert plan["settings"] == {"initializer": "triangulated"}
     parts = {each["part"]: each for each in plan["decisions"]}
     assert set(parts["modes"]["figures"]) == {
         *("bimodality", "separability", "separability_of_even", "smaller_share"),
@@ -92,49 +99,44 @@ def test_json_has_every_figure(scene, capsys):
     assert all(each["rule"] and each["source"] for each in parts.values())
 
 
-def test_a_plan_that_is_written_down_is_a_run_s(scene, tmp_path, trained):
+def test_a_plan_that_is_written_down_is_a_run_s(bare, tmp_path, trained):
     file, out = tmp_path / "plan.yaml", tmp_path / "run"
-    assert ended("plan", scene, "--steps", 4, "--write", file) == 0
+    assert ended("plan", bare, "--steps", 4, "--write", file) == 0
     assert ended("run", "--config", file, *FEW[2:], "--out", out) == 0
-    known = settings(trained)
-    assert {name: value for name, value in settings(out).items() if name != "notes"} == {
-        name: value for name, value in known.items() if name != "notes"
-    } | {"stop_after": None}
+    assert (out / "point_cloud.ply").read_bytes() == (trained / "point_cloud.ply").read_bytes()
 
 
-def test_the_summary_tells_the_plan(trained):
-    plan = summary(trained)["plan"]
-    assert plan["settings"] == {"densifier": "none"}
-    assert plan["seconds"] >= sum(each["seconds"] for each in plan["decisions"]) - 0.1
-    assert [each for each in summary(trained)["notes"] if each.startswith("plan: densifier")]
+def test_the_summary_reports_the_decisions_about_the_scene(trained):
+    row = summary(trained)["decisions"][0]
+    assert (row["setting"], row["value"]) == ("initializer", "triangulated")
+    assert row["because"] == "the scene has no SfM points"
+    assert settings(trained)["decided"]["initializer"] == row["because"]
 
 
-def test_the_configuration_repeats_the_run_without_the_planner(trained, tmp_path):
+def test_the_configuration_repeats_the_run_without_the_planner(trained, tmp_path, monkeypatch):
     known, again = settings(trained), tmp_path / "again"
-    assert known["plan"] == "off"
-    assert known["densifier"] == {"name": "none"}
+    assert known["initializer"]["name"] == "triangulated"
+    monkeypatch.setattr(decisions, "find", None)
     file = trained / "config.yaml"
     assert ended("run", "--config", file, "--set", "stop_after=null", "-q", "--out", again) == 0
     assert (again / "point_cloud.ply").read_bytes() == (trained / "point_cloud.ply").read_bytes()
-    assert summary(again)["plan"] is None
-    assert not (again / "plan.json").exists()
 
 
-def test_what_the_user_set_wins(scene, tmp_path):
+def test_a_new_length_asks_the_planner_again(trained, tmp_path):
+    file, out = trained / "config.yaml", tmp_path / "run"
+    assert ended("run", "--config", file, "--steps", 2, "-q", "--out", out) == 0
+    assert settings(out)["decided"]["initializer"] == "the scene has no SfM points"
+
+
+def test_what_the_user_set_wins(bare, tmp_path):
     out = tmp_path / "run"
-    given = ("--densifier", "adc", "--exposure", "gain")
-    assert ended("run", scene, *FEW, "--plan", "auto", *given, "--out", out) == 0
-    assert settings(out)["densifier"]["name"] == "adc"
+    given = ("--init", "random", "--exposure", "gain")
+    assert ended("run", bare, *FEW, *given, "--out", out) == 0
     assert settings(out)["exposure"]["name"] == "gain"
-    plan = summary(out)["plan"]
-    basis = {each["part"]: each["basis"] for each in plan["decisions"]}
-    assert basis["densifier"] == basis["exposure"] == "given"
-    assert plan["settings"] == {}
+    assert settings(out)["decided"].keys().isdisjoint({"exposure", "data.init"})
 
 
-def test_a_scene_without_points_gets_some(scene, tmp_path, capsys):
-    bare = tmp_path / "bare"
-    write_tiny_scene(bare, views=8, points=0)
+def test_a_scene_without_points_gets_some(bare, capsys):
     assert ended("plan", bare) == 0
     assert "triangulated" in capsys.readouterr().out
 
@@ -142,7 +144,7 @@ def test_a_scene_without_points_gets_some(scene, tmp_path, capsys):
 def test_a_single_photo_trains(tmp_path):
     write_tiny_scene(tmp_path / "one", views=1, points=0)
     out = tmp_path / "run"
-    assert ended("run", tmp_path / "one", *FEW, "--plan", "auto", "--out", out) == 0
+    assert ended("run", tmp_path / "one", *FEW, "--out", out) == 0
     assert settings(out)["data"]["init"] == "random"
 
 
@@ -176,8 +178,7 @@ try:
 finally:
     print("\\n".join(sorted(name for name in sys.modules if name.startswith("crossgrad_"))))
 """
-#: What a run of one mode, even exposure and no room for edits does not need. The usual densifier
-#: is read nevertheless, because its schedule says that there is no room.
+#: Modules that a run of one mode and even exposure does not need.
 LEFT_OUT = (
     *("samplers.near_far", "groupings.radial", "groupings.footprint"),
     *("exposures.gain", "exposures.per_photo", "diagnostics", "planner.probe"),
@@ -186,14 +187,13 @@ LEFT_OUT = (
 
 def test_what_is_left_out_is_not_imported(scene, tmp_path):
     out = tmp_path / "run"
-    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--plan", "auto", "--out", out]
+    arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
     done = subprocess.run(
         list(map(str, arguments)), capture_output=True, text=True, check=False, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     loaded = done.stdout.splitlines()
     assert "crossgrad_plugins.planner.planner" in loaded
-    assert "crossgrad_plugins.densifiers.none" in loaded
     for name in LEFT_OUT:
         assert f"crossgrad_plugins.{name}" not in loaded
 
@@ -204,7 +204,7 @@ def test_bands_that_are_left_out_are_not_allocated(scene, tmp_path, monkeypatch)
     matte = measured.ViewDependence(500, -0.02, -0.03, -0.01)
     monkeypatch.setattr(measured, "view_dependence", lambda scene: matte)
     out = tmp_path / "run"
-    assert ended("run", scene, *FEW, "--plan", "auto", "--out", out) == 0
+    assert ended("run", scene, *FEW, "--out", out) == 0
     assert settings(out)["backbone"]["sh_degree"] == 0
     checkpoint = next(Path(out).glob("checkpoints/*"))
     names = b"".join(each.read_bytes()[:4096] for each in checkpoint.glob("*.safetensors"))

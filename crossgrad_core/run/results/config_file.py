@@ -1,21 +1,15 @@
 """config.yaml: the resolved configuration, which repeats the run."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.config_version import NOTES, marked, unmarked
 from crossgrad_core.system.files import text_bytes, write_atomically
-from crossgrad_core.system.text_files import read_json
 from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 from crossgrad_core.wording import listed
-
-if TYPE_CHECKING:
-    from crossgrad_core.contract.blocks import Json
-
 
 FILE = "config.yaml"
 #: Settings of every run.
@@ -69,29 +63,3 @@ def as_yaml(config: RunConfig) -> str:
 
 def _content(folder: Path) -> dict[str, Any]:
     return read_mapping(folder / FILE, "the configuration of the run", "start a new run")
-
-
-PLAN = "plan.json"
-
-
-def write_plan(folder: Path, plan: "Mapping[str, Json] | None") -> None:
-    """Writes plan.json, where there is a plan.
-
-    Raises:
-        UserError: The disk is full.
-    """
-    if plan is not None:
-        text = json.dumps(dict(plan), indent=2, ensure_ascii=False)
-        write_atomically(folder / PLAN, text_bytes(f"{text}\n"))
-
-
-def read_plan(folder: Path) -> "Mapping[str, Json] | None":
-    """The plan of a run; None where there is none, or where the file is damaged."""
-    path = folder / PLAN
-    if not path.is_file():
-        return None
-    try:
-        content = read_json(path)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None

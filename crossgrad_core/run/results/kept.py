@@ -8,7 +8,6 @@ from crossgrad_core.config import CHANGEABLE
 from crossgrad_core.contract.blocks import Json
 from crossgrad_core.run.config_version import NOTES
 from crossgrad_core.run.results.config_file import FILE as CONFIG
-from crossgrad_core.run.results.config_file import PLAN
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
@@ -23,14 +22,12 @@ _REVISED: Final = frozenset({"steps", "revisions"})
 
 def kept_files(folder: Path) -> dict[str, Json]:
     """Return the texts of the files that a checkpoint holds, as far as they are there."""
-    found = {name: _content(folder / name) for name in (CONFIG, METRICS, PLAN)}
+    found = {name: _content(folder / name) for name in (CONFIG, METRICS)}
     return {name: text.decode(errors="replace") for name, text in found.items() if text is not None}
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
-    """Bring metrics.csv and plan.json to what they were at a checkpoint.
-
-    Rows that were added to metrics.csv later are dropped.
+    """Bring metrics.csv to what it was at a checkpoint; rows that were added later are dropped.
 
     Args:
         folder: The run's folder.
@@ -38,22 +35,17 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
         step: Its step.
 
     Returns:
-        A note on each file that was damaged.
+        A note if the file was damaged.
     """
-    notes = []
-    texts = scalars.get(KEY) or {}
-    for name in (METRICS, PLAN):
-        if name not in texts:
-            continue  # There was none when the checkpoint was written.
-        content = texts[name].encode()
-        found = _content(folder / name)
-        if found == content:
-            continue
-        write_atomically(folder / name, content)
-        if found is None or name != METRICS or not found.startswith(content):
-            was = "was gone" if found is None else "was damaged"
-            notes.append(f"{name} {was}: it is restored as it was at step {step}")
-    return tuple(notes)
+    text = (scalars.get(KEY) or {}).get(METRICS)
+    found = _content(folder / METRICS)
+    if text is None or found == text.encode():
+        return ()  # There was no file when the checkpoint was written, or it is whole.
+    write_atomically(folder / METRICS, text.encode())
+    if found is not None and found.startswith(text.encode()):
+        return ()
+    was = "was gone" if found is None else "was damaged"
+    return (f"{METRICS} {was}: it is restored as it was at step {step}",)
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:

@@ -43,7 +43,6 @@ class Summary:
         notes: What was chosen or left out, and why.
         decisions: The table of decided settings.
         check: Figures of the check of the scene against itself; None without one.
-        plan: What a planner decided and on what evidence; None where nothing was.
         error: Why the run failed; None otherwise.
     """
 
@@ -59,7 +58,6 @@ class Summary:
     notes: Sequence[str] = ()
     decisions: Sequence[Decision] = ()
     check: "Mapping[str, Json] | None" = None
-    plan: "Mapping[str, Json] | None" = None
     error: str | None = None
 
 
@@ -126,7 +124,6 @@ def _as_data(summary: Summary) -> dict[str, Any]:
         "notes": list(summary.notes),
         "decisions": [asdict(row) for row in summary.decisions],
         "scene_check": None if summary.check is None else dict(summary.check),
-        "plan": None if summary.plan is None else dict(summary.plan),
         "definitions": _definitions(figures),
         "falling": [each.name for each in figures if each.falls],
         "environment": dict(summary.environment),

@@ -18,10 +18,10 @@ from crossgrad_core.commands import (
     read_scene,
     write_settings,
 )
-from crossgrad_plugins.planner.decision import Decision
 from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.finding import Finding
+from crossgrad_plugins.planner.length import length
 from crossgrad_plugins.planner.planner import Plan, plan_of
-from crossgrad_plugins.planner.sizes import length
 
 #: Below this width the cost and the option of a part stand below its evidence.
 _WIDE: Final = 110
@@ -34,8 +34,8 @@ _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 
 def lines_of(plan: Plan, width: int) -> Iterator[str]:
-    """The table, and what it means, in lines of at most `width` characters."""
-    rows = [_HEADER, *(map(_cells, plan.decisions))]
+    """Yield the table of findings, and the settings that change, in lines of `width` characters."""
+    rows = [_HEADER, *map(_cells, plan.findings)]
     for row in rows:
         yield from _wide(row, width) if width >= _WIDE else _narrow(row, width)
         if row is _HEADER or width < _WIDE:
@@ -43,14 +43,14 @@ def lines_of(plan: Plan, width: int) -> Iterator[str]:
     if width >= _WIDE:
         yield ""
     changed = [f"{name} = {value}" for name, value in plan.settings.items()]
-    told = f"changed: {', '.join(changed)}" if changed else "nothing is changed"
-    yield from wrap(f"{told}; default: the evidence is missing or undecided", width)
+    summary = f"changed: {', '.join(changed)}" if changed else "nothing is changed"
+    yield from wrap(f"{summary}; default: the evidence is missing or undecided", width)
     yield f"decided in {plan.seconds:.1f} s"
 
 
-def _cells(decision: Decision) -> tuple[str, ...]:
-    choice = f"{decision.choice}{_MARKS[decision.basis]}"
-    return (decision.part, choice, decision.evidence, decision.saved, decision.force)
+def _cells(finding: Finding) -> tuple[str, ...]:
+    choice = f"{finding.choice}{_MARKS[finding.basis]}"
+    return (finding.part, choice, finding.evidence, finding.saved, finding.force)
 
 
 def _wide(row: Sequence[str], width: int) -> Iterator[str]:
@@ -109,8 +109,7 @@ def plan(
     if write is not None:
         _check_free(write)
     settings = merged(file, options, assignments)
-    # Without a plan the bundled scene has a bound on its views, which is the plan's to decide.
-    config = configured({**settings, "plan": "auto"})
+    config = configured(settings)
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
@@ -134,14 +133,14 @@ def advised(scene: Path) -> tuple[str, str]:
     Raises:
         UserError: The scene cannot be read.
     """
-    config = configured({"scene": str(scene), "plan": "auto"})
+    config = configured({"scene": str(scene)})
     decision = length(Evidence(config, read_scene(config)[0]))
     return f"{decision.choice}, {decision.evidence}", _command(scene, {}, [])
 
 
 def _command(scene: Path | None, options: Mapping[str, object], assignments: Sequence[str]) -> str:
     """The command that trains a scene as planned; the bundled one where none is named."""
-    given = {"plan": "auto", **options, "scene": None}
+    given = {**options, "scene": None}
     words = ["crossgrad run"] if scene is None else ["crossgrad run", quote(str(scene))]
     words += [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
     words += [f"--set {quote(each)}" for each in assignments]

@@ -55,8 +55,8 @@ def plan(given: Options) -> None:
 
     Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
     stands in a table with the decision, the figure it rests on, what it saves, and the option that
-    overrules it. Where evidence is missing the default stays. `crossgrad run --plan auto` decides
-    likewise and trains; `--plan turns` only decides how often far and near views come.
+    overrules it. If evidence is missing, the default stays. `crossgrad run` decides likewise and
+    trains; with `--plan off` it does not. `crossgrad recipes show` lists what the recipe decides.
     """
     announce(quiet=given.as_json)
     from crossgrad_plugins.planner import app

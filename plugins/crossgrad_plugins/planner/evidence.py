@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from pydantic import BaseModel
-
 from crossgrad_core.commands import ComponentChoice, RunConfig, views_per_step_of
 from crossgrad_core.plugin import Backbone, Sampler, Scene, ViewsPerStepSpec, build_component
 from crossgrad_plugins.planner.modes import Modes, modes_of
@@ -34,7 +32,10 @@ class Evidence:
         Args:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
-        known = _set_in(self.config, "") | _set_in(self.config.data, "data.")
+        known = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
+        # A run writes down its defaults, too: in the group `data` these leave a setting open.
+        own, usual = self.config.data, type(self.config.data)()
+        known |= {f"data.{n}" for n in own.model_fields_set if getattr(own, n) != getattr(usual, n)}
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
         return not known.isdisjoint(names)
 
@@ -92,9 +93,3 @@ class Evidence:
     def scene_note(self, word: str) -> str | None:
         """What the reader noted with that word; None where it did not."""
         return next((note for note in self.scene.notes if word in note), None)
-
-
-def _set_in(model: BaseModel, prefix: str) -> set[str]:
-    """Names of the settings of a group that have a value of the user's."""
-    given = model.model_fields_set
-    return {f"{prefix}{name}" for name in given if getattr(model, name) is not None}

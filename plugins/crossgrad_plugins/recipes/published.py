@@ -35,6 +35,7 @@ VALUES: Final[Mapping[str, Any]] = {
 class Published(Recipe):
     """Order of a step, 3-sigma footprint, near plane, rates and schedule as published."""
 
+    settings: ClassVar[Mapping[str, Any]] = {"plan": "off"}
     rasterizer_options: ClassVar[frozenset[str]] = frozenset({"footprint"})
 
     @override

@@ -6,7 +6,7 @@ import pytest
 from crossgrad_core.commands import configured
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks.observations import Observations
-from crossgrad_plugins.planner import looks, view_dependence
+from crossgrad_plugins.planner import appearance, view_dependence
 from crossgrad_plugins.planner.evidence import Evidence
 
 RNG = np.random.default_rng(5)
@@ -41,7 +41,7 @@ def observed(scene, sheen, per_point=12, gains=None):
 
 def decided(scene, found, monkeypatch, **given):
     monkeypatch.setattr(view_dependence, "observations_of", lambda *_: found)
-    return looks.degree(Evidence(configured({"scene": "nowhere", **given}), scene))
+    return appearance.degree(Evidence(configured({"scene": "nowhere", **given}), scene))
 
 
 def test_leaving_one_out_is_what_it_is_called():
@@ -67,7 +67,7 @@ def test_matte_points_need_no_bands(monkeypatch):
     found = decided(scene, observed(scene, 0.0), monkeypatch)
     assert (found.choice, found.basis) == ("0", "decided")
     assert dict(found.settings) == {"backbone.sh_degree": 0}
-    assert found.figures["high"] < looks.LEAST_SHARE
+    assert found.figures["high"] < appearance.LEAST_SHARE
     assert found.saved == "45 of 59 numbers of a Gaussian"
 
 
@@ -113,7 +113,7 @@ def test_directions_of_a_narrow_cone_decide_nothing(monkeypatch):
 def test_the_whole_interval_decides(figures, choice, basis, monkeypatch):
     measured = view_dependence.ViewDependence(*figures)
     monkeypatch.setattr(view_dependence, "view_dependence", lambda scene: measured)
-    found = looks.degree(Evidence(configured({"scene": "nowhere"}), ring()))
+    found = appearance.degree(Evidence(configured({"scene": "nowhere"}), ring()))
     assert (found.choice, found.basis) == (choice, basis)
 
 

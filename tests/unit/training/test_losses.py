@@ -7,7 +7,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
-from crossgrad_core.run.load_run import parsed
+from crossgrad_core.run.settings import parsed
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss, ssim_map
 
 RNG = np.random.default_rng(0)

@@ -8,8 +8,7 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.registry import validation
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import settings
-from crossgrad_core.run.load_run import parsed
-from crossgrad_core.run.settings import layered, merged
+from crossgrad_core.run.settings import layered, merged, parsed
 from crossgrad_core.system import yaml_values
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml, write_yaml
 from crossgrad_fuzz.case import Case

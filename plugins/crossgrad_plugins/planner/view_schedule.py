@@ -1,4 +1,4 @@
-"""How often far and near views come, where far cameras look down and near ones to the side."""
+"""How often far and near views come if far cameras look down and near ones to the side."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -8,10 +8,10 @@ import numpy as np
 from crossgrad_core.commands import ComponentChoice, facts_of
 from crossgrad_core.plugin import REFERENCE, Grouping, Json, Scene, build_component
 from crossgrad_plugins.groupings.split import FAR
-from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
-from crossgrad_plugins.planner.groups import EVEN, pairs, settings_of
-from crossgrad_plugins.planner.sizes import most_views
+from crossgrad_plugins.planner.finding import Finding, given
+from crossgrad_plugins.planner.grouping import EVEN, pairs, settings_of
+from crossgrad_plugins.planner.length import most_views
 
 #: Far views to a near one in the first part of a run; what that part is, sampler `horizon` knows.
 FAR_TO_NEAR: Final = 5
@@ -50,9 +50,9 @@ def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
     return Directions(float(np.median(angles[far])), float(np.median(angles[~far])))
 
 
-def turns(evidence: Evidence) -> Decision:
+def view_schedule(evidence: Evidence) -> Finding:
     """Whether far views come more often than near ones at first."""
-    part, usual = "turns of views", evidence.config.sampler.name
+    part, usual = "view schedule", evidence.config.sampler.name
     if evidence.is_given("sampler", "grouping"):
         return given(part, usual, "--sampler NAME")
     rule = (
@@ -62,17 +62,17 @@ def turns(evidence: Evidence) -> Decision:
         f"fewer than {REFERENCE:,} views"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
-    plain = Decision(part, usual, "default", "", rule, source, "--sampler horizon")
+    plain = Finding(part, usual, "default", "", rule, source, "--sampler horizon")
     if not evidence.is_measured or evidence.is_given("operator", "views_per_step"):
         return plain.found("measured with recipe auto and single views only")
     if not _in_short_run(evidence):
         return plain.found("measured in shorter runs only")
     if not evidence.modes.two:
         return plain.found("no two modes", decided=evidence.modes.one)
-    return _turns_of_two_modes(evidence, plain)
+    return _schedule_of_two_modes(evidence, plain)
 
 
-def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
+def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     """Whether far views come more often, by where both look."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
@@ -91,13 +91,16 @@ def _turns_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     sampler: dict[str, Json] = {"sampler": "horizon", "sampler.coarse": [FAR_TO_NEAR, 1]}
     choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views to a near one at first"
     return made.changed(
-        choice, {**sampler, **settings_of(cut.grouping)}, f"--sampler {plain.choice}"
+        choice,
+        {**sampler, **settings_of(cut.grouping)},
+        "far views look one way, near views another",
+        f"--sampler {plain.choice}",
     )
 
 
 def _in_short_run(evidence: Evidence) -> bool:
-    """Whether the run is short, with the length that a plan of all parts gives it."""
+    """Whether the run is short, with the length that the plan gives it."""
     config = evidence.config
-    if config.plan == "auto" and config.steps is config.seconds is config.max_views is None:
+    if config.steps is config.seconds is config.max_views is None:
         config = config.model_copy(update={"max_views": most_views(evidence)})
     return facts_of(config, evidence.scene).short

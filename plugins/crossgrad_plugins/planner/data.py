@@ -4,8 +4,8 @@ import re
 from collections import Counter
 from typing import Final
 
-from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.finding import Finding, given
 
 #: A photo shares points with no other one.
 _ONE_PHOTO: Final = 1
@@ -13,7 +13,7 @@ _ONE_PHOTO: Final = 1
 _BLENDED: Final = re.compile(r"blended over RGB \(([\d.]+), ([\d.]+), ([\d.]+)\)")
 
 
-def start(evidence: Evidence) -> Decision:
+def start(evidence: Evidence) -> Finding:
     """Where training starts."""
     part, config = "initializer", evidence.config
     if evidence.is_given("initializer", "data.init"):
@@ -21,7 +21,7 @@ def start(evidence: Evidence) -> Decision:
         return given(part, chosen, "--initializer NAME or --init")
     points, views = len(evidence.scene.points), len(evidence.scene.train_views)
     figures = {"points": points, "views": views}
-    plain = Decision(
+    plain = Finding(
         part,
         "as a run starts",
         "default",
@@ -34,18 +34,25 @@ def start(evidence: Evidence) -> Decision:
         return plain.found(f"{points:,} SfM points", figures=figures)
     shown = plain.found(f"no SfM points, {views} training photos", figures=figures)
     if views > _ONE_PHOTO:
-        return shown.changed("triangulated", {"initializer": "triangulated"}, "--init random")
-    return shown.changed("random points", {"data.init": "random"}, "--init FILE.ply")
+        return shown.changed(
+            "triangulated",
+            {"initializer": "triangulated"},
+            "the scene has no SfM points",
+            "--init random",
+        )
+    return shown.changed(
+        "random points", {"data.init": "random"}, "a single photo, no SfM points", "--init FILE.ply"
+    )
 
 
-def held_out(evidence: Evidence) -> Decision:
+def held_out(evidence: Evidence) -> Finding:
     """Which photos are held out, and whether every regime has some."""
     part, scene = "held out", evidence.scene
     photos = Counter(view.regime for view in scene.test_views)
     chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
     if evidence.is_given("data.split", "data.test_every"):
         return given(part, chosen, "--split HOW")
-    plain = Decision(
+    plain = Finding(
         part,
         chosen,
         "default",
@@ -60,10 +67,10 @@ def held_out(evidence: Evidence) -> Decision:
     return plain.found(f"no figure tells how good {' and '.join(lacking)} gets: none is held out")
 
 
-def undistortion(evidence: Evidence) -> Decision:
+def undistortion(evidence: Evidence) -> Finding:
     """Whether photos are undistorted."""
     note = evidence.scene_note("undistorted")
-    plain = Decision(
+    plain = Finding(
         "undistortion",
         "photos are undistorted" if note else "none",
         "default",
@@ -77,13 +84,13 @@ def undistortion(evidence: Evidence) -> Decision:
     return plain.found("all cameras are pinholes", decided=True, saved="a resampling of each photo")
 
 
-def masks(evidence: Evidence) -> Decision:
+def masks(evidence: Evidence) -> Finding:
     """Whether pixels are masked."""
     part = "masks"
     if evidence.is_given("data.masks"):
         return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")
     note = evidence.scene_note("masks: ") or evidence.scene_note("does not count")
-    plain = Decision(
+    plain = Finding(
         part,
         "masked pixels do not count" if note else "none",
         "default",
@@ -97,12 +104,12 @@ def masks(evidence: Evidence) -> Decision:
     return plain.found("no photo has a mask", decided=True, saved="weights of pixels")
 
 
-def background(evidence: Evidence) -> Decision:
+def background(evidence: Evidence) -> Finding:
     """What is drawn behind the scene."""
     part, usual = "background", evidence.config.background
     if evidence.is_given("background"):
         return given(part, usual, "--background COLOR")
-    plain = Decision(
+    plain = Finding(
         part,
         usual,
         "default",
@@ -118,4 +125,7 @@ def background(evidence: Evidence) -> Decision:
     color = ",".join(f"{float(level):g}" for level in found.groups())
     name = {"0,0,0": "black", "1,1,1": "white"}.get(color, color)
     shown = plain.found(note.removeprefix("photos: "), decided=True)
-    return shown if name == usual else shown.changed(name, {"background": name}, "--background C")
+    if name == usual:
+        return shown
+    because = "transparent photos were blended over it"
+    return shown.changed(name, {"background": name}, because, "--background COLOR")

@@ -3,8 +3,8 @@
 from math import isnan
 from typing import Final
 
-from crossgrad_plugins.planner.decision import Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.finding import Finding, given
 
 #: Share of the variance of tracks that a view dependence worth its cost explains.
 LEAST_SHARE: Final = 0.02
@@ -14,7 +14,7 @@ _OTHER_NUMBERS: Final = 14
 ONE_SCALE: Final = 2.0
 
 
-def exposure(evidence: Evidence) -> Decision:
+def exposure(evidence: Evidence) -> Finding:
     """Whether photos get an exposure each."""
     part, config = "exposure", evidence.config
     if evidence.is_given("exposure", "exposure_from") or not evidence.is_measured:
@@ -32,7 +32,7 @@ def exposure(evidence: Evidence) -> Decision:
         f"{LEAST_REDUCTION:.0%} less deviation on"
     )
     source = "docs/exposure.md, six scenes"
-    plain = Decision(part, "none", "default", "", rule, source, "--exposure gain")
+    plain = Finding(part, "none", "default", "", rule, source, "--exposure gain")
     if not any(len(view.seen) for view in evidence.scene.train_views):
         return plain.found("no SfM tracks tell how bright photos are beside each other")
     gains = deciding_gains(evidence.scene)
@@ -54,10 +54,11 @@ def exposure(evidence: Evidence) -> Decision:
     )
     if not gains.differ:
         return shown
-    return shown.changed("gain", {"exposure": "gain"}, "--exposure none")
+    because = f"photos differ in brightness by {gains.spread:.2f} stops"
+    return shown.changed("gain", {"exposure": "gain"}, because, "--exposure none")
 
 
-def degree(evidence: Evidence) -> Decision:
+def degree(evidence: Evidence) -> Finding:
     """Up to which degree colours depend on the direction."""
     part, config = "SH degree", evidence.config
     name = config.backbone.name
@@ -69,7 +70,7 @@ def degree(evidence: Evidence) -> Decision:
     source = "ours: leave one out over the directions of a track, exposure taken out"
     force = "--set backbone.sh_degree=N"
     usual = "as the backbone has it" if evidence.degree is None else str(evidence.degree)
-    plain = Decision(part, usual, "default", "", rule, source, force)
+    plain = Finding(part, usual, "default", "", rule, source, force)
     if evidence.degree is None:
         return plain.found(f"backbone {name} has no degree to set")
     if evidence.degree == 0:
@@ -79,7 +80,7 @@ def degree(evidence: Evidence) -> Decision:
     return _of_tracks(evidence, plain)
 
 
-def _of_tracks(evidence: Evidence, plain: Decision) -> Decision:
+def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
     """The degree by the view dependence of the tracks."""
     from crossgrad_plugins.planner.view_dependence import (
         FEWEST_TRACKS,
@@ -105,17 +106,19 @@ def _of_tracks(evidence: Evidence, plain: Decision) -> Decision:
     bands = 3 * ((1 + (evidence.degree or 0)) ** 2 - 1)
     saved = f"{bands} of {_OTHER_NUMBERS + bands} numbers of a Gaussian"
     made = plain.found(shown, figures=figures)
-    return made.changed("0", {"backbone.sh_degree": 0}, "--set backbone.sh_degree=3", saved)
+    because = "colours do not depend on the direction"
+    force = f"--set backbone.sh_degree={evidence.degree}"
+    return made.changed("0", {"backbone.sh_degree": 0}, because, force, saved)
 
 
-def scale_filter(evidence: Evidence) -> Decision:
+def scale_filter(evidence: Evidence) -> Finding:
     """Whether Gaussians are filtered to the sampling of the photos."""
     part, name = "scale filter", evidence.config.backbone.name
     if evidence.is_given("backbone"):
         return given(part, f"as backbone {name} has it", "--backbone mip")
     spread = evidence.modes.spread
     rule = f"none where footprints range over less than {ONE_SCALE:g}"
-    plain = Decision(part, "none", "default", "", rule, "Mip-Splatting's zoom", "--backbone mip")
+    plain = Finding(part, "none", "default", "", rule, "Mip-Splatting's zoom", "--backbone mip")
     figures = {"range": spread}
     if spread < ONE_SCALE:
         return plain.found(

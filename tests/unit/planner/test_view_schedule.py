@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from crossgrad_core.commands import ComponentChoice, UserError, configured
-from crossgrad_core.run import apply_plan
+from crossgrad_core.run import decisions
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.posed import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.planner import plan_of
-from crossgrad_plugins.planner.turns import directions, turns
+from crossgrad_plugins.planner.view_schedule import directions, view_schedule
 
 RNG = np.random.default_rng(0)
 CLOUD = np.column_stack([RNG.uniform(0, 60, 400), RNG.uniform(0, 60, 400), RNG.uniform(0, 6, 400)])
@@ -43,7 +43,7 @@ def scene_of(low, height=2.0):
 
 
 def decision(scene, **given):
-    return turns(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
+    return view_schedule(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
 
 
 def test_far_views_come_first_where_near_ones_look_around():
@@ -69,20 +69,21 @@ def test_what_is_decided_is_a_run_that_draws_so():
     "length", [{"steps": 100}, {"seconds": 5.0}, {"max_views": 100}, {"steps": 29_999}], ids=str
 )
 def test_a_short_run_with_this_plan_draws_so(length):
-    asked = configured({"scene": "x", "plan": "turns", **length})
-    run = assemble(asked, scene_of(AROUND), "colmap")
+    run = assemble(configured({"scene": "x", **length}), scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "horizon"
     assert run.selection.names["grouping"] == run.config.grouping.name
-    assert (run.sampler.coarse, run.config.plan) == ((5, 1), "off")
-    assert [each["part"] for each in run.plan["decisions"]] == ["turns of views"]
-    assert any("--sampler epoch overrules it" in note for note in run.notes)
+    assert run.sampler.coarse == (5, 1)
+    row = next(row for row in run.decisions if row.setting == "sampler")
+    assert (row.value, row.override) == ("horizon", "--sampler epoch")
+    assert run.config.decided["sampler"] == row.because
 
 
 @pytest.mark.parametrize("given", [{"steps": 100}, {"seconds": 5.0}, {"steps": 30_000}], ids=str)
 def test_runs_without_a_plan_draw_epochs(given):
-    run = assemble(configured({"scene": "x", **given}), scene_of(AROUND), "colmap")
-    assert (run.selection.names["sampler"], run.plan) == ("epoch", None)
-    assert not [note for note in run.notes if note.startswith("plan:")]
+    asked = configured({"scene": "x", "plan": "off", **given})
+    run = assemble(asked, scene_of(AROUND), "colmap")
+    assert run.selection.names["sampler"] == "epoch"
+    assert "sampler" not in run.config.decided
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_runs_without_a_plan_draw_epochs(given):
     ids=str,
 )
 def test_what_the_user_set_draws_epochs_with_this_plan(given):
-    asked = configured({"scene": "x", "plan": "turns", **given})
+    asked = configured({"scene": "x", **given})
     run = assemble(asked, scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "epoch"
 
@@ -108,26 +109,25 @@ def missing(*_arguments):
     ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
 )
 def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeypatch):
-    monkeypatch.setattr(apply_plan, name, value)
-    assemble(configured({"scene": "x", "steps": 100}), scene_of(AROUND), "colmap")
-    asked = configured({"scene": "x", "steps": 100, "plan": "turns"})
+    monkeypatch.setattr(decisions, name, value)
+    off = configured({"scene": "x", "steps": 100, "plan": "off"})
+    assemble(off, scene_of(AROUND), "colmap")
+    asked = configured({"scene": "x", "steps": 100})
     with pytest.raises((RuntimeError, UserError)):
         assemble(asked, scene_of(AROUND), "colmap")
 
 
-def test_a_plan_that_was_asked_for_is_told_where_it_changes_nothing():
-    asked = configured({"scene": "x", "steps": 30_000, "plan": "turns"})
-    run = assemble(asked, scene_of(AROUND), "colmap")
-    assert run.selection.names["sampler"] == "epoch"
-    (found,) = run.plan["decisions"]
-    assert found["evidence"] == "measured in shorter runs only"
+def test_views_of_long_runs_come_alike():
+    found = decision(scene_of(AROUND), steps=30_000)
+    assert (found.choice, found.settings) == ("epoch", {})
+    assert found.evidence == "measured in shorter runs only"
 
 
 @pytest.mark.parametrize(("photos", "short"), [(100, True), (400, False)])
 def test_a_whole_plan_of_many_photos_is_no_short_run(photos, short):
     views = scene_of(AROUND).views
     scene = posed_scene([replace(views[i % 24], name=f"{i}.png") for i in range(photos)], CLOUD)
-    found = turns(Evidence(configured({"scene": "x", "plan": "auto"}), scene))
+    found = view_schedule(Evidence(configured({"scene": "x"}), scene))
     assert bool(found.settings) == short
 
 

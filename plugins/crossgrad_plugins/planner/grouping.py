@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 from crossgrad_core.commands import ComponentChoice
 from crossgrad_core.plugin import ViewsPerStepSpec
-from crossgrad_plugins.planner.decision import NOTHING, Decision, given
 from crossgrad_plugins.planner.evidence import Evidence
+from crossgrad_plugins.planner.finding import NOTHING, Finding, given
 from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ONE_OF, Modes
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _TWO_AGAINST_ONE: Final = (
 _NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
 
 
-def modes(evidence: Evidence) -> Decision:
+def modes(evidence: Evidence) -> Finding:
     """How many modes the distances of the cameras have."""
     found = evidence.modes
     rule = (
@@ -44,7 +44,7 @@ def modes(evidence: Evidence) -> Decision:
         f"one distance: range (95th / 5th percentile) < {LEAST_RATIO}"
     )
     source = "ours; Otsu 1979. Sarle's coefficient, the paper's, calls lopsided distances two modes"
-    plain = Decision("modes", _name(found), "default", "", rule, source, "--grouping NAME")
+    plain = Finding("modes", _name(found), "default", "", rule, source, "--grouping NAME")
     figures = {
         "bimodality": found.bimodality,
         "separability": found.cut.separability,
@@ -58,7 +58,7 @@ def modes(evidence: Evidence) -> Decision:
     return plain.found(evidence_text, decided=found.two or found.one, figures=figures)
 
 
-def pairs(evidence: Evidence) -> Decision:
+def pairs(evidence: Evidence) -> Finding:
     """Whether steps draw pairs of near and far views."""
     config, found = evidence.config, evidence.modes
     part, usual = "pairs of views", config.sampler.name
@@ -68,7 +68,7 @@ def pairs(evidence: Evidence) -> Decision:
         f"two modes, {EVEN:.0%} of the views or more in each, and sigma_b^2 / sigma_w^2 >= "
         f"{LEAST_RHO} with its whole interval"
     )
-    plain = Decision(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
+    plain = Finding(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
     if found.one:
         return plain.found("one mode: no near and far", decided=True, saved="groups of views")
     if not found.two:
@@ -76,7 +76,7 @@ def pairs(evidence: Evidence) -> Decision:
     return _pairs_of_two_modes(evidence, plain)
 
 
-def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
+def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     """Whether pairs pay, by the probe."""
     probe = evidence.probe
     if probe is None:
@@ -102,6 +102,7 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Decision) -> Decision:
     return plain.found(shown, figures=figures).changed(
         f"near-far by {grouping.name}",
         {"sampler": "near-far", **settings_of(grouping)},
+        "gradients of near and far views differ",
         f"--sampler {plain.choice}",
         f"{probe.rho / (1.0 + probe.rho):.0%} of a step's gradient variance",
     )
@@ -137,14 +138,14 @@ def _without_interval(probe: "Probe") -> str:
     return "no variance"
 
 
-def views_per_step(evidence: Evidence) -> Decision:
+def views_per_step(evidence: Evidence) -> Finding:
     """How many views a step has."""
     part = "views per step"
     if evidence.is_given("views_per_step"):
         return given(part, evidence.config.views_per_step, "--views K")
     rule = "1, unless pairs are drawn: a second view of a step costs what a further step does"
     usual = str(max(evidence.view_plan.counts))
-    plain = Decision(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
+    plain = Finding(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
     if "sampler" in pairs(evidence).settings:
         return replace(plain, choice="2").found("a step has a near and a far view", decided=True)
     if evidence.is_given("sampler", "operator", "batch_rule", "densify_views", "backward"):
@@ -162,7 +163,7 @@ def views_per_step(evidence: Evidence) -> Decision:
     return plain.found(shown, decided=True, saved=saved, figures=figures)
 
 
-def operator(evidence: Evidence) -> Decision:
+def operator(evidence: Evidence) -> Finding:
     """Whether the views' gradients are kept apart, and how they are combined."""
     part = "operator"
     usual = "+".join(link.name for link in evidence.config.operators)
@@ -170,7 +171,7 @@ def operator(evidence: Evidence) -> Decision:
         return given(part, usual, "--operator NAME")
     rule = f"projects where pairs are drawn and conflict exceeds {CHANCE:.0%} with its interval"
     source = "paper; half of random directions conflict"
-    plain = Decision(part, usual, "default", "", rule, source, "--operator NAME")
+    plain = Finding(part, usual, "default", "", rule, source, "--operator NAME")
     apart = "gradients of each view kept apart"
     joint = evidence.config.backward == "joint"
     if joint or evidence.modes.one:
@@ -185,7 +186,12 @@ def operator(evidence: Evidence) -> Decision:
     shown = f"{probe.conflict:.0%} of near-far pairs conflict, at least {probe.conflict_low:.0%}"
     if probe.conflict_low > CHANCE and _draws_pairs(evidence):
         made = plain.found(shown, figures=figures)
-        return made.changed("symmetric", {"operator": "symmetric"}, f"--operator {usual}")
+        return made.changed(
+            "symmetric",
+            {"operator": "symmetric"},
+            "gradients of near and far views conflict",
+            f"--operator {usual}",
+        )
     return plain.found(shown, decided=True, saved=apart, figures=figures)
 
 
