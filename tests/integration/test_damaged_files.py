@@ -43,7 +43,7 @@ def stopped(scene, tmp_path_factory):
     """A run that stopped between two of its evaluations."""
     out = tmp_path_factory.mktemp("stopped") / "run"
     options = ("--steps", 8, "--stop-after", 5, "--eval-every", 3, "--save-every", 2)
-    settings = ("--threads", 1, "--plan", "turns", "-q")
+    settings = ("--threads", 1, "-q")
     assert ended("run", scene, "--out", out, *options, *settings) == 0
     return out
 

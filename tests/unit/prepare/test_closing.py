@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from support.commands import ended
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.commands import configured, merged
 from crossgrad_core.run.app import bundled_scene
 from crossgrad_plugins.prepare import app
 from crossgrad_plugins.prepare.app import draw
@@ -27,8 +26,7 @@ def test_the_last_line_is_the_command_that_the_planner_advises(tmp_path, monkeyp
     (advised,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("run it: ")]
     assert last.removeprefix("next: ") == advised.removeprefix("run it: ")
     words = shlex.split(last.removeprefix("next: crossgrad run "))
-    assert words == [str(scene), "--plan", "auto"]
-    assert configured(merged(None, {"scene": words[0], "plan": words[2]}, [])).plan == "auto"
+    assert words == [str(scene)]
 
 
 @pytest.mark.parametrize(("georef", "known"), [(None, False), ({}, True)])
