@@ -60,7 +60,13 @@ from crossgrad_core.contract.gramian_operator import (
     diagonals,
     transformed,
 )
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
+from crossgrad_core.contract.grouping import (
+    GradientProbe,
+    Grouping,
+    GroupingRule,
+    Quantity,
+    Regrouping,
+)
 from crossgrad_core.contract.initializer import Initializer, MorePoints
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.markers import hookimpl
@@ -163,6 +169,7 @@ __all__ = [
     "GramianOperator",
     "Granularity",
     "Grouping",
+    "GroupingRule",
     "HasUnusedOptions",
     "IncompatibleSelectionError",
     "Initializer",
@@ -200,7 +207,6 @@ __all__ = [
     "Response",
     "Rounding",
     "Rows",
-    "Rule",
     "RunInfo",
     "SampleContext",
     "SampleResult",

@@ -36,7 +36,7 @@ from crossgrad_core.contract.contexts import (
     ViewSample,
 )
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.grouping import Regrouping, Rule
+from crossgrad_core.contract.grouping import GroupingRule, Regrouping
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.finite import is_finite
@@ -107,7 +107,7 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
         setup.hook.crossgrad_log(text=f"step {state.step}: {note}")
 
 
-def labels_of(rule: Rule, scene: Scene, name: str) -> tuple[str, ...]:
+def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
     """The labels of the training views by the rule of the grouping of that name, one for each."""
     labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
     if len(labels) == len(views):
