@@ -36,6 +36,7 @@ class Evidence:
         """
         known = _set_in(self.config, "") | _set_in(self.config.data, "data.")
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
+        known |= {f"rules.{name}" for name in self.config.rules}
         return not known.isdisjoint(names)
 
     @cached_property

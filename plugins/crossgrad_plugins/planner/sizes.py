@@ -172,18 +172,24 @@ def _steps(evidence: Evidence) -> int | None:
 def dropout(evidence: Evidence) -> Decision:
     """Whether training views are drawn without a share of the Gaussians."""
     part, config = "dropout", evidence.config
-    if evidence.is_given("dropout"):
-        return given(part, config.dropout or "none", "--dropout SHARE")
+    force = "--rule dropout, --no-rule dropout"
+    if evidence.is_given("rules.dropout"):
+        return given(part, _share(config.rules["dropout"]), force)
     rule = "some where a point lies in at most 5 photos; where more show it, no gain was measured"
     photos = photos_per_point(evidence.scene)
-    share = table_of(evidence.config, evidence.scene)["dropout"].value
-    choice = f"{share:g}" if share else "none"
-    plain = Decision(part, choice, "default", "", rule, _FEW, "--dropout SHARE")
+    row = table_of(evidence.config, evidence.scene).get("rules.dropout")
+    share = row is not None and row.value
+    plain = Decision(part, _share(share), "default", "", rule, _FEW, force)
     if not photos:
         return plain.found("no SfM points tell how many photos show the same")
     shown = f"a point lies in {photos:g} of {len(evidence.scene.train_views)} photos (median)"
     saved = NOTHING if share else "a random number for each Gaussian of a view"
     return plain.found(shown, decided=True, saved=saved, figures={"photos_of_a_point": photos})
+
+
+def _share(options: object) -> str:
+    """The share of a rule's options, in words."""
+    return f"{options.get('share', 'usual')}" if isinstance(options, dict) else "none"
 
 
 #: Settings that only make sense with density control.

@@ -554,7 +554,10 @@ def test_dropout_where_few_photos_show_a_point(photos, choice):
     assert (found.choice, found.basis, found.settings) == (choice, "decided", {})
     assert found.figures == {"photos_of_a_point": photos}
     assert plan_for(orbit(photos), recipe={"name": "auto"}).of_part("dropout").choice == choice
-    assert plan_for(orbit(photos), dropout=0.2).of_part("dropout").basis == "given"
+    assert (
+        plan_for(orbit(photos), rules={"dropout": {"share": 0.2}}).of_part("dropout").basis
+        == "given"
+    )
     assert plan_for(orbit(photos), recipe={"name": "published"}).of_part("dropout").choice == "none"
 
 
