@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.contexts import Answer, DensifyResult, StepContext
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Scene, View
-from crossgrad_core.contract.selection import Selection
 
 
 class Rule(Component):
@@ -26,7 +26,7 @@ class Rule(Component):
     slot: ClassVar[str] = "rules"
     copies: ClassVar[int] = 0
 
-    def unused(self, selection: Selection, scene: Scene) -> str:
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
         """Return why the rule would change nothing in this run; empty if it would change something.
 
         A new run is refused if the user asks for a rule that would change nothing.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
@@ -16,11 +16,9 @@ from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.rule import Rule
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.schedule import ViewsPerStepSpec
-
-if TYPE_CHECKING:
-    from crossgrad_core.contract.rule import Rule
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ class Selection:
     grouping: Grouping | None = None
     labels: tuple[str, ...] | None = None
     view_plan: ViewsPerStepSpec | None = None
-    rules: "Mapping[str, Rule]" = field(default_factory=dict)
+    rules: Mapping[str, Rule] = field(default_factory=dict)
 
     @property
     def views(self) -> ViewsPerStepSpec:

@@ -218,7 +218,7 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
 
 def _of_rules(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     for name, rule in rules_of(config).items():
-        if why := rule.unused(setup.selection, setup.scene):
+        if why := rule.unused(setup.backbone, setup.scene):
             yield f"rules.{name}", why
 
 

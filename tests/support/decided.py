@@ -57,7 +57,7 @@ EXTRAS: tuple[Mapping[str, Any], ...] = (
     {"batch_rule": "sqrt"},
     {"max_gaussians": 50_000},
     {"growth": "unbounded"},
-    {"rules": {"sh-interval": {"every": 2}}},
+    {"rules": {"sparse-sh": {"every": 2}}},
 )
 DEVICES = ("cpu", "cuda")
 #: Primitives at the start, for the budget.

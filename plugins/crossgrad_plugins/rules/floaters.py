@@ -14,13 +14,13 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import (
+    Backbone,
     Edit,
     Field,
     FinalEdit,
     Model,
     Rule,
     Scene,
-    Selection,
     View,
     apply_to_parameters,
     hookimpl,
@@ -55,9 +55,9 @@ class Floaters(Rule):
         return FinalEdit(Edit(kept.nonzero().squeeze(1)), removed(len(rows)))
 
     @override
-    def unused(self, selection: Selection, scene: Scene) -> str:
-        if not selection.backbone.positions:
-            return f"backbone {selection.names['backbone']} names no positions"
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
+        if not backbone.positions:
+            return "the backbone names no positions"
         if not cameras_that_tell(scene):
             return "no photo observes enough points to say what around it is empty"
         return ""

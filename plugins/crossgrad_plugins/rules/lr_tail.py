@@ -6,7 +6,7 @@ the end of a run. Fading rates end that (docs/steady-ends.md).
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Field, LearningRate, Rule, Scene, Schedule, Selection, hookimpl
+from crossgrad_core.plugin import Backbone, Field, LearningRate, Rule, Scene, Schedule, hookimpl
 
 
 class LrTail(Rule):
@@ -29,7 +29,6 @@ class LrTail(Rule):
         return float(self.factor ** ((step - start) / (total - start)))
 
     @override
-    def unused(self, selection: Selection, scene: Scene) -> str:
-        if all(block.lr.decays for block in selection.backbone.trained_blocks()):
-            return f"backbone {selection.names['backbone']} has no constant rates"
-        return ""
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
+        constant = any(not block.lr.decays for block in backbone.trained_blocks())
+        return "" if constant else "the backbone has no constant rates"

@@ -17,13 +17,13 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import (
     AfterStepContext,
+    Backbone,
     DensifyResult,
     Edit,
     Field,
     Rows,
     Rule,
     Scene,
-    Selection,
     hookimpl,
     is_in_image,
 )
@@ -68,10 +68,9 @@ class ScaleClamp(Rule):
         return DensifyResult(Edit(values={names[1]: bounded}))
 
     @override
-    def unused(self, selection: Selection, scene: Scene) -> str:
-        if selection.backbone.learns_scales:
-            return ""
-        return f"backbone {selection.names['backbone']} has no Gaussians with axes that learn"
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
+        learns = backbone.learns_scales
+        return "" if learns else "the backbone has no Gaussians with axes that learn"
 
 
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:

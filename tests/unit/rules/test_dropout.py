@@ -120,7 +120,7 @@ def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share)
 
 
 def test_what_is_said_of_the_default_is_the_default():
-    said = (Path(__file__).parents[3] / "docs" / "settings.md").read_text(encoding="utf-8")
+    said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
     row = next(line for line in said.splitlines() if line.startswith("| `rules.dropout`"))
     assert f"{DROPOUT}" in row and f"{FEW_PHOTOS} training photos" in row
 

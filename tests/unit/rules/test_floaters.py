@@ -253,7 +253,7 @@ def test_the_default_and_what_is_said_of_it(given, what):
 def test_only_none_keeps_its_set():
     never = {n for n in entries("densifiers") if not build(Densifier, n, {}).edits}
     assert never == {"none"}
-    said = (Path(__file__).parents[3] / "docs" / "settings.md").read_text(encoding="utf-8")
+    said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
     row = next(line for line in said.splitlines() if line.startswith("| `rules.floaters`"))
     assert "none" in row
 

@@ -298,7 +298,7 @@ def everything(state):
 
 
 #: SH bands above the first learn in one of three steps.
-THIRD = {"rules": {"sh-interval": {"every": 3}}}
+THIRD = {"rules": {"sparse-sh": {"every": 3}}}
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.start import first_state
 
 #: SH bands above the first learn in one of two steps.
-SECOND = {"sh-interval": {"every": 2}}
+SECOND = {"sparse-sh": {"every": 2}}
 IDLE = [
     (
         {"operator": {"name": "chain", "links": ["mean"], "granularity": "kind"}},
@@ -84,8 +84,8 @@ IDLE = [
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "adc", "prune_scale": 0.3}}, "densifier.prune_scale"),
     ({"densifier": {"name": "dc4gs", "reset_opacity": 0.3}}, "densifier.reset_opacity"),
-    ({"backbone": {"name": "scaffold"}, "rules": SECOND}, "rules.sh-interval"),
-    ({"backbone": {"name": "vanilla", "sh_degree": 0}, "rules": SECOND}, "rules.sh-interval"),
+    ({"backbone": {"name": "scaffold"}, "rules": SECOND}, "rules.sparse-sh"),
+    ({"backbone": {"name": "vanilla", "sh_degree": 0}, "rules": SECOND}, "rules.sparse-sh"),
     (
         {"densifier": {"name": "absgrad", "criterion": "gsplat", "abs_threshold": 1e-3}},
         "densifier.abs_threshold",
@@ -156,7 +156,7 @@ AT_WORK = [
     {"densifier": {"name": "none"}, "max_gaussians": 10},
     {"densifier": {"name": "adc", "prune_scale": 0.3}, "reset_every": 10},
     {"backbone": {"name": "vanilla", "sh_degree": 1}, "rules": SECOND},
-    {"backbone": {"name": "scaffold"}, "rules": {"sh-interval": False}},
+    {"backbone": {"name": "scaffold"}, "rules": {"sparse-sh": False}},
     {"max_gaussians": "auto", "growth": "budget"},
     {"densifier": {"name": "adc"}, "growth": "budget"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},

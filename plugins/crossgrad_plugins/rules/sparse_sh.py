@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 from typing_extensions import override
 
-from crossgrad_core.plugin import Block, Field, Rule, Scene, Selection, hookimpl
+from crossgrad_core.plugin import Backbone, Block, Field, Rule, Scene, hookimpl
 
 
-class ShInterval(Rule):
+class SparseSh(Rule):
     """Lets SH bands above the first learn in one of several steps."""
 
     every: int = Field(2, ge=2, le=100, description="SH bands learn in one of so many steps")
@@ -18,7 +18,6 @@ class ShInterval(Rule):
         return {name: self.every for block in blocks if block.rests for name in block.tensors}
 
     @override
-    def unused(self, selection: Selection, scene: Scene) -> str:
-        if any(block.rests for block in selection.backbone.trained_blocks()):
-            return ""
-        return f"backbone {selection.names['backbone']} trains no SH bands above the first"
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
+        banded = any(block.rests for block in backbone.trained_blocks())
+        return "" if banded else "the backbone trains no SH bands above the first"

@@ -1,4 +1,4 @@
-"""Tensors that learn in some steps only: the rule `sh-interval`."""
+"""Tensors that learn in some steps only: the rule `sparse-sh`."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -22,7 +22,7 @@ from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.numba_kernels import frame
 
 STEPS, EVERY = 12, 3
-RULES = {"sh-interval": {"every": EVERY}}
+RULES = {"sparse-sh": {"every": EVERY}}
 
 
 class Decay:
@@ -132,8 +132,8 @@ def test_views_that_are_drawn_together_give_the_same_parameters():
 
 
 def test_a_run_writes_down_in_which_steps_its_bands_learn():
-    assert resolved(setup_of(rules=RULES)).rules["sh-interval"] == {"every": EVERY}
-    assert "sh-interval" not in resolved(setup_of()).rules
+    assert resolved(setup_of(rules=RULES)).rules["sparse-sh"] == {"every": EVERY}
+    assert "sparse-sh" not in resolved(setup_of()).rules
 
 
 def test_without_the_rule_all_learn_in_every_step_at_their_own_rate():
