@@ -1,6 +1,6 @@
 """Held-out photos of finished runs with their floaters and without: a table.
 
-    crossgrad run SCENE --seconds 600 --floaters keep --out RUN
+    crossgrad run SCENE --seconds 600 --no-rule floaters --out RUN
     python benchmarks/floaters.py RUN ...
 
 A run that removed its floaters has none left. Nothing is written to the runs.
@@ -17,11 +17,11 @@ from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
 from crossgrad_core.run.export import renderer
 from crossgrad_core.run.load_run import opened
-from crossgrad_core.training.averaging import eval_parameters
-from crossgrad_core.training.floaters import EMPTY, in_empty_space, rows_without_floaters
+from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
-from crossgrad_core.training.step import keep
+from crossgrad_core.training.step import final_edits
+from crossgrad_plugins.rules.floaters import Floaters, in_empty_space
 
 _METRICS = ("psnr", "psnr_cc")
 #: Changes of a photo below it are not shown, dB.
@@ -41,15 +41,15 @@ def measured(setup: Setup, state: TrainState) -> EvaluationResult:
 def row(folder: Path, empty: float) -> Sequence[str]:
     """A run's line: what was removed, how long that took, and what it did to held-out photos."""
     setup, state = opened(folder, {})
+    setup = setup.with_rules({"floaters": Floaters.model_construct(empty=empty)})
     primitives = state.primitives(setup)
-    positions = eval_parameters(state)[setup.backbone.positions].detach().double().cpu().numpy()
-    near = int(in_empty_space(positions, setup.scene, empty).sum())
-    before = measured(setup, state)
-    rows_without_floaters(setup, state, empty)  # Compiles what is to be timed.
+    positions = (
+        eval_parameters(setup, state)[setup.backbone.positions].detach().double().cpu().numpy()
+    )
+    near = int(in_empty_space(positions.double().cpu().numpy(), setup.scene, empty).sum())
+    before = measured(setup, state)  # Compiles what is to be timed.
     start = perf_counter()
-    rows = rows_without_floaters(setup, state, empty)
-    if rows is not None:
-        keep(setup, state, rows)
+    list(final_edits(setup, state))
     seconds = perf_counter() - start
     after = measured(setup, state)
     pairs = zip(before.views, after.views, strict=True)
@@ -72,7 +72,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument(
-        "--empty", type=float, default=EMPTY, metavar="SHARE",
+        "--empty", type=float, default=Floaters().empty, metavar="SHARE",
         help="of the way to the nearest point that a camera sees; 1e9: everywhere",
     )  # fmt: skip
     arguments = parser.parse_args()

@@ -218,7 +218,7 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "unbounded",
             "schedule_unit": "steps",
-            "dropout": 0.0,  # Each photo sees all that is in front of it.
+            "rules": {"dropout": False},  # Each photo sees all that is in front of it.
             **options,
         }
     )

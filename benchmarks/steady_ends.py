@@ -43,9 +43,10 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
 
 def arm(run: RunResults) -> tuple[str, str, str, str]:
     """Scene, growth, and what is done at the end of a run."""
-    shares = (run.config.get(name) or 0.0 for name in ("lr_tail", "weight_averaging"))
-    fades, averages = map(float, shares)
-    left = f" to {run.config['lr_tail_factor']:g}" if fades else ""
+    rules = dict(run.config.get("rules") or {})
+    tail, average = (rules.get(name) or {} for name in ("lr-tail", "weight-averaging"))
+    fades, averages = (float(each.get("share", 0.0)) for each in (tail, average))
+    left = f" to {tail['factor']:g}" if fades else ""
     growth = str(run.config.get("growth") or "unbounded")
     return Path(str(run.config["scene"])).name, growth, f"{fades:.0%}{left}", f"{averages:.0%}"
 

@@ -18,7 +18,7 @@ from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.entries import load as load_component
 from crossgrad_core.registry.requirements import unmet_requirement
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, OWN_COMMANDS
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, OWN_COMMANDS
 from crossgrad_core.registry.strays import Stray, strays
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
@@ -70,8 +70,8 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.reading import read_run as read_results
     from crossgrad_core.run.settings import layered, merged
     from crossgrad_core.run.usual_views import views_per_step_of
+    from crossgrad_core.scene.shown_points import photos_per_point
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
-    from crossgrad_core.training.dropout import photos_per_point
     from crossgrad_core.training.probe_gradients import view_gradients
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.start import first_state as begin
@@ -83,8 +83,8 @@ __all__ = [
     "DEFAULT_STEPS",
     "FAILED",
     "GROUPS",
-    "LISTS",
     "LOCK",
+    "MANY",
     "OFFERED",
     "OWN_COMMANDS",
     "VERSION",
@@ -206,7 +206,7 @@ _LATE: Final = {
     "model_of": "training.step",
     "open_run": "run.load_run:opened",
     "panels_of": "run.results.panels",
-    "photos_per_point": "training.dropout",
+    "photos_per_point": "scene.shown_points",
     "read_panel": "run.results.panels",
     "read_results": "run.results.reading:read_run",
     "read_settings": "system.yaml_values:read_mapping",
@@ -278,8 +278,9 @@ def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
     for name in type(config).model_fields:
         value = getattr(config, name)
         choices = value if isinstance(value, tuple) else (value,)
-        slot = name if name in LISTS else plural(name)
+        slot = name if name in MANY else plural(name)
         found += [(slot, each) for each in choices if isinstance(each, ComponentChoice)]
+    found += [("rules", each) for each in config.used_rules]
     return [(slot, choice) for slot, choice in found if choice.name != AUTO]
 
 

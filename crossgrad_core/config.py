@@ -211,15 +211,6 @@ class RunConfig(BaseModel):
     sh_start: float | None = Field(
         None, ge=0, le=1, description="share of the run before the SH degree grows"
     )
-    max_scale_ratio: float | None = Field(
-        None,
-        ge=0,
-        description="most that a standard deviation may be of the distance to the nearest training "
-        "camera that has a Gaussian at its side; 0 for no bound",
-    )
-    sh_every: int = Field(
-        1, ge=1, le=100, description="SH bands above the first learn in one of so many steps"
-    )
     densify_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(
             "all",
@@ -273,32 +264,14 @@ class RunConfig(BaseModel):
         "separate",
         description="One backward pass per view, or one for all views. Default: separate.",
     )
-    lr_tail: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
-        None,
-        ge=0,
-        le=1,
-        description="Over the last share of the steps, rates that are constant as published fade. "
-        "Default: auto.",
-    )
-    lr_tail_factor: float = Field(0.01, gt=0, le=1, description="what fading leaves of a rate")
-    weight_averaging: Annotated[float, Flag("SHARE", TRAINING)] = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="Evaluate and export the average of the parameters of the last share of the "
-        "steps. Default: 0.",
-    )
-    floaters: Annotated[Literal["keep", "remove"] | None, Flag("keep|remove", TRAINING)] = Field(
-        None,
-        description="What is done at the end with primitives around cameras that no training photo "
-        "shows. Default: auto.",
-    )
-    dropout: Annotated[float | None, Flag("SHARE", TRAINING)] = Field(
-        None,
-        ge=0,
-        le=0.9,
-        description="Share of the Gaussians that each training view is drawn without. Default: "
-        "auto.",
+    rules: Annotated[
+        dict[str, dict[str, Any] | Literal[False]],
+        Flag("NAME", TRAINING, "rule", common=True),
+        Flag("NAME", TRAINING, "no_rule"),
+    ] = Field(
+        {},
+        description="--rule adds a rule that acts during training, --no-rule leaves one out, both "
+        "repeatable. Default: auto.",
     )
     device: Annotated[str, Flag("auto|cpu|cuda|cuda:N", MACHINE, common=True)] = Field(
         AUTO,
@@ -362,6 +335,14 @@ class RunConfig(BaseModel):
             raise ValueError(f"each one once, with all its options; {', '.join(twice)} comes twice")
         return value
 
+    @field_validator("rules", mode="before")
+    @classmethod
+    def _rules(cls, value: object) -> object:
+        """Options for each rule; `true` and nothing stand for a rule with its defaults."""
+        if not isinstance(value, Mapping):
+            return value
+        return {name: {} if each in (True, None) else each for name, each in value.items()}
+
     @field_validator("views_per_step")
     @classmethod
     def _views_per_step(cls, value: int | str | None) -> int | str | None:
@@ -390,6 +371,15 @@ class RunConfig(BaseModel):
             None
             if self.views_per_step is None
             else ViewsPerStepSpec.parsed(str(self.views_per_step))
+        )
+
+    @property
+    def used_rules(self) -> tuple[ComponentChoice, ...]:
+        """The rules that are not left out."""
+        return tuple(
+            ComponentChoice.model_validate({**options, "name": name})
+            for name, options in self.rules.items()
+            if options is not False
         )
 
     @property

@@ -25,6 +25,7 @@ from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
     AggregateResult,
+    Answer,
     DensifyContext,
     DensifyResult,
     EvaluationReport,
@@ -60,7 +61,13 @@ from crossgrad_core.contract.gramian_operator import (
     diagonals,
     transformed,
 )
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Quantity, Regrouping, Rule
+from crossgrad_core.contract.grouping import (
+    GradientProbe,
+    Grouping,
+    GroupingRule,
+    Quantity,
+    Regrouping,
+)
 from crossgrad_core.contract.initializer import Initializer, MorePoints
 from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.markers import hookimpl
@@ -72,6 +79,7 @@ from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.recipe import Facts, Recipe, with_rows
 from crossgrad_core.contract.resolution import Resolution, octave
+from crossgrad_core.contract.rule import FinalEdit, GaussiansContext, GaussiansResult, Rule
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import (
     COORDINATES_TAG,
@@ -88,6 +96,7 @@ from crossgrad_core.contract.scene import (
     View,
     centers_of,
     footprint_of,
+    is_in_image,
     masked,
     radial_distances,
     to_uint8,
@@ -139,6 +148,7 @@ __all__ = [
     "AfterStepContext",
     "AggregateContext",
     "AggregateResult",
+    "Answer",
     "Backbone",
     "Block",
     "BlockKind",
@@ -156,13 +166,17 @@ __all__ = [
     "Facts",
     "Field",
     "Figure",
+    "FinalEdit",
     "Fitted",
     "Gaussians",
+    "GaussiansContext",
+    "GaussiansResult",
     "Georeference",
     "GradientProbe",
     "GramianOperator",
     "Granularity",
     "Grouping",
+    "GroupingRule",
     "HasUnusedOptions",
     "IncompatibleSelectionError",
     "Initializer",
@@ -240,6 +254,7 @@ __all__ = [
     "hookimpl",
     "installed_plugins",
     "is_file",
+    "is_in_image",
     "length_lines",
     "listed",
     "masked",

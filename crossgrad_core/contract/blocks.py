@@ -72,7 +72,7 @@ class Block:
         lr: Learning rate of all its tensors; 0 freezes the block: its tensors get no gradient,
             may be of any type, and take part in topology edits and checkpoints only.
         rests: Whether its tensors are details of the colour, such as spherical harmonics of higher
-            degrees, that need not learn in every step (`Schedule.sh_every`).
+            degrees, that need not learn in every step.
     """
 
     name: str
@@ -112,7 +112,7 @@ def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -
 #: Names of states that belong to the components of slots.
 SLOTS: Final = frozenset({"densifier", "operator", "resolution", "sampler"})
 #: These and the core's own: no other plugin may use them.
-TAKEN: Final = SLOTS | {"average", "budget", "grouping", "photos", "thinned"}
+TAKEN: Final = SLOTS | {"budget", "grouping", "photos", "thinned"}
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
 

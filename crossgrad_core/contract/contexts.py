@@ -349,13 +349,13 @@ class DensifyContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class AfterStepContext(StepContext):
-    """For `crossgrad_after_step`: noise, clamps, filters.
+    """For `crossgrad_after_optimizer`, `crossgrad_after_step` and `crossgrad_step_done`.
 
     Attributes:
         parameters: The parameters; to be changed through the answered edit only.
         backbone: The backbone.
         means_lr: Current learning rate of the primitives' positions.
-        edited: Whether density control changed the set of primitives in this step.
+        edited: Whether density control changed the set of primitives in this step already.
     """
 
     parameters: Mapping[str, Tensor]
@@ -411,7 +411,7 @@ class RegularizeResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class DensifyResult(Answer):
-    """Answer of `crossgrad_densify` and `crossgrad_after_step`: an edit, or NO_EDIT."""
+    """Answer of the hooks that edit primitives, such as `crossgrad_densify`: may be NO_EDIT."""
 
     edit: Edit
 

@@ -14,7 +14,7 @@ from crossgrad_core.contract.scene import Scene, View
 
 
 @dataclass(frozen=True, eq=False)
-class Rule:
+class GroupingRule:
     """A grouping as fitted to the training cameras of a scene.
 
     Attributes:
@@ -72,7 +72,7 @@ class Grouping(Component):
     @abstractmethod
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         """The rule, fitted on `scene.train_views`.
 
         Args:
@@ -106,7 +106,7 @@ class Regrouping(Grouping):
         """The step after which the training views are grouped anew."""
 
     @abstractmethod
-    def refit(self, model: Model, rng: np.random.Generator) -> Rule:
+    def refit(self, model: Model, rng: np.random.Generator) -> GroupingRule:
         """The rule for the rest of the run.
 
         Args:

@@ -6,6 +6,7 @@ wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A
 must answer with a value; None is an error.
 """
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from crossgrad_core.contract.markers import hookspec
@@ -13,10 +14,12 @@ from crossgrad_core.contract.markers import hookspec
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from crossgrad_core.contract.blocks import Block, LearningRate, PluginState
     from crossgrad_core.contract.contexts import (
         AfterStepContext,
         AggregateContext,
         AggregateResult,
+        Answer,
         DensifyContext,
         DensifyResult,
         EvaluationReport,
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
         ScaleResult,
         StepRecord,
     )
+    from crossgrad_core.contract.rule import FinalEdit, GaussiansContext, GaussiansResult
+    from crossgrad_core.contract.schedule import Schedule
     from crossgrad_core.contract.selection import Selection
 
 
@@ -48,6 +53,13 @@ class HookSpecs:
     def crossgrad_run_start(self, run: "RunInfo") -> None:
         """Event: the scene is read, the components are chosen, no step is taken yet."""
 
+    @hookspec
+    def crossgrad_update_intervals(self, blocks: "tuple[Block, ...]") -> "Mapping[str, int] | None":
+        """Tensors that learn in one of N steps only, by name -> N.
+
+        Every plugin is asked once per run. In its steps such a tensor has sqrt(N) times its rate.
+        """
+
     @hookspec(firstresult=True)
     def crossgrad_sample_views(self, context: "SampleContext") -> "SampleResult | None":
         """Hook 1: the K views of this step. Answered by the selected sampler."""
@@ -55,6 +67,13 @@ class HookSpecs:
     @hookspec(firstresult=True)
     def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
         """The scale at which each drawn view is rendered and compared. The selected resolution."""
+
+    @hookspec
+    def crossgrad_view_gaussians(self, context: "GaussiansContext") -> "GaussiansResult | None":
+        """The Gaussians that a training view is rendered from, if others than the decoded ones.
+
+        Every plugin is asked in turn, once per view, about what the one before it answered.
+        """
 
     @hookspec
     def crossgrad_pixel_weights(self, context: "PixelContext") -> "Tensor | None":
@@ -77,6 +96,22 @@ class HookSpecs:
     ) -> "AggregateResult | None":
         """Hook 2: one gradient per tensor from the gradients of K views. The selected operator."""
 
+    @hookspec
+    def crossgrad_rate_factor(
+        self, rate: "LearningRate", step: int, schedule: "Schedule"
+    ) -> float | None:
+        """A factor for a learning rate of the backbone in a step, not negative.
+
+        Every plugin is asked for each block; None means "as it is". Answers multiply.
+        """
+
+    @hookspec
+    def crossgrad_after_optimizer(self, context: "AfterStepContext") -> "DensifyResult | None":
+        """After the optimizer and before density control: an edit that overwrites values; or None.
+
+        Every plugin is asked in turn. The set of primitives stays.
+        """
+
     @hookspec(firstresult=True)
     def crossgrad_densify(self, context: "DensifyContext") -> "DensifyResult | None":
         """Hook 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
@@ -86,12 +121,33 @@ class HookSpecs:
         """After optimizer and density control: an edit for noise, clamps, filters; or None."""
 
     @hookspec
+    def crossgrad_step_done(self, context: "AfterStepContext") -> "Answer | None":
+        """The parameters after a complete step, for states that follow them, such as an average.
+
+        `context.edited` is True if the set of primitives changed in this step, or if density
+        control overwrote values.
+        """
+
+    @hookspec
     def crossgrad_step_end(self, record: "StepRecord") -> None:
         """Event: the step is complete."""
 
     @hookspec
     def crossgrad_model_ready(self, model: "Model") -> None:
         """Event: the step is complete, and this is the model now. Read only; off the clock."""
+
+    @hookspec
+    def crossgrad_eval_parameters(
+        self, states: "Mapping[str, PluginState]", step: int
+    ) -> "Mapping[str, Tensor] | None":
+        """Tensors that evaluations and exports show in place of the parameters of these names."""
+
+    @hookspec
+    def crossgrad_final_edit(self, model: "Model") -> "FinalEdit | None":
+        """The edit of a finished run, before it is evaluated and exported; or None.
+
+        Every plugin is asked in turn. `model.parameters` are those that evaluations show.
+        """
 
     @hookspec
     def crossgrad_evaluation(self, report: "EvaluationReport") -> None:

@@ -8,8 +8,6 @@ from typing import Final, Literal
 
 from typing_extensions import override
 
-from crossgrad_core.numerics.hashing import hash32
-
 _FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1..2@0.5"
 
 
@@ -199,7 +197,6 @@ class Schedule:
         coarse_until: Backbones that train from coarse to fine have all levels from here on.
         sh_from: SH degree at the first step.
         sh_wait: The degree stays that of the first step before this.
-        sh_every: Blocks that may rest learn in one of so many steps.
         counting: What is counted.
         pace: K of every step.
         edits_before: Edits before `densify_from` in a run whose length followed the clock.
@@ -220,7 +217,6 @@ class Schedule:
     coarse_until: int
     sh_from: int = 0
     sh_wait: int = 0
-    sh_every: int = 1
     counting: Counting = IN_STEPS
     pace: ViewsPerStep = ONE_BY_ONE
     edits_before: int = 0
@@ -376,15 +372,6 @@ class Schedule:
         count = self.counted(step)
         more = count // self.sh_interval if count >= self.sh_wait else 0
         return min(maximum, self.sh_from + more)
-
-    def rests(self, step: int) -> bool:
-        """Whether blocks that may rest do not learn in this step.
-
-        They learn in one of each `sh_every` steps, as if drawn by lot: where samplers go through
-        photos or regimes by turns, none is left out.
-        """
-        turn, place = divmod(step - 1, self.sh_every)
-        return place != hash32(turn) * self.sh_every >> 32
 
     def densifies(self, step: int) -> bool:
         """Whether density control edits the primitives after this step."""

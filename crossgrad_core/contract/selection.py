@@ -1,7 +1,7 @@
 """The chosen components of a run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from crossgrad_core.contract.backbone import Backbone
@@ -16,6 +16,7 @@ from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.rule import Rule
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.schedule import ViewsPerStepSpec
 
@@ -36,6 +37,7 @@ class Selection:
         resolution: The scale of each view of a step.
         exporter: What writes the trained scene to a file.
         metrics: What is measured of held-out views, by name.
+        rules: The rules that act during training, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
         views_per_step: K; the largest one where it changes.
         device: Torch device type.
@@ -62,6 +64,7 @@ class Selection:
     grouping: Grouping | None = None
     labels: tuple[str, ...] | None = None
     view_plan: ViewsPerStepSpec | None = None
+    rules: Mapping[str, Rule] = field(default_factory=dict)
 
     @property
     def views(self) -> ViewsPerStepSpec:
@@ -85,6 +88,11 @@ class Selection:
             "grouping": self.grouping,
         }
         return {slot: each for slot, each in filled.items() if each is not None}
+
+    @property
+    def plugins(self) -> dict[str, object]:
+        """Name -> plugin of everything that trains: the components and the rules."""
+        return {**self.components, **{f"rule:{name}": each for name, each in self.rules.items()}}
 
 
 @runtime_checkable

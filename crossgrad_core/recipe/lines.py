@@ -43,6 +43,8 @@ def _value(row: Decision) -> str:
 def shown(value: object) -> str:
     """Return a value as a table shows it."""
     match value:
+        case dict():
+            return ", ".join(f"{name} {shown(each)}" for name, each in value.items()) or "on"
         case bool():
             return str(value).lower()
         case float():

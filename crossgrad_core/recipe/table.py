@@ -22,13 +22,12 @@ DECIDED: Final = (
         "initializer",
         "exposure",
         "resolution",
-        "dropout",
-        "floaters",
     ),
     *("schedule_unit", "growth", "max_gaussians", "min_refinements", "reset_every", "sh_start"),
-    *("position_lr", "max_scale_ratio", "rate_factor", "hurried_rates", "beta1", "beta2"),
-    *("lr_tail", "step_order"),
+    *("position_lr", "rate_factor", "hurried_rates", "beta1", "beta2", "step_order"),
 )
+#: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.
+RULES: Final = "rules"
 
 
 def recipe_of(config: RunConfig) -> Recipe:
@@ -40,6 +39,8 @@ def is_given(config: RunConfig, setting: str) -> bool:
     """Return True if a setting, or an option of a component, has a value already."""
     name, _, option = setting.partition(".")
     value = getattr(config, name, None)
+    if name == RULES:
+        return option in config.rules if option else name in config.model_fields_set
     if option:
         return isinstance(value, ComponentChoice) and option in value.options
     if name not in config.model_fields_set or value is None:
@@ -58,7 +59,7 @@ def given_settings(config: RunConfig) -> dict[str, Any]:
 
 def is_complete(config: RunConfig) -> bool:
     """Return True if no recipe is needed: the run repeats one that wrote all decisions down."""
-    return all(is_given(config, name) for name in DECIDED)
+    return all(is_given(config, name) for name in (*DECIDED, RULES))
 
 
 def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
@@ -89,11 +90,13 @@ def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
     Raises:
         UserError: A recipe names a setting that does not exist, or gives it a wrong value.
     """
-    update: dict[str, Any] = config.model_dump(exclude_unset=True)
+    update: dict[str, Any] = {RULES: {}, **config.model_dump(exclude_unset=True)}
     for row in sorted(rows, key=lambda row: "." in row.setting):
         name, _, option = row.setting.partition(".")
         held = update.get(name)
-        if option:
+        if name == RULES:
+            update[name] = {**update[name], option: row.value}
+        elif option:
             update[name] = {"name": AUTO, **(held or {}), option: row.value}
         elif isinstance(held, dict) and isinstance(row.value, str):
             update[name] = {**held, "name": row.value}
@@ -142,4 +145,4 @@ def _value(config: RunConfig, setting: str) -> object:
     value = getattr(config, name)
     if isinstance(value, ComponentChoice):
         return value.options.get(option) if option else value.name
-    return value
+    return value[option] if name == RULES else value

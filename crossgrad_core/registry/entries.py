@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.requirements import unmet_requirement
 from crossgrad_core.registry.signatures import wrong_signatures
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, LISTS, OFFERED, PLANNERS, QUICK
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, PLANNERS, QUICK
 from crossgrad_core.registry.source_location import defined_at, raised_at
 from crossgrad_core.registry.strays import strays
 from crossgrad_core.system.version import VERSION
@@ -262,7 +262,7 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
             error,
             component,
             subject=f"{word} {name}",
-            prefix=f"{slot}.{name}" if slot in LISTS else word,
+            prefix=f"{slot}.{name}" if slot in MANY else word,
             todo=f"`crossgrad plugins show {name}` explains the options",
         ) from None
 

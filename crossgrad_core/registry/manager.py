@@ -22,8 +22,10 @@ from crossgrad_core.contract.contexts import (
     SampleResult,
     StepContext,
 )
+from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.hooks import HookSpecs
 from crossgrad_core.contract.markers import PROJECT
+from crossgrad_core.contract.rule import GaussiansResult
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.wording import did_you_mean, listed, sentences, singular
@@ -119,14 +121,36 @@ def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> 
     results: list[object] = hook(context=context)
     for result in results:
         if not isinstance(result, answer) or not _complete(result):
-            raise UserError(
-                f"a plugin answers {hook.name} with something else",
-                where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
-                expected=f"a value of type {answer.__name__}, or None",
-                found=repr(result),
-                todo="repair the plugin (docs/hooks.md), or leave it out",
-            )
+            raise wrong_answer(hook, f"a value of type {answer.__name__}, or None", repr(result))
     return cast("list[A]", results)
+
+
+def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserError:
+    """Return the error about an answer to a hook that the run cannot use."""
+    return UserError(
+        f"a plugin answers {hook.name} with something else",
+        where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
+        expected=expected,
+        found=found,
+        todo="repair the plugin (docs/hooks.md), or leave it out",
+    )
+
+
+def one_by_one(manager: pluggy.PluginManager, name: str) -> tuple[pluggy.HookCaller, ...]:
+    """Return a caller for each plugin that answers a hook, in the order of registration.
+
+    Each of them asks one plugin, so that the next one can be asked about its answer. Wrappers take
+    part in every call.
+    """
+    answering = [
+        implementation.plugin
+        for implementation in getattr(manager.hook, name).get_hookimpls()
+        if not (implementation.wrapper or implementation.hookwrapper)
+    ]
+    return tuple(
+        manager.subset_hook_caller(name, [each for each in answering if each is not plugin])
+        for plugin in answering
+    )
 
 
 def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
@@ -179,6 +203,8 @@ def _complete(answer: Answer) -> bool:
             return bool(answer.draw)
         case DensifyResult():
             return isinstance(answer.edit, Edit)
+        case GaussiansResult():
+            return isinstance(answer.gaussians, Gaussians)
         case RegularizeResult():
             return isinstance(answer.loss, Tensor) and answer.loss.numel() == 1
         case _:

@@ -21,10 +21,13 @@ GROUPS: Final[dict[str, str]] = {
         "metrics",
         "observers",
         "recipes",
+        "rules",
     )
 }
-#: Slots that a run fills with any number of components.
+#: Slots that a run fills with a list of components.
 LISTS: Final = ("metrics", "observers")
+#: Slots that a run fills with any number of components; `rules` is a mapping of names.
+MANY: Final = (*LISTS, "rules")
 #: What packages offer as commands of `crossgrad`; no slot of a run.
 COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.

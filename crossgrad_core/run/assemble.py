@@ -27,7 +27,7 @@ from crossgrad_core.registry.entries import (
     refuse_other_version,
 )
 from crossgrad_core.registry.manager import make_manager
-from crossgrad_core.registry.slots import GROUPS, LISTS
+from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.select import select
@@ -138,7 +138,8 @@ def check_names(config: RunConfig) -> None:
         choose_device(config.device)
     named = [("operators", link) for link in config.operators]
     named += [(slot, choice) for slot in LISTS for choice in getattr(config, slot)]
-    single = (slot for slot in GROUPS if slot not in {"operators", *LISTS})
+    named += [("rules", ComponentChoice(name=name)) for name in config.rules]
+    single = (slot for slot in GROUPS if slot not in {"operators", *MANY})
     named += [(slot, getattr(config, singular(slot))) for slot in single]
     for slot, choice in named:
         unread = slot == "recipes" and is_complete(config)
@@ -195,8 +196,9 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
     timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [each.name for each in config.operators]
+    named |= {"metrics": [*selection.metrics], "observers": [*observers]}
     added = (
-        *from_elsewhere({**named, "metrics": [*selection.metrics], "observers": [*observers]}),
+        *from_elsewhere({**named, "rules": [*selection.rules]}),
         *_linear_note(setup),
         *idle_note(setup),
         *timed,
@@ -267,7 +269,7 @@ def _groups(
 
 
 def _plugins(selection: Selection, observers: Mapping[str, Component]) -> dict[str, object]:
-    plugins: dict[str, object] = {**selection.components}
+    plugins = selection.plugins
     for name, metric in selection.metrics.items():
         plugins[f"metric:{name}"] = metric
     for name, observer in observers.items():

@@ -23,11 +23,11 @@ from crossgrad_core.recipe.table import (
 from crossgrad_core.registry.entries import find, load, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
-from crossgrad_core.run.select import chosen, fitted_backbone
+from crossgrad_core.run.select import chosen, fitted_backbone, rules_of
 from crossgrad_core.run.settings import layered, parsed
 from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.run.usual_views import views_per_step_of
-from crossgrad_core.training.dropout import photos_per_point
+from crossgrad_core.scene.shown_points import photos_per_point
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
@@ -136,7 +136,9 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with the numbers of the length that is planned now; components stay.
+    """Return the run with the numbers and rules of the length that is planned now.
+
+    Other components stay.
 
     Args:
         setup: The run.
@@ -146,6 +148,9 @@ def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
     numbers = {each.name for each in fields(Numbers)}
     rows = {row.setting: row for row in setup.decide(Length(planned, planned, start))}
     table = {row.setting: row for row in setup.decisions}
-    changed = {name: row for name, row in rows.items() if name in numbers}
+    changed = {
+        name: row for name, row in rows.items() if name in numbers or name.startswith("rules.")
+    }
     config = applied(setup.config, tuple(changed.values()))
-    return replace(setup, config=config, decisions=tuple((table | changed).values()))
+    setup = replace(setup, config=config, decisions=tuple((table | changed).values()))
+    return setup.with_rules(rules_of(config))

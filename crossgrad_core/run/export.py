@@ -17,8 +17,8 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import compare
 from crossgrad_core.evaluation.metrics import psnr
 from crossgrad_core.system.files import write_atomically
-from crossgrad_core.training.averaging import eval_parameters
 from crossgrad_core.training.per_image_params import apply
+from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import eval_background
@@ -91,7 +91,7 @@ def export_scene(
     views = setup.train_views if view is None else (view,)
     with torch.no_grad():
         cameras = [each.camera for each in views]
-        baked = setup.backbone.bake(eval_parameters(state), phase, cameras)
+        baked = setup.backbone.bake(eval_parameters(setup, state), phase, cameras)
     exporter = exporter or setup.selection.exporter
     placed = setup.scene.georeference.placed(baked, setup.scene.similarity, coordinates)
     comments = [f"crossgrad step {state.step}"]
@@ -179,7 +179,7 @@ def plain_renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
 
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
     """Renders what any camera sees with the parameters to be shown, before any exposure."""
-    background, parameters = eval_background(setup), eval_parameters(state)
+    background, parameters = eval_background(setup), eval_parameters(setup, state)
     phase = setup.phase(state.step, training=False)
 
     def render_one(camera: Camera) -> Tensor:

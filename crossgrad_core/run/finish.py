@@ -22,11 +22,10 @@ from crossgrad_core.run.session import PANELS, Session
 from crossgrad_core.scene.photo_check import fits
 from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length, seconds_ahead
-from crossgrad_core.training.floaters import rows_without_floaters, told_of
 from crossgrad_core.training.loop import Stopper, evaluates_after, train
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFailedError, TrainState
-from crossgrad_core.training.step import keep
+from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
 #: How torch says that there is no memory, besides errors of a type of its own.
@@ -117,9 +116,8 @@ class RunLoop:
         Part by part: none that fails costs another, and the ending says which did.
         """
         self._attempt("", lambda: self._train(length))
-        removes = self.setup.numbers.floaters == "remove"
-        if self.ending.status == "finished" and removes:
-            self._attempt("floaters are left", self._remove_floaters)
+        if self.ending.status == "finished":
+            self._attempt("the model is left as it was trained", self._edit_finished)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
@@ -162,17 +160,17 @@ class RunLoop:
                     write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised
 
-    def _remove_floaters(self) -> None:
-        setup, state = self.setup, self.state
+    def _edit_finished(self) -> None:
+        state = self.state
         state.laps = PhaseTimer()
-        rows = self._unless_interrupted(partial(rows_without_floaters, setup, state))
-        if rows is not None:
-            count = state.primitives(setup) - len(rows)
-            keep(setup, state, rows)
-            self.session.renew(setup, state.step)
-            setup.hook.crossgrad_log(text=told_of(count))
+        self._unless_interrupted(self._apply_final_edits)
         state.laps.lap("density_control")
         state.clock.count(state.laps)
+
+    def _apply_final_edits(self) -> None:
+        for edit in final_edits(self.setup, self.state):
+            self.session.renew(self.setup, self.state.step)
+            self.setup.hook.crossgrad_log(text=edit.note)
 
     def _catch_up(self) -> None:
         """Evaluates where an earlier session ended before it could."""

@@ -16,7 +16,7 @@ from crossgrad_core.defaults import PROGRESS
 from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_core.registry.slots import LISTS
+from crossgrad_core.registry.slots import LISTS, MANY
 from crossgrad_core.run.assemble import assemble, check_names, read_and_check, read_scene
 from crossgrad_core.run.checkpoint.checkpoint import (
     CHECKPOINTS,
@@ -47,7 +47,6 @@ from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.differences import Weight
 from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
 from crossgrad_core.system.version import VERSION
-from crossgrad_core.training import averaging
 from crossgrad_core.training.budget import replay_length
 from crossgrad_core.training.per_image_params import check_photos_are
 from crossgrad_core.training.rngs import restored_streams, stream_states
@@ -150,9 +149,10 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise _misfit(checkpoint, "the state of a run", in_one_line(error)) from error
     check_photos_are(setup, state)
-    average = state.states.get(averaging.STATE)
-    if average is not None and not averaging.fits(average, state.parameters):
-        raise _misfit(checkpoint, "sums in the shapes of the parameters", "another average")
+    rows = state.primitives(setup)
+    for name, held in state.states.items():
+        if any(tensor.shape[:1] != (rows,) for tensor in held.per_primitive.values()):
+            raise _misfit(checkpoint, f"a row for each of {rows} primitives", f"state of {name}")
     return state
 
 
@@ -284,13 +284,13 @@ _PLAIN: Final = {
     "resolution": defaults.RESOLUTION,
 }
 #: Slots (singular words) whose components a run can be looked at without.
-REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, LISTS)})
+REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
 def without_missing(config: RunConfig) -> RunConfig:
     """The configuration with plain parts for those that only train, and are not installed here.
 
-    Metrics and observers that are not are left out.
+    Metrics, observers and rules that are not are left out.
     """
     update: dict[str, object] = {}
     lacking = []
@@ -304,6 +304,9 @@ def without_missing(config: RunConfig) -> RunConfig:
         if gone := [each.name for each in chosen if each.name not in known]:
             lacking.append(f"{slot} {listed(gone)}")
             update[slot] = tuple(each for each in chosen if each.name in known)
+    if gone := sorted(config.rules.keys() - entries("rules").keys()):
+        lacking.append(f"rules {listed(gone)}")
+        update["rules"] = {n: each for n, each in config.rules.items() if n not in gone}
     if lacking:
         _LOG.warning("not installed here, and left out: %s", listed(lacking))
     return config.model_copy(update=update)
@@ -324,7 +327,8 @@ def _is_gone(slot: str, choice: ComponentChoice) -> bool:
 
 def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
     """The configuration with the parts again that trained it."""
-    return config.model_copy(update={slot: getattr(trained, slot) for slot in _PLAIN})
+    slots = (*_PLAIN, "rules")
+    return config.model_copy(update={slot: getattr(trained, slot) for slot in slots})
 
 
 #: How a run ended that wrote down its results, and a checkpoint with them.

@@ -49,7 +49,7 @@ def _options(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[Opt
 
 
 def _kind(field: FieldInfo) -> object:
-    if get_origin(field.annotation) is tuple:
+    if get_origin(field.annotation) in {tuple, dict}:
         return list[str]
     kinds = [each for each in get_args(field.annotation) if each is not NoneType]
     kind = kinds[0] if len(kinds) == 1 else field.annotation

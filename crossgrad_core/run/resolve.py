@@ -1,7 +1,7 @@
 """The configuration as it was carried out: every decision written down."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.component import Component
@@ -40,6 +40,7 @@ def resolved(setup: Setup) -> RunConfig:
             "reader": config.reader.model_copy(update={"name": names["reader"]}),
             "metrics": tuple(_choice(name, each) for name, each in selection.metrics.items()),
             "observers": tuple(c for c in config.observers if c.name != PROGRESS),
+            "rules": {name: _options(selection.rules.get(name)) for name in config.rules},
             "scene": scene,
             "data": data.model_copy(update=located),
             "exposure_from": None if known is None else known.resolve(),
@@ -58,6 +59,10 @@ def _located(path: Path | None) -> Path | None:
 
 def _choice(name: str, component: Component) -> ComponentChoice:
     return ComponentChoice.model_validate({"name": name, **component.model_dump(mode="json")})
+
+
+def _options(rule: Component | None) -> dict[str, Any] | Literal[False]:
+    return False if rule is None else rule.model_dump(mode="json")
 
 
 def _operator(config: RunConfig, setup: Setup) -> ComponentChoice | tuple[ComponentChoice, ...]:

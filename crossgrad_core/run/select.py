@@ -16,6 +16,7 @@ from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.resolution import Resolution
+from crossgrad_core.contract.rule import Rule
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, is_in_image
 from crossgrad_core.contract.selection import Selection
@@ -94,8 +95,14 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
         device=device.type,
         grouping=grouping,
         view_plan=views,
+        rules=rules_of(config),
     )
     return selection, notes
+
+
+def rules_of(config: RunConfig) -> dict[str, Rule]:
+    """The rules of a run by name."""
+    return {each.name: build(Rule, each.name, each.options) for each in config.used_rules}
 
 
 def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None:

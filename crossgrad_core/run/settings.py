@@ -16,9 +16,9 @@ from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.recipe import Recipe
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
-from crossgrad_core.recipe.table import without_decided
+from crossgrad_core.recipe.table import RULES, without_decided
 from crossgrad_core.registry.entries import installed_as, load
-from crossgrad_core.registry.slots import GROUPS, LISTS
+from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.run.config_version import unmarked
 from crossgrad_core.run.options import OPTIONS
@@ -30,7 +30,7 @@ Settings: TypeAlias = dict[str, Any]
 #: Options that add to a list of components, by the setting that they add to.
 ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
 #: Settings that name one component (or a chain of operators) and hold its options.
-CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in LISTS)
+CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in MANY)
 #: Settings that say how long a run is.
 LENGTHS: Final = tuple(
     (name,)
@@ -148,11 +148,39 @@ def _flat(layer: Mapping[str, object]) -> Settings:
 
 def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
     """Place of a setting -> what the user gave; None and empty lists stand for nothing."""
-    return {
-        _PLACES.get(name, tuple(name.split("."))): _plain(value)
-        for name, value in options.items()
-        if not (value is None or (isinstance(value, list) and not value))
-    }
+    places: dict[tuple[str, ...], object] = {}
+    for name, value in options.items():
+        if not (value is None or (isinstance(value, list) and not value)):
+            place = _PLACES.get(name, tuple(name.split(".")))
+            if place == (RULES,):
+                places |= {(RULES, rule): each for rule, each in _rules(name, value).items()}
+            else:
+                places[place] = _plain(value)
+    return places
+
+
+def _rules(option: str, value: object) -> Mapping[str, object]:
+    """Name of a rule -> its options, or whether it is used.
+
+    Raises:
+        UserError: There is something else than a rule.
+    """
+    if isinstance(value, Mapping) and "name" not in value:
+        return {str(name): _plain(each) for name, each in value.items()}
+    found: dict[str, object] = {}
+    for each in _items(value):
+        choice = _named(RULES, each)
+        if not isinstance(choice, dict) or not isinstance(choice.get("name"), str):
+            raise UserError(
+                "there is something else than a rule",
+                where=RULES,
+                expected="names of rules, or a mapping of names to options",
+                found=repr(each),
+                todo="`crossgrad plugins list --slot rules` shows what there is",
+            )
+        options = {key: each for key, each in choice.items() if key != "name"}
+        found[choice["name"]] = option != "no_rule" and (options or True)
+    return found
 
 
 def _overlaid(
@@ -186,7 +214,7 @@ def _opened(settings: Settings, paths: Sequence[tuple[str, ...]]) -> Settings:
     if {path[0] for path in paths} & {*_DECIDING, *(name for (name,) in LENGTHS)}:
         without_decided(opened)
     elif decided := opened.get("decided"):
-        names = {".".join(path) for path in paths}
+        names = {".".join(path[:2]) for path in paths}
         opened["decided"] = {name: why for name, why in decided.items() if name not in names}
     return opened
 
@@ -262,7 +290,7 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
     Raises:
         UserError: It fills another slot, or no installed package offers it.
     """
-    slot = key if key in LISTS else plural(key)
+    slot = key if key in MANY else plural(key)
     where = f"{key}, {kind.__module__}:{kind.__qualname__}"
     if getattr(kind, "slot", None) != slot:
         raise UserError(
@@ -334,6 +362,9 @@ def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
         settings[key] = _renamed(settings.get(key), _choice(key, value))
     elif key in LISTS and not rest and value is not None:
         settings[key] = _extended(_in_list(_listed(settings, key)), _long_form(key, value))
+    elif key == RULES and value is True and len(rest) == 1:
+        used = _holder(settings, path)
+        used[rest[0]] = used.get(rest[0]) or {}
     elif not rest:
         settings[key] = _long_form(key, value)
     else:
@@ -414,7 +445,8 @@ def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
     part = path[depth]
     match place:
         case dict():
-            if place.get(part) is None:
+            left_out = path[0] == RULES and depth and place.get(part) in (True, False)
+            if place.get(part) is None or left_out:
                 place[part] = {}
             return place[part]
         case list():

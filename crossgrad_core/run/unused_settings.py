@@ -15,8 +15,8 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import reasons_against, refuse
 from crossgrad_core.run.resolve import ALWAYS
+from crossgrad_core.run.select import rules_of
 from crossgrad_core.scene.split import TEST_LIST, TRAIN_LIST
-from crossgrad_core.training.floaters import cameras_that_tell
 from crossgrad_core.training.rates import axes_of
 from crossgrad_core.training.schedules import MOST_DEGREES
 from crossgrad_core.training.setup import Setup
@@ -60,9 +60,8 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
         *_of_exposure(config, setup),
         *_of_the_split(config),
         *_of_positions(config, setup),
-        *_of_sizes(config, setup),
         *_of_the_start(config),
-        *_of_the_end(config, setup),
+        *_of_rules(config, setup),
     ]
     if found:
         raise UserError(
@@ -159,12 +158,9 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
 
 
 def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if not any(block.rests for block in setup.trained_blocks):
-        why = f"backbone {setup.selection.names['backbone']} trains no SH bands above the first"
-        if config.sh_every > 1:
-            yield "sh_every", why
-        if config.sh_start:
-            yield "sh_start", why
+    if config.sh_start and not any(block.rests for block in setup.trained_blocks):
+        name = setup.selection.names["backbone"]
+        yield "sh_start", f"backbone {name} trains no SH bands above the first"
     elif config.sh_start and setup.schedule.sh_from >= MOST_DEGREES:
         yield "sh_start", "all harmonics are drawn from the first step on (sh_from, --init)"
 
@@ -220,31 +216,16 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
         yield "data.points", f"--init {config.data.init} starts from other points"
 
 
-def _of_the_end(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """What is said about rates that fade and about floaters, where there can be none."""
-    fades = setup.numbers.lr_tail > 0.0
-    if config.lr_tail_factor != RunConfig.model_fields["lr_tail_factor"].default and not fades:
-        yield "lr_tail_factor", "no rate fades with --lr-tail 0"
-    if config.lr_tail and all(block.lr.decays for block in setup.trained_blocks):
-        name = setup.selection.names["backbone"]
-        yield "lr_tail", f"backbone {name} has no constant rates"
-    if config.floaters == "remove":
-        if not setup.backbone.positions:
-            yield "floaters", f"backbone {setup.selection.names['backbone']} names no positions"
-        if not cameras_that_tell(setup.scene):
-            yield "floaters", "no photo observes enough points to say what around it is empty"
+def _of_rules(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
+    for name, rule in rules_of(config).items():
+        if why := rule.unused(setup.backbone, setup.scene):
+            yield f"rules.{name}", why
 
 
 def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.position_lr == "per-axis" and axes_of(setup) is None:
         name = setup.selection.names["backbone"]
         yield "position_lr", f"primitives of backbone {name} are no Gaussians with axes"
-
-
-def _of_sizes(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    if config.max_scale_ratio and not setup.backbone.learns_scales:
-        name = setup.selection.names["backbone"]
-        yield "max_scale_ratio", f"backbone {name} has no Gaussians with axes that learn"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

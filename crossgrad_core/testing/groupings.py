@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, Rule
+from crossgrad_core.contract.grouping import GradientProbe, Grouping, GroupingRule
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.testing.components import COMPONENT_CHECKS
 from crossgrad_core.testing.contract import (
@@ -43,7 +43,7 @@ class SampleProbe:
         return np.stack([gramian, 2.0 * gramian])
 
 
-def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> Rule:
+def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> GroupingRule:
     """What a grouping answers for a scene."""
     probe: GradientProbe | None = SampleProbe(scene) if grouping.needs_probe else None
     return grouping.fit(scene, np.random.default_rng(seed), probe)
@@ -53,7 +53,7 @@ def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
     """One label per view, each of them announced in `labels` (unless the user's input names it)."""
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
-    require(isinstance(rule, Rule), f"the answer is {rule!r}, not a Rule")
+    require(isinstance(rule, GroupingRule), f"the answer is {rule!r}, not a GroupingRule")
     for views in (scene.train_views, scene.views, scene.views[:1]):
         labels = rule.labels(views)
         require(len(labels) == len(views), f"{len(views)} views have {len(labels)} labels")

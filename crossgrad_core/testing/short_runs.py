@@ -57,7 +57,7 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     selection, _ = select(config, sample_scene(), "none")
     # What the manager would gather; registering with it would take most of the time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
-    plugins = (*selection.components.values(), *observers)
+    plugins = (*selection.plugins.values(), *observers)
     asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
     answers = [ask(selection) for ask in asked if ask is not None]
     return reasons_against(config, selection, [each for each in answers if each])

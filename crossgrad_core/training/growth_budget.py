@@ -86,5 +86,5 @@ def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
         separate=setup.separate,
         watched=bool(setup.watchers),
         joint=setup.joint or setup.rasterizer.batched,
-        averaged=setup.config.weight_averaging > 0.0,
+        copies=sum(rule.copies for rule in setup.selection.rules.values()),
     )

@@ -14,8 +14,6 @@ from crossgrad_core.contract.contexts import ViewRecord
 STANDING = 6
 #: ... and while an edit is under way, when no graph is left: the new parameters and moments.
 EDIT = 3
-#: ... where the last parameters are averaged: the sums, those before and those of that good state.
-AVERAGE = 3
 #: What the graph of one view takes until its backward pass is over, in units of the parameters or,
 #: where that is more, of what was decoded for the view. Measured with the numba rasterizer: 2.7.
 GRAPH = 3
@@ -79,7 +77,7 @@ class Demand:
         separate: Whether the views' gradients are kept apart.
         watched: Whether their combination may not overwrite one of them.
         joint: Whether the graphs of all views are alive at once.
-        averaged: Whether the last parameters are averaged.
+        copies: Copies of the parameters that the states of rules hold.
     """
 
     parameters: int
@@ -88,7 +86,7 @@ class Demand:
     separate: bool = False
     watched: bool = False
     joint: bool = False
-    averaged: bool = False
+    copies: int = 0
 
     @property
     def gradients(self) -> int:
@@ -100,7 +98,7 @@ class Demand:
         """Bytes for each primitive."""
         graphs = self.views if self.joint else 1
         graph = GRAPH * graphs * max(self.parameters, self.kept // self.views)
-        standing = STANDING + AVERAGE * self.averaged
+        standing = STANDING + self.copies
         always = (standing + self.gradients) * self.parameters + self.kept
         return always + max(EDIT * self.parameters, graph)
 

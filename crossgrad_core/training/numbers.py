@@ -18,10 +18,6 @@ class Numbers:
     beta1: float
     beta2: float
     position_lr: Literal["extent", "per-axis"]
-    max_scale_ratio: float
-    lr_tail: float
-    floaters: Literal["keep", "remove"]
-    dropout: float
     growth: Growth
     max_gaussians: int | Literal["auto"]
     step_order: Literal["optimize-first", "densify-first"]

@@ -5,14 +5,14 @@ from typing import Final
 
 from crossgrad_core.contract.blocks import AdamRule, LearningRate, Parameters
 from crossgrad_core.errors import UserError
-from crossgrad_core.training.averaging import tail_lr_factor
+from crossgrad_core.training.rules import rate_factor
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
 
-#: Blocks that learn in one of n steps have n to this power times their rate then.
+#: Tensors that learn in one of n steps have n to this power times their rate then.
 RESTED: Final = 0.5
 
 
@@ -37,16 +37,15 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),
-            todo="repair the plugin (docs/write-a-backbone.md), or --position-lr extent --set "
-            "max_scale_ratio=0",
+            todo="repair the plugin (docs/write-a-backbone.md)",
         )
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
     """Name of each trained tensor -> its learning rate in a step."""
-    every = setup.schedule.sh_every
+    intervals = setup.update_intervals
     return {
-        name: rate_at(setup, block.lr, step) * (every**RESTED if block.rests else 1.0)
+        name: rate_at(setup, block.lr, step) * float(intervals.get(name, 1) ** RESTED)
         for block in setup.trained_blocks
         for name in block.tensors
     }
@@ -62,7 +61,7 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     """A learning rate of the backbone in a step: of the schedule, times what the run asks for."""
     numbers, schedule = setup.numbers, setup.schedule
     factor = numbers.rate_factor * (rate.hurried if numbers.hurried_rates else 1.0)
-    factor *= tail_lr_factor(setup, rate, step)
+    factor *= rate_factor(setup, rate, step)
     if setup.config.batch_rule == "sqrt":
         factor *= sqrt(schedule.pace.at(step))
     return rate.at(schedule.progress(step)) * factor

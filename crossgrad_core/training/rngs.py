@@ -1,6 +1,6 @@
 """Named random streams: one generator per purpose, so that one draw never shifts another."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, cast
 from zlib import crc32
 
@@ -8,13 +8,21 @@ import numpy as np
 
 STREAMS = (
     "create", "grouping", "sampler", "operator", "densifier", "after_step", "regularize",
-    "background", "resolution", "density", "dropout",
+    "background", "resolution", "density",
 )  # fmt: skip
 
 
-def make_streams(seed: int, rewinds: int = 0) -> dict[str, np.random.Generator]:
-    """Fresh generators of a run; `rewinds` gives other ones after a rewind."""
-    return {name: np.random.default_rng([seed, crc32(name.encode()), rewinds]) for name in STREAMS}
+def make_streams(
+    seed: int, rewinds: int = 0, names: Iterable[str] = STREAMS
+) -> dict[str, np.random.Generator]:
+    """Fresh generators of a run; `rewinds` gives other ones after a rewind.
+
+    Args:
+        seed: Seed of the run.
+        rewinds: How often training went back.
+        names: The streams: those of every run, and one for each rule.
+    """
+    return {name: np.random.default_rng([seed, crc32(name.encode()), rewinds]) for name in names}
 
 
 def stream_states(streams: Mapping[str, np.random.Generator]) -> dict[str, dict[str, Any]]:

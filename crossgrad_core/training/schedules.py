@@ -40,7 +40,6 @@ def schedule_of(
         schedule,
         reset_every=numbers.reset_every or None,
         sh_from=config.sh_from or 0,
-        sh_every=config.sh_every,
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )

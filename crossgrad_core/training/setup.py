@@ -21,15 +21,28 @@ from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.operator import Operator
 from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.rule import Rule
 from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.separate import DenseGradients
+from crossgrad_core.numerics.hashing import hash32
+from crossgrad_core.registry.manager import make_manager, one_by_one, wrong_answer
 from crossgrad_core.scene.photos_ahead import PhotosAhead
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
+
+
+def learns_in(step: int, every: int) -> bool:
+    """Return True if a tensor that learns in one of `every` steps learns in this one.
+
+    The step is drawn by lot from each `every` steps: where samplers go through photos or regimes
+    by turns, none of them is left out.
+    """
+    turn, place = divmod(step - 1, every)
+    return place == hash32(turn) * every >> 32
 
 
 @dataclass(frozen=True)
@@ -182,6 +195,15 @@ class Setup:
         """The run with the settings that it has in another length."""
         return replace(self, revised={**self.revised, **self.following(steps, start)})
 
+    def with_rules(self, rules: Mapping[str, Rule]) -> "Setup":
+        """The run with these rules in place of its own."""
+        if rules == self.selection.rules:
+            return self
+        others = {n: each for n, each in self.plugins.items() if not isinstance(each, Rule)}
+        selection = replace(self.selection, rules=rules)
+        plugins = {**selection.plugins, **others}
+        return replace(self, selection=selection, manager=make_manager(plugins), plugins=plugins)
+
     @property
     def backbone(self) -> Backbone:
         """The backbone."""
@@ -291,11 +313,25 @@ class Setup:
         passthrough = self.backbone.passthrough
         return {field: name for field, name in passthrough.items() if name in trained}
 
+    @cached_property
+    def update_intervals(self) -> Mapping[str, int]:
+        """Trained tensor -> N, of those that learn in one of N steps.
+
+        Raises:
+            UserError: A plugin names another tensor, or no number from 1 on.
+        """
+        hook = self.hook.crossgrad_update_intervals
+        trained = {name for block in self.trained_blocks for name in block.tensors}
+        answers: list[Mapping[str, int]] = hook(blocks=self.trained_blocks)
+        found = {name: every for answer in answers for name, every in answer.items()}
+        if wrong := {n: e for n, e in found.items() if n not in trained or int(e) != e or e < 1}:
+            raise wrong_answer(hook, "tensors that learn, each with a number from 1 on", str(wrong))
+        return found
+
     def resting(self, step: int) -> frozenset[str]:
         """The tensors that do not learn in a step."""
-        rest = self.schedule.rests(step)
-        blocks = (block for block in self.trained_blocks if block.rests and rest)
-        return frozenset(name for block in blocks for name in block.tensors)
+        intervals = self.update_intervals.items()
+        return frozenset(name for name, every in intervals if not learns_in(step, every))
 
     @cached_property
     def regularizes(self) -> bool:
@@ -311,6 +347,26 @@ class Setup:
     def acts_after_step(self) -> bool:
         """Whether any plugin acts after the step."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())
+
+    @cached_property
+    def follows_steps(self) -> bool:
+        """Whether any plugin follows the parameters from step to step."""
+        return bool(self.hook.crossgrad_step_done.get_hookimpls())
+
+    @cached_property
+    def changes_rates(self) -> bool:
+        """Whether any plugin changes learning rates."""
+        return bool(self.hook.crossgrad_rate_factor.get_hookimpls())
+
+    @cached_property
+    def gaussians_hooks(self) -> tuple[pluggy.HookCaller, ...]:
+        """The plugins that change the Gaussians of training views, each by itself."""
+        return one_by_one(self.manager, "crossgrad_view_gaussians")
+
+    @cached_property
+    def optimizer_hooks(self) -> tuple[pluggy.HookCaller, ...]:
+        """The plugins that act after the optimizer, each by itself."""
+        return one_by_one(self.manager, "crossgrad_after_optimizer")
 
     def phase(self, step: int, *, training: bool) -> Phase:
         """The phase that a backbone decodes in."""

@@ -40,8 +40,8 @@ from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.axes import step_along_axes
 from crossgrad_core.training.adam.late import Late
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.rates import axes_of, check_axes
-from crossgrad_core.training.rngs import make_streams
+from crossgrad_core.training.rates import check_axes
+from crossgrad_core.training.rngs import STREAMS, make_streams
 from crossgrad_core.training.scaled_photos import decoded_meanwhile
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
@@ -125,7 +125,7 @@ _LESS = 0.8
 
 def first_state(setup: Setup) -> TrainState:
     """The state before the first step."""
-    rngs = make_streams(setup.config.seed)
+    rngs = make_streams(setup.config.seed, names=(*STREAMS, *setup.selection.rules))
     created, crowd = initial_parameters(setup, rngs["create"])
     parameters = setup.densifier.started(created)
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
@@ -137,8 +137,7 @@ def first_state(setup: Setup) -> TrainState:
     }
     prepared = setup.backbone.prepare(parameters, setup.scene, setup.phase(0, training=True))
     parameters = _made(setup, prepared, "prepare")
-    if axes_of(setup) or setup.numbers.max_scale_ratio:
-        check_axes(setup, parameters)
+    check_axes(setup, parameters)
     state = TrainState(tensors=parameters, moments=AdamState(), rngs=rngs)
     photos = per_image_params.started(setup)
     if photos is not None:
@@ -292,8 +291,8 @@ def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
 
 def unwatched(setup: Setup) -> Setup:
     """The same run without observers and wrappers, which must not see steps that do not count."""
-    components = setup.selection.components
-    return replace(setup, manager=make_manager(components), plugins=components)
+    plugins = setup.selection.plugins
+    return replace(setup, manager=make_manager(plugins), plugins=plugins)
 
 
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:

@@ -392,7 +392,7 @@ class Snapshot:
         state.step = self.mark.step
         state.last = self.mark.last
         state.rewinds += 1
-        state.rngs = make_streams(seed, state.rewinds)
+        state.rngs = make_streams(seed, state.rewinds, state.rngs)
 
     def hand_over(self, state: TrainState) -> None:
         """Puts `state` back as it was, so that it goes on as if nothing had happened since.

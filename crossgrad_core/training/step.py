@@ -1,6 +1,6 @@
 """One optimizer step: sample, render, aggregate, optimize, densify."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,6 +26,7 @@ from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
     AggregateResult,
+    Answer,
     DensifyContext,
     DensifyResult,
     Model,
@@ -36,22 +37,21 @@ from crossgrad_core.contract.contexts import (
     ViewSample,
 )
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.grouping import Regrouping, Rule
+from crossgrad_core.contract.grouping import GroupingRule, Regrouping
+from crossgrad_core.contract.rule import FinalEdit
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.gradients.sparse_rows import coalesced, dense
-from crossgrad_core.registry.manager import call_all, call_first_result
+from crossgrad_core.registry.manager import call_all, call_first_result, one_by_one, wrong_answer
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.adam import counted as one_more
 from crossgrad_core.training.adam.axes import step_along_axes
-from crossgrad_core.training.averaging import STATE as AVERAGE
-from crossgrad_core.training.averaging import restart, update_average, with_rows
 from crossgrad_core.training.growth_budget import max_new_gaussians
 from crossgrad_core.training.per_image_params import apply, take_photo_step
 from crossgrad_core.training.rates import axes_of, means_rate_at, rates_at, rule_at
 from crossgrad_core.training.rngs import make_streams
-from crossgrad_core.training.scale_clamp import clamp_scales
+from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.setup import Scale, Setup
 from crossgrad_core.training.state import NonFiniteError, TrainState
 from crossgrad_core.training.views import (
@@ -107,7 +107,7 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
         setup.hook.crossgrad_log(text=f"step {state.step}: {note}")
 
 
-def labels_of(rule: Rule, scene: Scene, name: str) -> tuple[str, ...]:
+def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
     """The labels of the training views by the rule of the grouping of that name, one for each."""
     labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
     if len(labels) == len(views):
@@ -210,14 +210,7 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     """
     if edit.is_empty:
         return False
-    if misfit := misfit_of(edit, setup.blocks, state.tensors):
-        raise UserError(
-            "a plugin's edit does not fit the primitives",
-            where=f"step {state.step}, densifier {setup.selection.names['densifier']} or a plugin "
-            "that acts after steps",
-            found=misfit,
-            todo="repair the plugin; `crossgrad plugins check` looks at its edits",
-        )
+    _check_edit(setup, state, edit)
     _apply(setup, state, edit)
     if edit.source is None:
         return False
@@ -226,32 +219,45 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
     return True
 
 
-def keep(setup: Setup, state: TrainState, rows: Tensor) -> None:
-    """Keeps these primitives only, as they are: what a backbone derives is not renewed.
+def _check_edit(setup: Setup, state: TrainState, edit: Edit) -> None:
+    if misfit := misfit_of(edit, setup.blocks, state.tensors):
+        raise UserError(
+            "a plugin's edit does not fit the primitives",
+            where=f"step {state.step}, densifier {setup.selection.names['densifier']} or a plugin "
+            "that acts after steps",
+            found=misfit,
+            todo="repair the plugin; `crossgrad plugins check` looks at its edits",
+        )
 
-    What ends it halfway leaves the state as it was.
 
-    Args:
-        setup: The run.
-        state: Its state.
-        rows: [M] int64, in rising order.
+def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
+    """Yield the edits of a finished run, each when it is applied; derived values are not renewed.
+
+    What ends an edit halfway leaves the state as it was.
+
+    Raises:
+        UserError: An edit does not fit the parameters.
     """
-    edit, adam, before = Edit(rows), state.adam, state.primitives(setup)
-    names = [n for block in setup.blocks if block.per_primitive for n in block.tensors]
-    first, second = (
-        {**moments, **{n: apply_to_moment(edit, n, moments[n]) for n in names if n in moments}}
-        for moments in (adam.exp_avg, adam.exp_avg_sq)
-    )
-    tensors = apply_to_parameters(edit, setup.blocks, state.tensors)
-    source, fresh = gather_indices(edit, before, rows.device)
-    states = {
-        name: with_rows(setup, state, old, rows)
-        if name == AVERAGE
-        else _gathered(name, old, source, fresh, before)
-        for name, old in state.states.items()
-    }
-    state.moments = replace(adam, exp_avg=first, exp_avg_sq=second)
-    state.tensors, state.states = tensors, states
+    for hook in one_by_one(setup.manager, "crossgrad_final_edit"):
+        shown = eval_parameters(setup, state)
+        model = replace(
+            model_of(setup, state),
+            phase=setup.phase(state.step, training=False),
+            parameters=shown,
+        )
+        answers: list[object] = hook(model=model)
+        for answer in answers:
+            if not isinstance(answer, FinalEdit):
+                raise wrong_answer(hook, "a FinalEdit, or None", repr(answer))
+            _check_edit(setup, state, answer.edit)
+            adam = state.adam
+            moments = replace(adam, exp_avg=dict(adam.exp_avg), exp_avg_sq=dict(adam.exp_avg_sq))
+            changed = replace(state, moments=moments)
+            _apply(setup, changed, answer.edit)
+            state.tensors, state.moments = changed.tensors, changed.moments
+            state.states = changed.states
+            state.accept(answer.states, hook)
+            yield answer
 
 
 def put_in_order(setup: Setup, state: TrainState) -> None:
@@ -319,7 +325,6 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     # An edit needs the memory that gradients hold.
     del of_views, context, aggregated, of_step
     counts = _finish(setup, state, rendered, gradients, scale)
-    update_average(setup, state)
     primitives = state.primitives(setup)
     state.counters.peak_primitives = max(state.counters.peak_primitives, primitives)
     return StepRecord(
@@ -471,6 +476,8 @@ def _finish(
         edited |= _after_step(setup, state, edited=edited)
     if edited:
         put_in_order(setup, state)
+    if setup.follows_steps:
+        _step_done(setup, state, edited=edited or bool(edit.values))
     return edit.counts
 
 
@@ -488,7 +495,7 @@ def _optimize(
     whole = {name: dense(g) for name, g in found.items() if name not in sparse_rows}
     state.settle(name for name, g in whole.items() if g is not None)
     _take_adam_step(setup, state, whole, rates, rule, scale)
-    clamp_scales(setup, state)
+    _after_optimizer(setup, state)
     for name, gradient in sparse_rows.items():
         param, to_sum = state.tensors[name], scale.to_sum[name]
         step = one_more(name, param, state.moments, rates[name], rule, to_sum)
@@ -531,29 +538,44 @@ def _densify(setup: Setup, state: TrainState, rendered: Rendered) -> tuple[Edit,
     answer = call_first_result(setup.hook.crossgrad_densify, context, DensifyResult)
     state.accept(answer.states, setup.hook.crossgrad_densify)
     edited = apply_edit(setup, state, answer.edit)
-    if edited or answer.edit.values:
-        restart(state)
     state.laps.lap("density_control")
     return answer.edit, edited
+
+
+def _after_optimizer(setup: Setup, state: TrainState) -> None:
+    for hook in setup.optimizer_hooks:
+        context = _after_context(setup, state, edited=False)
+        for answer in call_all(hook, context, DensifyResult):
+            if not answer.edit.keeps_rows:
+                raise wrong_answer(hook, "an edit of values", "an edit of the set of primitives")
+            state.accept(answer.states, hook)
+            apply_edit(setup, state, answer.edit)
 
 
 def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
     """Whether the set of primitives changed."""
     changed = False
-    context = AfterStepContext(
+    context = _after_context(setup, state, edited=edited)
+    for answer in call_all(setup.hook.crossgrad_after_step, context, DensifyResult):
+        state.accept(answer.states, setup.hook.crossgrad_after_step)
+        changed |= apply_edit(setup, state, answer.edit)
+    return changed
+
+
+def _step_done(setup: Setup, state: TrainState, *, edited: bool) -> None:
+    context = _after_context(setup, state, edited=edited)
+    for answer in call_all(setup.hook.crossgrad_step_done, context, Answer):
+        state.accept(answer.states, setup.hook.crossgrad_step_done)
+
+
+def _after_context(setup: Setup, state: TrainState, *, edited: bool) -> AfterStepContext:
+    return AfterStepContext(
         **context_fields(setup, state, "after_step"),
         parameters=state.current,
         backbone=setup.backbone,
         means_lr=means_rate_at(setup, state.step),
         edited=edited,
     )
-    for answer in call_all(setup.hook.crossgrad_after_step, context, DensifyResult):
-        state.accept(answer.states, setup.hook.crossgrad_after_step)
-        # Noise and filters, which change in every step, are what an average takes away.
-        if apply_edit(setup, state, answer.edit):
-            restart(state)
-            changed = True
-    return changed
 
 
 def _check_finite(

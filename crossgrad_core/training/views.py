@@ -27,6 +27,7 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render
 from crossgrad_core.contract.gradients import Gradients
+from crossgrad_core.contract.rule import GaussiansContext
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.columns import is_native
@@ -35,8 +36,8 @@ from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.sparse_rows import coalesced, dense
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.manager import call_all, call_first_result
-from crossgrad_core.training.dropout import dropped
 from crossgrad_core.training.per_image_params import Leaves, apply, leaves_of
+from crossgrad_core.training.rules import view_gaussians
 from crossgrad_core.training.scaled_photos import Pair, on_device
 from crossgrad_core.training.setup import Scale, Setup
 from crossgrad_core.training.state import NonFiniteError, TrainState
@@ -463,8 +464,15 @@ def _prepare(
     target = target_at(setup, state, draw.views[slot], scale, slot)
     background = background_of(setup, state)
     state.laps.lap("photos")
-    seen = as_in_full(_seen(setup, state, target.camera), setup.rasterizer, target.stride)
-    gaussians = dropped(setup, state, seen)
+    gaussians = as_in_full(_seen(setup, state, target.camera), setup.rasterizer, target.stride)
+    if setup.gaussians_hooks:
+        context = GaussiansContext(
+            **context_fields(setup, state, "regularize"),
+            view=setup.train_views[draw.views[slot]],
+            gaussians=gaussians,
+            rngs=state.rngs,
+        )
+        gaussians = view_gaussians(setup, state, context)
     state.laps.lap("decode")
     return _Prepared(slot, target, background, gaussians)
 

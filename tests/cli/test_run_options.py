@@ -36,9 +36,14 @@ def test_type_help_and_heading_are_the_field_s(option):
     assert parameter.default is None  # What the user does not give is left to the schema.
 
 
-def test_each_flag_is_the_setting_s_name_but_two():
-    renamed = {option.path: option.name for option in OPTIONS if option.name != option.path[-1]}
-    assert renamed == {("views_per_step",): "views", ("observers",): "observe"}
+def test_each_flag_is_the_setting_s_name_but_three():
+    renamed = {option.name: option.path for option in OPTIONS if option.name != option.path[-1]}
+    assert renamed == {
+        "views": ("views_per_step",),
+        "observe": ("observers",),
+        "rule": ("rules",),
+        "no_rule": ("rules",),
+    }
 
 
 @pytest.mark.parametrize(

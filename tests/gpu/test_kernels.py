@@ -18,16 +18,15 @@ from crossgrad_core.contract.blocks import AdamState
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam.adam import adam_step
 from crossgrad_core.training.adam.axes import step_along_axes
-from crossgrad_core.training.dropout import STREAM, dropped
-from crossgrad_core.training.floaters import rows_without_floaters
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.step import keep
+from crossgrad_core.training.step import final_edits
 from crossgrad_core.training.strided_rendering import as_in_full, camera_of
 from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 from crossgrad_plugins.rasterizers.gsplat_cuda import GsplatRasterizer
 from crossgrad_plugins.rasterizers.gswarp_cuda import GswarpRasterizer
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
+from crossgrad_plugins.rules.dropout import Dropout
 
 pytestmark = [
     pytest.mark.gpu,
@@ -241,12 +240,13 @@ def test_adam_is_that_of_the_cpu():
 
 def test_what_a_view_is_drawn_without_is_drawn_on_the_device_and_repeatable():
     scene = random_gaussians(100_000, CAMERAS["middle"], opacities=(0.1, 0.2))
-    setup = SimpleNamespace(config=SimpleNamespace(dropout=0.3))
+    rule = Dropout(share=0.3)
     found = []
     for _ in range(2):
-        state = SimpleNamespace(rngs={STREAM: np.random.default_rng(4)})
-        gaussians = leaves(scene, "cuda", torch.float32)
-        found.append([dropped(setup, state, gaussians).opacities.detach() for _ in range(2)])
+        rngs = {"dropout": np.random.default_rng(4)}
+        context = SimpleNamespace(gaussians=leaves(scene, "cuda", torch.float32), rngs=rngs)
+        answers = [rule.crossgrad_view_gaussians(context) for _ in range(2)]
+        found.append([each.gaussians.opacities.detach() for each in answers])
     (first, second), again = found
     assert torch.equal(first, again[0])
     assert torch.equal(second, again[1])
@@ -261,7 +261,7 @@ def started(rasterizer, device="cuda", **options):
         "steps": 200,
         "device": device,
         "rasterizer": rasterizer,
-        "dropout": 0.0,  # A GPU leaves out others than the CPU.
+        "rules": {"dropout": False},  # A GPU leaves out others than the CPU.
         "metrics": [{"name": "psnr"}],
         **options,
     }
@@ -274,7 +274,7 @@ def started(rasterizer, device="cuda", **options):
     [
         {"densifier": {"name": "none"}},
         {"views_per_step": 2, "operator": {"name": "pcgrad"}},
-        {"backbone": {"name": "distance"}, "dropout": 0.3},
+        {"backbone": {"name": "distance"}, "rules": {"dropout": {}}},
     ],
     ids=str,
 )
@@ -322,10 +322,9 @@ def test_floaters_are_those_of_the_cpu(backbone):
         moved = centers[rows % len(centers)]
         moved = moved + 0.1 * torch.randn(len(rows), 3, generator=draws, dtype=moved.dtype)
         positions[rows.to(device)] = moved.to(positions)
-        left = rows_without_floaters(setup, state)
-        assert left is not None
+        (removal,) = final_edits(setup, state)
+        left = removal.edit.source
         assert left.device.type == device
-        keep(setup, state, left)
         assert len(state.parameters[setup.backbone.positions]) == len(left)
         timed_step(setup, state)
         found[device] = left.cpu()

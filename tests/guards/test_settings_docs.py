@@ -31,6 +31,7 @@ def options():
     parameters = get_command(app).commands["run"].params
     return {each.name: each.opts[0] for each in parameters} | {
         "observers": "--observe",
+        "rules": "--rule",
         "views_per_step": "--views",
     }
 

@@ -53,7 +53,11 @@ def trained(number, *plugins, **settings):
 def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
     plain, doubled = (
         assembled(
-            backbone={"name": backbone}, rate_factor=factor, lr_tail=0.0, beta1=0.9, beta2=0.999
+            backbone={"name": backbone},
+            rate_factor=factor,
+            rules={"lr-tail": False},
+            beta1=0.9,
+            beta2=0.999,
         )
         for factor in (1.0, 2.0)
     )

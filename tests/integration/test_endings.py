@@ -15,11 +15,12 @@ from crossgrad_core.contract.blocks import Edit, Rows
 from crossgrad_core.contract.contexts import DensifyResult
 from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import app, assemble, finish, session
+from crossgrad_core.run import app, assemble, session
 from crossgrad_core.run.checkpoint.checkpoint import latest, load
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.scene import photos_ahead
 from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_plugins.rules.floaters import Floaters
 
 STEPS, FAILS_IN = 8, 5
 RESULTS = {"per_view.csv", "curve.png", "renders", "point_cloud.ply", "summary.json"}
@@ -388,16 +389,19 @@ def test_what_ends_the_removal_of_floaters_loses_nothing(
     whole, out = tmp_path / "whole", tmp_path / "run"
     assert run(scene, whole) == 0
 
-    def broken(setup, state):
+    @hookimpl
+    def broken(self, model):
         raise error
 
     with monkeypatch.context() as patched:
-        patched.setattr(finish, "rows_without_floaters", broken)
+        patched.setattr(Floaters, "crossgrad_final_edit", broken)
         assert run(scene, out) == (0 if isinstance(error, KeyboardInterrupt) else 1)
     stopped = isinstance(error, KeyboardInterrupt)
     assert summary(out)["status"] == ("stopped" if stopped else "failed")
     if not stopped:
-        assert summary(out)["error"].startswith("floaters are left: ZeroDivisionError: by zero")
+        told = "the model is left as it was trained: in hook crossgrad_final_edit of rule floaters"
+        assert summary(out)["error"].startswith(told)
+        assert "ZeroDivisionError: by zero" in summary(out)["error"]
     assert read_metrics(out)[-1]["primitives"] == summary(whole)["primitives"] + 3
     assert resumed(out) == 0
     assert_same(out, whole)
@@ -410,7 +414,7 @@ def test_floaters_are_removed_when_a_run_is_finished(scene, tmp_path, with_plugi
     cleaned, stopped, kept = tmp_path / "cleaned", tmp_path / "stopped", tmp_path / "kept"
     assert run(scene, cleaned) == 0
     assert run(scene, stopped, stop_after=3) == 0
-    assert run(scene, kept, floaters="keep") == 0
+    assert run(scene, kept, rules={"floaters": False}) == 0
     count = summary(kept)["primitives"]
     assert summary(stopped)["primitives"] == count
     assert summary(cleaned)["primitives"] == count - 3

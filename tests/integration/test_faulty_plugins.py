@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from crossgrad_core.plugin import (
     Densifier, ViewSample, Edit, Figure, Grouping, Loss, Metric, Observer, Rasterizer, Reader,
-    Resolution, Rows, Rule, Sampler, UserError, hookimpl,
+    Resolution, Rows, GroupingRule, Sampler, UserError, hookimpl,
 )
 
 class TensorMetric(Metric):
@@ -38,7 +38,7 @@ class Before(Sampler):
 
 class Fewer(Grouping):
     def fit(self, scene, rng, probe=None):
-        return Rule(lambda views: ("near", "near", "far", "far"))
+        return GroupingRule(lambda views: ("near", "near", "far", "far"))
 
 class Failing(Grouping):
     def fit(self, scene, rng, probe=None):

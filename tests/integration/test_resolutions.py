@@ -76,7 +76,7 @@ CASES = {
     "spectral, a length that changes": {"resolution": SPECTRAL, **REVISIONS},
     "running losses, exposure, average": {
         "resolution": SPECTRAL, "sampler": {"name": "active"}, "operator": {"name": "gradnorm"},
-        "exposure": {"name": "gain"}, "weight_averaging": 0.3,
+        "exposure": {"name": "gain"}, "rules": {"weight-averaging": {"share": 0.3}},
     },
     "a further view, anchors": {
         "resolution": SPECTRAL, "backbone": {"name": "scaffold"}, "densify_views": "extra",

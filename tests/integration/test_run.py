@@ -110,15 +110,18 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
 
 
 def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scene, tmp_path):
-    settings = {"steps": 20, "weight_averaging": 0.5, "lr_tail": 0.5, "eval_every": 4}
-    run(scene, tmp_path / "raw", **{**settings, "weight_averaging": 0.0})
+    settings = {"steps": 20, "eval_every": 4}
+    tail = {"lr-tail": {"share": 0.5}}
+    settings["rules"] = {**tail, "weight-averaging": {"share": 0.5}}
+    run(scene, tmp_path / "raw", **{**settings, "rules": tail})
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=15, **settings) == 0
     assert app.run({}, resume=tmp_path / "parts", verbosity=-1) == 0
     whole, parts = load(latest(tmp_path / "whole")), load(latest(tmp_path / "parts"))
     assert same(whole.parameters, parts.parameters)
     assert same(whole.parameters, load(latest(tmp_path / "raw")).parameters)
-    assert same(whole.plugins["average"].tensors, parts.plugins["average"].tensors)
+    (one, two) = (each.plugins["weight-averaging"].per_primitive for each in (whole, parts))
+    assert one and same(one, two)
     rows = [row for row in quality(tmp_path / "parts") if row["step"] != "15"]
     assert rows == quality(tmp_path / "whole")
     # The average of steps 11 to 20 begins after the evaluation of step 8.

@@ -57,7 +57,7 @@ EXTRAS: tuple[Mapping[str, Any], ...] = (
     {"batch_rule": "sqrt"},
     {"max_gaussians": 50_000},
     {"growth": "unbounded"},
-    {"sh_every": 2},
+    {"rules": {"sparse-sh": {"every": 2}}},
 )
 DEVICES = ("cpu", "cuda")
 #: Primitives at the start, for the budget.
@@ -73,7 +73,7 @@ DECIDED = (
         "steps",
         "schedule_unit",
     ),
-    *("sh_every", "lr_tail", "weight_averaging", "floaters", "dropout", "growth", "max_gaussians"),
+    *("rules", "growth", "max_gaussians"),
 )
 
 
@@ -162,7 +162,6 @@ def decided(settings: Mapping[str, Any]) -> Mapping[str, Any]:
         "rates": {step: rates_at(setup, step) for step in _steps(setup)},
         "adam": {step: repr(rule_at(setup, step)) for step in _steps(setup)},
         "axes": axes_of(setup),
-        "max_scale_ratio": setup.numbers.max_scale_ratio,
         "growth": setup.numbers.growth,
         "bound": setup.numbers.max_gaussians,
         "budget": _budget(setup),
@@ -178,7 +177,7 @@ def _steps(setup: Setup) -> tuple[int, ...]:
 def _schedule(setup: Setup) -> Mapping[str, Any]:
     schedule = setup.schedule
     names = (
-        *("mode", "total", "length", "lr_until", "sh_interval", "sh_from", "sh_wait", "sh_every"),
+        *("mode", "total", "length", "lr_until", "sh_interval", "sh_from", "sh_wait"),
         *("densify_from", "densify_until", "densify_every", "reset_every", "min_refinements"),
         *("anchors_from", "anchors_every", "coarse_until"),
     )

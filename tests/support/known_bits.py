@@ -42,9 +42,8 @@ USUAL: Mapping[str, Any] = {
     "views": 2,
     "beta1": 0.9,
     "beta2": 0.999,
-    "floaters": "keep",
+    "rules": {"floaters": False, "scale-clamp": False},
     "position_lr": "extent",
-    "max_scale_ratio": 0.0,
 }
 BACKBONES = ("analytic", "distance", "mip", "octree", "pixel", "scaffold", "vanilla")
 #: Name -> the settings of a run; what begins with `bundled` has the bundled scene.

@@ -8,7 +8,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import (
     GradientProbe,
     Grouping,
-    Rule,
+    GroupingRule,
     Scene,
     UserError,
     View,
@@ -22,7 +22,7 @@ class MedianDistance(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         threshold = float(np.median(radial_distances(scene, scene.train_views)))
 
         def labels(views: Sequence[View]) -> tuple[str, ...]:
@@ -31,4 +31,4 @@ class MedianDistance(Grouping):
 
         if len(set(labels(scene.train_views))) == 1:
             raise UserError("all training cameras are equally far", where="grouping")
-        return Rule(labels)
+        return GroupingRule(labels)

@@ -10,6 +10,7 @@ from crossgrad_example.equal_length import EqualLength
 from crossgrad_example.faint import Faint
 from crossgrad_example.gain import Gain
 from crossgrad_example.gentle import Gentle
+from crossgrad_example.jitter import Jitter
 from crossgrad_example.largest_error import LargestError
 from crossgrad_example.least_seen import LeastSeen
 from crossgrad_example.median_distance import MedianDistance
@@ -36,6 +37,7 @@ PLUGINS = {
     "metrics": LargestError,
     "observers": Clip,
     "recipes": Gentle,
+    "rules": Jitter,
     "commands": count_views,
 }
 CASES = [(slot, check) for slot in PLUGINS for check in checks_of(slot)]

@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 
 from crossgrad_core.commands import (
     COMMANDS,
-    LISTS,
+    MANY,
     Entry,
     listed,
     load_command,
@@ -104,7 +104,7 @@ def _options(entry: Entry, component: "type[Component]") -> str:
     fields = component.model_fields
     if not fields:
         return f"{_MARGIN}no options"
-    prefix = f"{entry.slot}.{entry.name}" if entry.slot in LISTS else singular(entry.slot)
+    prefix = f"{entry.slot}.{entry.name}" if entry.slot in MANY else singular(entry.slot)
     heading = f"{_MARGIN}options (--set {prefix}.OPTION=VALUE):"
     return "\n".join([heading, *(_option(name, field) for name, field in fields.items())])
 

@@ -11,8 +11,8 @@ from typing_extensions import override
 from crossgrad_core.plugin import (
     GradientProbe,
     Grouping,
+    GroupingRule,
     Quantity,
-    Rule,
     Scene,
     View,
 )
@@ -45,7 +45,7 @@ class Altitude(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "altitude")
         axis, source = upward(scene, self.up)
         train = altitudes(scene, scene.train_views, axis)
@@ -55,7 +55,7 @@ class Altitude(Grouping):
             f"grouping altitude: near up to {threshold:.4g} local units above the mean camera; "
             f"up is {np.array2string(axis, precision=3)} ({source})"
         )
-        return Rule(lambda views: halves(altitudes(scene, views, axis), threshold), (note,))
+        return GroupingRule(lambda views: halves(altitudes(scene, views, axis), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

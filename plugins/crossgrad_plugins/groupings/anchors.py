@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
+from crossgrad_core.plugin import GradientProbe, Grouping, GroupingRule, Quantity, Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import rule_by_shares
 
@@ -27,7 +27,7 @@ class Anchors(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         return rule_by_shares(scene, "anchors", self.share, (NEAR, FAR))
 
     @override

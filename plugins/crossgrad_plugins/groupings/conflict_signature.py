@@ -11,9 +11,9 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import (
     GradientProbe,
+    GroupingRule,
     Model,
     Regrouping,
-    Rule,
     Scene,
     UserError,
     View,
@@ -54,12 +54,12 @@ class ConflictSignature(Regrouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "conflict-signature")
         if probe is None:
             early = Radial().fit(scene, rng)
             later = f"grouping conflict-signature: by gradients after step {self.at}, until then:"
-            return Rule(early.labels, (later, *early.notes))
+            return GroupingRule(early.labels, (later, *early.notes))
         count = min(self.cameras, len(scene.train))
         probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
         cosines = mean_cosines(probe.gramians([int(i) for i in probed]))
@@ -75,7 +75,7 @@ class ConflictSignature(Regrouping):
             return tuple(train[i] for i in nearest)
 
         note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
-        return Rule(labels, (note,))
+        return GroupingRule(labels, (note,))
 
     @property
     @override
@@ -83,7 +83,7 @@ class ConflictSignature(Regrouping):
         return self.at
 
     @override
-    def refit(self, model: Model, rng: np.random.Generator) -> Rule:
+    def refit(self, model: Model, rng: np.random.Generator) -> GroupingRule:
         from crossgrad_plugins.diagnostics.probe import ModelProbe
 
         try:
@@ -91,7 +91,7 @@ class ConflictSignature(Regrouping):
         except UserError as error:
             # Gradients that all agree make one group; a run goes on with those it has.
             early = Radial().fit(model.scene, rng)
-            return Rule(early.labels, (f"the groups stay as they are: {error.what}",))
+            return GroupingRule(early.labels, (f"the groups stay as they are: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,8 +10,8 @@ from typing_extensions import override
 from crossgrad_core.plugin import (
     GradientProbe,
     Grouping,
+    GroupingRule,
     Quantity,
-    Rule,
     Scene,
     UserError,
     View,
@@ -46,7 +46,7 @@ class Footprint(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "footprint")
         own = _own(scene, scene.train_views)
         blind = np.isnan(own)
@@ -69,7 +69,7 @@ class Footprint(Grouping):
         note = f"grouping footprint: near from {-threshold:.4g} pixels per local unit"
         if blind.any():
             note += f"; training views without SfM points go with the nearest other: {blind.sum()}"
-        return Rule(lambda views: halves(sizes(views), threshold), (note,))
+        return GroupingRule(lambda views: halves(sizes(views), threshold), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

@@ -11,8 +11,8 @@ from typing_extensions import override
 from crossgrad_core.plugin import (
     GradientProbe,
     Grouping,
+    GroupingRule,
     Quantity,
-    Rule,
     Scene,
     View,
     radial_distances,
@@ -42,7 +42,7 @@ class GaussianMixture(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "gmm")
         distances = radial_distances(scene, scene.train_views)
         away = distances[distances > 0.0]
@@ -50,10 +50,10 @@ class GaussianMixture(Grouping):
         if mixture is None or len(set(mixture.labels(away))) == 1:
             median = Radial().fit(scene, rng)
             fallback = "grouping gmm: the mixture is degenerate, the median split is used instead"
-            return Rule(median.labels, (fallback, *median.notes))
+            return GroupingRule(median.labels, (fallback, *median.notes))
         near, far = np.exp(mixture.means)
         note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
-        return Rule(lambda views: mixture.labels(radial_distances(scene, views)), (note,))
+        return GroupingRule(lambda views: mixture.labels(radial_distances(scene, views)), (note,))
 
     @override
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity:

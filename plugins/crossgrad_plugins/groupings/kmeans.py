@@ -10,7 +10,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import (
     GradientProbe,
     Grouping,
-    Rule,
+    GroupingRule,
     Scene,
     View,
     centers_of,
@@ -38,7 +38,7 @@ class KMeans(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "kmeans")
         points = centers_of(scene.train_views)
         trials = [_lloyd(points, _seeds(points, rng)) for _ in range(self.restarts)]
@@ -55,7 +55,7 @@ class KMeans(Grouping):
             clusters = _nearest(centers_of(views), centroids)
             return tuple(NEAR if cluster == near else FAR for cluster in clusters)
 
-        return Rule(labels, (note,))
+        return GroupingRule(labels, (note,))
 
 
 def _nearest(points: NDArray[np.float64], centroids: NDArray[np.float64]) -> NDArray[np.int64]:

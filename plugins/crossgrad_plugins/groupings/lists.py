@@ -8,7 +8,15 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import GradientProbe, Grouping, Rule, Scene, UserError, View, read_rows
+from crossgrad_core.plugin import (
+    GradientProbe,
+    Grouping,
+    GroupingRule,
+    Scene,
+    UserError,
+    View,
+    read_rows,
+)
 from crossgrad_plugins.groupings.split import require_training_views
 
 
@@ -28,7 +36,7 @@ class Lists(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         require_training_views(scene, "lists")
         table = None if self.file is None else read_labels(self.file)
 
@@ -39,7 +47,7 @@ class Lists(Grouping):
 
         train = set(labels(scene.train_views))
         _require_two(train, self.file)
-        return Rule(labels, (f"grouping lists: {', '.join(sorted(train))}",))
+        return GroupingRule(labels, (f"grouping lists: {', '.join(sorted(train))}",))
 
 
 def read_labels(path: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
+from crossgrad_core.plugin import GradientProbe, Grouping, GroupingRule, Quantity, Scene, View
 from crossgrad_plugins.groupings.split import log_distances, rule_of_distances
 
 
@@ -24,7 +24,7 @@ class Percentile(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         return rule_of_distances(
             scene, "percentile", lambda distances: np.percentile(distances, self.q)
         )

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
+from crossgrad_core.plugin import GradientProbe, Grouping, GroupingRule, Quantity, Scene, View
 from crossgrad_plugins.groupings.split import CUT, Cut, cut_of, log_distances, rule_of_distances
 
 
@@ -22,7 +22,7 @@ class Radial(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         return rule_of_distances(scene, "radial", partial(cut_of, cut=self.cut))
 
     @override

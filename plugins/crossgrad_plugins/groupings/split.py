@@ -6,7 +6,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Quantity, Rule, Scene, UserError, View, radial_distances
+from crossgrad_core.plugin import GroupingRule, Quantity, Scene, UserError, View, radial_distances
 from crossgrad_plugins.groupings.thresholds import otsu_threshold
 
 #: Where a distance is cut in near and far: at the median, or where Otsu cuts its logarithm.
@@ -23,7 +23,7 @@ def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
 
 def rule_of_distances(
     scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], float | np.floating]
-) -> Rule:
+) -> GroupingRule:
     """Labels `near` where the distance from the mean training camera is at most a threshold.
 
     Args:
@@ -39,7 +39,7 @@ def rule_of_distances(
     threshold = float(threshold_of(train))
     require_groups(grouping, halves(train, threshold), (NEAR, FAR), "distance from their mean")
     note = f"grouping {grouping}: near up to {threshold:.4g} local units from the mean camera"
-    return Rule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
+    return GroupingRule(lambda views: halves(radial_distances(scene, views), threshold), (note,))
 
 
 def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from typing_extensions import override
 
-from crossgrad_core.plugin import GradientProbe, Grouping, Quantity, Rule, Scene, View
+from crossgrad_core.plugin import GradientProbe, Grouping, GroupingRule, Quantity, Scene, View
 from crossgrad_plugins.groupings.split import FAR, MIDDLE, NEAR, log_distances
 from crossgrad_plugins.groupings.thirds import rule_by_shares
 
@@ -22,7 +22,7 @@ class Terciles(Grouping):
     @override
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
-    ) -> Rule:
+    ) -> GroupingRule:
         return rule_by_shares(scene, "terciles", 1.0 / 3.0, self.labels)
 
     @override

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.plugin import Rule, Scene, radial_distances
+from crossgrad_core.plugin import GroupingRule, Scene, radial_distances
 from crossgrad_plugins.groupings.split import (
     FAR,
     MIDDLE,
@@ -15,7 +15,9 @@ from crossgrad_plugins.groupings.split import (
 )
 
 
-def rule_by_shares(scene: Scene, grouping: str, share: float, needed: Sequence[str]) -> Rule:
+def rule_by_shares(
+    scene: Scene, grouping: str, share: float, needed: Sequence[str]
+) -> GroupingRule:
     """Near up to quantile `share` of the radial distance, far beyond quantile 1 - share.
 
     Args:
@@ -33,7 +35,7 @@ def rule_by_shares(scene: Scene, grouping: str, share: float, needed: Sequence[s
     quantity = "distance from their mean"
     require_groups(grouping, _three(train, low, high), needed, quantity)
     note = f"grouping {grouping}: near up to {low:.4g}, far beyond {high:.4g} local units"
-    return Rule(lambda views: _three(radial_distances(scene, views), low, high), (note,))
+    return GroupingRule(lambda views: _three(radial_distances(scene, views), low, high), (note,))
 
 
 def _three(values: NDArray[np.float64], low: float, high: float) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ def degree(evidence: Evidence) -> Finding:
     """Up to which degree colours depend on the direction."""
     part, config = "SH degree", evidence.config
     name = config.backbone.name
-    of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "sh_every")
+    of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "rules.sparse-sh")
     if evidence.is_given(*of_bands, "data.init"):
         chosen = config.backbone.options.get("sh_degree", "as you start it")
         return given(part, chosen, "--set backbone.sh_degree=N")

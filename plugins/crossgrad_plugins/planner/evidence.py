@@ -37,6 +37,7 @@ class Evidence:
         own, usual = self.config.data, type(self.config.data)()
         known |= {f"data.{n}" for n in own.model_fields_set if getattr(own, n) != getattr(usual, n)}
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
+        known |= {f"rules.{name}" for name in self.config.rules}
         return not known.isdisjoint(names)
 
     @cached_property

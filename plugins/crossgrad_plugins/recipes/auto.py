@@ -189,11 +189,11 @@ def _dropout(facts: Facts) -> Decision:
     photos = facts.photos_per_point
     few = 0.0 < photos <= FEW_PHOTOS
     return Decision(
-        "dropout",
-        DROPOUT if few else 0.0,
+        "rules.dropout",
+        few and {"share": DROPOUT},
         "few photos show each point" if few else "enough photos show each point",
         f"a point lies in {photos:g} of {facts.photos} photos (median); docs/few-photos.md",
-        "--dropout 0" if few else "",
+        "--no-rule dropout" if few else "",
     )
 
 
@@ -343,11 +343,11 @@ def steps(choice: Choice) -> list[Decision]:
             "--position-lr extent" if along else "",
         ),
         Decision(
-            "max_scale_ratio",
-            SCALE_RATIO if bounded else 0.0,
+            "rules.scale-clamp",
+            bounded and {"ratio": SCALE_RATIO},
             "large Gaussians near a camera hide the scene" if bounded else "as published",
             "docs/floaters.md",
-            "--set max_scale_ratio=0" if bounded else "",
+            "--no-rule scale-clamp" if bounded else "",
         ),
         Decision(
             "sh_start",
@@ -376,17 +376,17 @@ def ends(choice: Choice) -> list[Decision]:
     fades = any(not block.lr.decays for block in choice.facts.backbone.trained_blocks())
     return [
         Decision(
-            "lr_tail",
-            LR_TAIL if fades else 0.0,
+            "rules.lr-tail",
+            fades and {"share": LR_TAIL},
             "constant rates fade at the end" if fades else "all rates decay already",
             "docs/steady-ends.md",
-            "--lr-tail 0" if fades else "",
+            "--no-rule lr-tail" if fades else "",
         ),
         Decision(
-            "floaters",
-            "remove" if edits else "keep",
+            "rules.floaters",
+            {} if edits else False,
             "no photo shows them, and they hide the scene" if edits else "the primitives stay",
             "docs/floaters.md",
-            "--floaters keep" if edits else "",
+            "--no-rule floaters" if edits else "",
         ),
     ]

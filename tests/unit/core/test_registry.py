@@ -17,7 +17,7 @@ from crossgrad_core.system.version import VERSION
 GOOD = """
 from functools import wraps
 from pydantic import Field
-from crossgrad_core.plugin import Rule, Grouping
+from crossgrad_core.plugin import GroupingRule, Grouping
 
 def helped(function):
     @wraps(function)
@@ -30,7 +30,7 @@ class Good(Grouping):
     seed: int = Field(3, ge=0, description="seed")
 
     def fit(self, scene, rng, probe=None):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Demanding(Good):
     file: str = Field(description="a file")
@@ -40,29 +40,29 @@ class Unfinished(Grouping):
 
 class Few(Good):
     def fit(self, scene):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Many(Good):
     def fit(self, scene, rng, probe, more):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Without(Good):
     def fit(self, scene, rng):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Any(Good):
     def fit(self, *arguments, **more):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Static(Good):
     @staticmethod
     def fit(scene, rng, probe=None):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Decorated(Good):
     @helped
     def fit(self, scene, rng, probe, helper):
-        return Rule(lambda views: ("near",) * len(views))
+        return GroupingRule(lambda views: ("near",) * len(views))
 
 class Own(Good):
     def copy(self):

@@ -19,6 +19,7 @@ from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.schedules import schedule_of
+from crossgrad_core.training.setup import learns_in
 
 
 def test_published_schedule_at_reference_length():
@@ -49,8 +50,7 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
 
 @pytest.mark.parametrize("every", range(1, 20))
 def test_what_may_rest_learns_in_one_of_each_n_steps_and_with_all_turns_of_a_sampler(every):
-    schedule = replace(Schedule.for_run(100 * every), sh_every=every)
-    learns = np.array([not schedule.rests(step) for step in range(1, 100 * every + 1)])
+    learns = np.array([learns_in(step, every) for step in range(1, 100 * every + 1)])
     assert (learns.reshape(100, every).sum(axis=1) == 1).all()
     for turns in (2, 3, 4, 8):
         counts = np.bincount(np.flatnonzero(learns) % turns, minlength=turns)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.grouping import Grouping, Quantity, Rule
+from crossgrad_core.contract.grouping import Grouping, GroupingRule, Quantity
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
@@ -111,7 +111,9 @@ class Sized(Grouping):
     """A third party's: by the number of points that a view sees."""
 
     def fit(self, scene, rng, probe=None):
-        return Rule(lambda views: tuple("near" if len(v.seen) > 3 else "far" for v in views))
+        return GroupingRule(
+            lambda views: tuple("near" if len(v.seen) > 3 else "far" for v in views)
+        )
 
     def quantity(self, scene, views):
         return Quantity("the number of points", np.array([float(len(v.seen)) for v in views]))

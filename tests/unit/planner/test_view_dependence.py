@@ -127,6 +127,6 @@ def test_the_user_s_degree_stays(monkeypatch):
 
 def test_who_says_in_which_steps_bands_learn_has_them(monkeypatch):
     scene = ring()
-    found = decided(scene, observed(scene, 0.0), monkeypatch, sh_every=4)
+    found = decided(scene, observed(scene, 0.0), monkeypatch, rules={"sparse-sh": {"every": 4}})
     assert found.basis == "given"
     assert not found.settings

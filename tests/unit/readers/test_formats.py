@@ -170,7 +170,7 @@ def parameters_after(path, reader):
         threads=1,
         initializer={"name": "points"},
         reader={"name": reader},
-        dropout=0.0,
+        rules={"dropout": False},
     )
     setup = assemble(config, *read_scene(config, path))
     state = first_state(setup)

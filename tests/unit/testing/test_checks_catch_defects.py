@@ -226,17 +226,17 @@ class ChangesItsState(InTurn):
 
 class ForeignLabel(Radial):
     def fit(self, scene, rng, probe=None):
-        return api.Rule(lambda views: ("close",) * len(views))
+        return api.GroupingRule(lambda views: ("close",) * len(views))
 
 
 class OneLabelForAll(Radial):
     def fit(self, scene, rng, probe=None):
-        return api.Rule(lambda views: ("near",))
+        return api.GroupingRule(lambda views: ("near",))
 
 
 class EmptyGroup(Radial):
     def fit(self, scene, rng, probe=None):
-        return api.Rule(lambda views: ("near",) * len(views))
+        return api.GroupingRule(lambda views: ("near",) * len(views))
 
 
 class MeasuresRanks(Radial):
@@ -251,7 +251,7 @@ class FittedOnWhatIsAsked(Radial):
             far = (len(views) + 1) // 2
             return ("far",) * far + ("near",) * (len(views) - far)
 
-        return api.Rule(labels)
+        return api.GroupingRule(labels)
 
 
 class GlobalLabels(Radial):

@@ -297,6 +297,10 @@ def everything(state):
             for name, tensor in getattr(saved, kind).items()}, saved.adam_steps  # fmt: skip
 
 
+#: SH bands above the first learn in one of three steps.
+THIRD = {"rules": {"sparse-sh": {"every": 3}}}
+
+
 @pytest.mark.parametrize(
     ("settings", "plugins"),
     [
@@ -306,12 +310,12 @@ def everything(state):
         ({"operator": "pcgrad", "views": 2, "backbone": "distance"}, ()),
         ({"operator": "graddrop", "views": 2}, ()),
         ({"recipe": {"name": "published"}}, ()),
-        ({"weight_averaging": 0.5}, ()),
+        ({"rules": {"weight-averaging": {"share": 0.5}}}, ()),
         ({}, (Decay,)),
         ({"views": 2}, (PerView,)),
         ({}, (Copies,)),
-        ({"sh_every": 3}, (Decay,)),
-        ({"sh_every": 3, "operator": "pcgrad", "views": 2}, (PerView,)),
+        (THIRD, (Decay,)),
+        ({**THIRD, "operator": "pcgrad", "views": 2}, (PerView,)),
     ],
     ids=str,
 )
@@ -329,9 +333,7 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"operator": "pcgrad", "views": 2}, {"sh_every": 3}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"operator": "pcgrad", "views": 2}, THIRD], ids=str)
 @pytest.mark.parametrize("stop", [6, 13, 14])
 def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
     tmp_path, monkeypatch, stop, settings

@@ -19,6 +19,8 @@ from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.start import first_state
 
+#: SH bands above the first learn in one of two steps.
+SECOND = {"sparse-sh": {"every": 2}}
 IDLE = [
     (
         {"operator": {"name": "chain", "links": ["mean"], "granularity": "kind"}},
@@ -82,8 +84,8 @@ IDLE = [
     ({"densifier": {"name": "mcmc"}, "reset_every": 10}, "reset_every"),
     ({"densifier": {"name": "adc", "prune_scale": 0.3}}, "densifier.prune_scale"),
     ({"densifier": {"name": "dc4gs", "reset_opacity": 0.3}}, "densifier.reset_opacity"),
-    ({"backbone": {"name": "scaffold"}, "sh_every": 2}, "sh_every"),
-    ({"backbone": {"name": "vanilla", "sh_degree": 0}, "sh_every": 2}, "sh_every"),
+    ({"backbone": {"name": "scaffold"}, "rules": SECOND}, "rules.sparse-sh"),
+    ({"backbone": {"name": "vanilla", "sh_degree": 0}, "rules": SECOND}, "rules.sparse-sh"),
     (
         {"densifier": {"name": "absgrad", "criterion": "gsplat", "abs_threshold": 1e-3}},
         "densifier.abs_threshold",
@@ -129,17 +131,15 @@ IDLE = [
     ({"min_refinements": 6, "densify_until": 600}, "min_refinements"),
     ({"min_refinements": 6, "densify_from": 0, "densify_every": 9}, "min_refinements"),
     ({"min_refinements": 6, "schedule": "absolute", "schedule_unit": "views"}, "min_refinements"),
-    ({"lr_tail_factor": 0.5, "lr_tail": 0.0}, "lr_tail_factor"),
-    ({"lr_tail_factor": 0.5, "recipe": {"name": "published"}}, "lr_tail_factor"),
     (
         {
             "backbone": {
                 "name": "scaffold",
                 **dict.fromkeys(("lr_features_final", "lr_scales_final", "lr_cov_final"), 1e-5),
             },
-            "lr_tail": 0.5,
+            "rules": {"lr-tail": {}},
         },
-        "lr_tail",
+        "rules.lr-tail",
     ),
 ]
 #: The same settings where they do something.
@@ -155,8 +155,8 @@ AT_WORK = [
     {"densifier": {"name": "adc"}, "densify_every": 10, "reset_every": 10, "max_gaussians": 10},
     {"densifier": {"name": "none"}, "max_gaussians": 10},
     {"densifier": {"name": "adc", "prune_scale": 0.3}, "reset_every": 10},
-    {"backbone": {"name": "vanilla", "sh_degree": 1}, "sh_every": 2},
-    {"backbone": {"name": "scaffold"}, "sh_every": 1},
+    {"backbone": {"name": "vanilla", "sh_degree": 1}, "rules": SECOND},
+    {"backbone": {"name": "scaffold"}, "rules": {"sparse-sh": False}},
     {"max_gaussians": "auto", "growth": "budget"},
     {"densifier": {"name": "adc"}, "growth": "budget"},
     {"rasterizer": {"name": "torch", "dilation": 0.1}},
@@ -165,9 +165,9 @@ AT_WORK = [
     {"seconds": 9.0, "clock": "cpu"},
     {"stop_after": 10},
     {"steps": None, "seconds": 9.0, "stop_after": 40_000},
-    {"lr_tail": 0.5, "lr_tail_factor": 0.5},
-    {"lr_tail_factor": 0.5},
-    {"backbone": {"name": "scaffold"}, "lr_tail": 0.5},
+    {"rules": {"lr-tail": {"share": 0.5, "factor": 0.5}}},
+    {"rules": {"lr-tail": {"factor": 0.5}}, "recipe": {"name": "published"}},
+    {"backbone": {"name": "scaffold"}, "rules": {"lr-tail": {"share": 0.5}}},
     # A value that is the default is never refused.
     {"operator": {"name": "chain", "links": ["mean"], "granularity": "block"}},
     {"backbone": {"name": "scaffold", "lr_bank": 0.01}},

@@ -30,7 +30,7 @@ from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run import select as selecting
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import averaging, growth_budget, per_image_params, start, step
+from crossgrad_core.training import growth_budget, per_image_params, start, step
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import apply_edit, take_step
 
@@ -252,7 +252,7 @@ def test_a_state_that_is_none_is_refused_at_once():
 
 def test_the_names_of_the_core_are_those_that_it_uses():
     slots = {each.STATE for each in (sampler, operator, densifier, resolution)}
-    own = {each.STATE for each in (per_image_params, growth_budget, averaging)} | {step.GROUPING}
+    own = {each.STATE for each in (per_image_params, growth_budget)} | {step.GROUPING}
     assert slots | own | {start.THINNED} == TAKEN
 
 

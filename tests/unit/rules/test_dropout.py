@@ -9,15 +9,17 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import ViewSample
+from crossgrad_core.contract.rule import GaussiansContext
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
+from crossgrad_core.scene.shown_points import photos_per_point
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.dropout import dropped, photos_per_point
+from crossgrad_core.training.rules import view_gaussians
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step
-from crossgrad_core.training.views import RenderCallback, render_views
+from crossgrad_core.training.views import RenderCallback, context_fields, render_views
 from crossgrad_plugins.recipes.auto import DROPOUT, FEW_PHOTOS
 
 
@@ -31,6 +33,14 @@ def decoded(setup, state):
     return setup.backbone.decode(state.parameters, camera, setup.phase(1, training=True))
 
 
+def dropped(setup, state, gaussians):
+    """What a training view is rendered from."""
+    fields = context_fields(setup, state, "regularize")
+    view = setup.train_views[0]
+    context = GaussiansContext(**fields, view=view, gaussians=gaussians, rngs=state.rngs)
+    return view_gaussians(setup, state, context)
+
+
 def with_photos(count):
     """The scene with so many training photos, all of which show its points."""
     scene = sample_scene()
@@ -39,7 +49,7 @@ def with_photos(count):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
 def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
-    setup = setup_of(dropout=share)
+    setup = setup_of(rules={"dropout": {"share": share}})
     state = first_state(setup)
     whole = decoded(setup, state)
     raised, shares = (whole.opacities / (1.0 - share)).clamp(max=1.0), []
@@ -55,7 +65,7 @@ def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
 
 def test_what_is_nearly_opaque_can_still_fade():
     """Its opacity is cut off at 1, its gradient is not."""
-    setup = setup_of(dropout=0.3)
+    setup = setup_of(rules={"dropout": {"share": 0.3}})
     state = first_state(setup)
     logits = torch.full((500,), 3.0, requires_grad=True)
     gaussians = replace(
@@ -70,16 +80,16 @@ def test_what_is_nearly_opaque_can_still_fade():
     torch.testing.assert_close(gradient, torch.where(part.opacities > 0.0, slope, 0.0))
 
 
-def test_no_share_is_no_change_and_no_draw():
-    setup = setup_of(dropout=0.0)
+def test_without_the_rule_there_is_no_change_and_no_generator():
+    setup = setup_of(rules={"dropout": False})
     state = first_state(setup)
-    whole, before = decoded(setup, state), state.rngs["dropout"].bit_generator.state
+    whole = decoded(setup, state)
     assert dropped(setup, state, whole) is whole
-    assert state.rngs["dropout"].bit_generator.state == before
+    assert "dropout" not in state.rngs
 
 
 def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
-    setup = setup_of(dropout=0.5)
+    setup = setup_of(rules={"dropout": {"share": 0.5}})
     state = first_state(setup)
     rendered, _ = render_views(setup, state, ViewSample((0,)), (1.0,))
     left_out = rendered.records[0].gaussians.opacities == 0.0
@@ -97,26 +107,26 @@ def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
         (FEW_PHOTOS, {}, DROPOUT),
         (FEW_PHOTOS + 1, {}, 0.0),
         (FEW_PHOTOS, {"recipe": {"name": "published"}}, 0.0),
-        (FEW_PHOTOS, {"dropout": 0.0}, 0.0),
-        (FEW_PHOTOS + 1, {"dropout": 0.2}, 0.2),
-        (1, {"recipe": {"name": "published"}, "dropout": 0.2}, 0.2),
+        (FEW_PHOTOS, {"rules": {"dropout": False}}, 0.0),
+        (FEW_PHOTOS + 1, {"rules": {"dropout": {"share": 0.2}}}, 0.2),
+        (1, {"recipe": {"name": "published"}, "rules": {"dropout": {"share": 0.2}}}, 0.2),
     ],
 )
 def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share):
     setup = setup_of(with_photos(photos), **given)
-    assert resolved(setup).dropout == share
-    noted = [row for row in setup.decisions if row.setting == "dropout" and row.override]
-    assert len(noted) == (share > 0.0 and "dropout" not in given)
+    assert resolved(setup).rules.get("dropout", False) == (share > 0.0 and {"share": share})
+    noted = [row for row in setup.decisions if row.setting == "rules.dropout" and row.override]
+    assert len(noted) == (share > 0.0 and "rules" not in given)
 
 
 def test_what_is_said_of_the_default_is_the_default():
-    said = (Path(__file__).parents[3] / "docs" / "settings.md").read_text(encoding="utf-8")
-    row = next(line for line in said.splitlines() if line.startswith("| `dropout`"))
+    said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
+    row = next(line for line in said.splitlines() if line.startswith("| `rules.dropout`"))
     assert f"{DROPOUT}" in row and f"{FEW_PHOTOS} training photos" in row
 
 
 def test_a_run_goes_on_with_the_same_bits():
-    setup = setup_of(dropout=0.3)
+    setup = setup_of(rules={"dropout": {"share": 0.3}})
     whole = first_state(setup)
     for _ in range(5):
         take_step(setup, whole)

@@ -1,5 +1,7 @@
 """No Gaussian is longer than its share of the distance to cameras that have it at their side."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -11,15 +13,11 @@ from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.training import scale_clamp
-from crossgrad_core.training.scale_clamp import (
-    EVERY,
-    LEAST,
-    clamp_scales,
-)
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.step import take_step
+from crossgrad_core.training.step import apply_edit, take_step
 from crossgrad_plugins.recipes.auto import SCALE_RATIO as BOUND
+from crossgrad_plugins.rules import scale_clamp
+from crossgrad_plugins.rules.scale_clamp import EVERY, LEAST
 
 ANCHORS = ("octree", "scaffold")
 AXES = sorted(
@@ -36,6 +34,20 @@ def setup_of(backbone="vanilla", **settings):
     return assemble(
         RunConfig(**{"steps": 100, "backbone": choice, **settings}), sample_scene(), "none"
     )
+
+
+def using(ratio):
+    """The setting of a run with a bound; None leaves it to the recipe."""
+    return {} if ratio is None else {"scale-clamp": {"ratio": ratio} if ratio else False}
+
+
+def clamp_scales(setup, state):
+    context = SimpleNamespace(
+        step=state.step, scene=setup.scene, backbone=setup.backbone, parameters=state.parameters
+    )
+    answer = setup.selection.rules["scale-clamp"].crossgrad_after_optimizer(context)
+    if answer is not None:
+        apply_edit(setup, state, answer.edit)
 
 
 def at_random(setup, seed, step=EVERY):
@@ -78,7 +90,7 @@ def expected(setup, state, bound):
 @pytest.mark.parametrize("seed", range(4))
 def test_axes_are_as_long_as_they_may_be(seed, bound, at_once, monkeypatch):
     monkeypatch.setattr(scale_clamp, "_AT_ONCE", at_once)
-    setup = setup_of(max_scale_ratio=bound)
+    setup = setup_of(rules=using(bound))
     state = at_random(setup, seed)
     before = {name: each.detach().clone() for name, each in state.parameters.items()}
     wanted = expected(setup, state, bound or BOUND)
@@ -100,6 +112,7 @@ def test_what_has_diverged_and_what_is_small_stay():
     scales[:4] = torch.tensor([np.inf, np.nan, np.log(LEAST) - 1e-3, np.log(LEAST) + 1e-3])[:, None]
     before = scales[:3].clone()
     clamp_scales(setup, state)
+    scales = state.parameters["scales"].detach()
     assert torch.equal(scales[:3].nan_to_num(nan=-99.0), before.nan_to_num(nan=-99.0))
     assert scales[3, 0] >= np.log(np.float32(LEAST)) - 1e-6
 
@@ -113,13 +126,16 @@ def test_nothing_is_too_long():
         state.parameters["means"].detach()[:] = 1e4  # 17,321 away; the larger size is 8,103.
         scales[:] = size
         clamp_scales(setup, state)
+        scales = state.parameters["scales"].detach()
         assert torch.equal(scales, torch.full_like(scales, size))
 
 
 def test_a_run_within_seconds_is_told_once_its_length_is_planned(tmp_path, capsys):
     command = ("run", "--seconds", 1, "--max-size", 48, "--threads", 1, "--out", tmp_path / "run")
     assert ended(*command) == 0
-    assert "max_scale_ratio=0" in capsys.readouterr().out + (tmp_path / "run/log.txt").read_text()
+    assert (
+        "--no-rule scale-clamp" in capsys.readouterr().out + (tmp_path / "run/log.txt").read_text()
+    )
 
 
 def test_sizes_are_looked_at_once_in_so_many_steps():
@@ -135,7 +151,7 @@ def test_a_step_bounds_sizes(backbone):
     """Adam's moments stay, and all that is not too long has the bits of a step without a bound."""
     found = {}
     for bound in (None, 0.0):
-        setup = setup_of(backbone, max_scale_ratio=bound, initializer={"name": "points"})
+        setup = setup_of(backbone, rules=using(bound), initializer={"name": "points"})
         state = first_state(setup)
         state.step = EVERY - 1
         # Behind all cameras that are in front of the scene, and long.
@@ -157,8 +173,8 @@ def test_a_step_bounds_sizes(backbone):
         ({"steps": 29_999}, BOUND),
         ({"steps": None, "seconds": 5.0}, BOUND),
         ({"steps": 30_000}, 0.0),
-        ({"steps": 30_000, "max_scale_ratio": 0.7}, 0.7),
-        ({"max_scale_ratio": 0.0}, 0.0),
+        ({"steps": 30_000, "rules": using(0.7)}, 0.7),
+        ({"rules": using(0.0)}, 0.0),
         ({"recipe": {"name": "published"}}, 0.0),
         ({"schedule": "absolute"}, 0.0),
         ({"options": {"lr_scales": 0.0}}, 0.0),
@@ -168,8 +184,9 @@ def test_a_step_bounds_sizes(backbone):
 )
 def test_which_runs_have_a_bound(settings, bound):
     setup = setup_of(**settings)
-    assert setup.numbers.max_scale_ratio == bound
-    told = [row for row in setup.decisions if row.override == "--set max_scale_ratio=0"]
+    rule = setup.selection.rules.get("scale-clamp")
+    assert (0.0 if rule is None else rule.ratio) == bound
+    told = [row for row in setup.decisions if row.override == "--no-rule scale-clamp"]
     assert len(told) == (bound == BOUND)
 
 
@@ -178,6 +195,6 @@ def test_which_runs_have_a_bound(settings, bound):
 )
 def test_a_bound_is_refused_where_no_sizes_learn(settings):
     setup = setup_of(**settings)
-    config = setup.config.model_copy(update={"max_scale_ratio": 0.5})
+    config = setup.config.model_copy(update={"rules": using(0.5)})
     with pytest.raises(UserError, match="no Gaussians with axes that learn"):
         refuse_settings_for_nothing(config, setup)

@@ -17,18 +17,13 @@ from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_core.training.averaging import STATE, eval_parameters
-from crossgrad_core.training.floaters import (
-    EMPTY,
-    FEWEST_SEEN,
-    floaters,
-    in_empty_space,
-    rows_without_floaters,
-    told_of,
-)
+from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.start import first_state
-from crossgrad_core.training.step import keep, take_step
+from crossgrad_core.training.step import final_edits, model_of, take_step
+from crossgrad_plugins.rules import floaters as rule
+from crossgrad_plugins.rules.floaters import FEWEST_SEEN, Floaters, removed
 
+EMPTY = Floaters().empty
 BACKBONES = sorted(n for n, e in entries("backbones").items() if e.distribution == "crossgrad")
 #: On a scene of forty points the published cells of anchors would hold nothing.
 OPTIONS = {"scaffold": {"voxel_size": 1e-5}}
@@ -54,10 +49,25 @@ def scattered(setup, seed=0, share=0.7):
 
 def cleaned(setup, state):
     """How many floaters were removed from the state."""
-    rows, before = rows_without_floaters(setup, state), state.primitives(setup)
-    if rows is not None:
-        keep(setup, state, rows)
-    return before - state.primitives(setup)
+    before = state.primitives(setup)
+    notes = [edit.note for edit in final_edits(setup, state)]
+    gone = before - state.primitives(setup)
+    assert notes == ([removed(gone)] if gone else [])
+    return gone
+
+
+def shown(setup, state):
+    """The model as it is shown at the end of a run."""
+    phase, parameters = setup.phase(state.step, training=False), eval_parameters(setup, state)
+    return replace(model_of(setup, state), phase=phase, parameters=parameters)
+
+
+def floaters(setup, state):
+    return rule.floaters(shown(setup, state), EMPTY)
+
+
+def in_empty_space(places, scene):
+    return rule.in_empty_space(places, scene, EMPTY)
 
 
 def images(setup, parameters, step=0):
@@ -121,7 +131,7 @@ def test_photos_stay_as_they_are(backbone):
 
 
 def test_moments_states_and_the_average_come_along():
-    setup = setup_of(weight_averaging=1.0)
+    setup = setup_of(rules={"weight-averaging": {"share": 1.0}})
     state = scattered(setup)
     for _ in range(3):
         take_step(setup, state)
@@ -129,18 +139,20 @@ def test_moments_states_and_the_average_come_along():
     state.commit({"other": PluginState(per_primitive={"rows": rows})})
     gone = floaters(setup, state)
     kept = np.setdiff1d(np.arange(state.primitives(setup)), gone.numpy())
-    wanted = {name: t.detach()[kept] for name, t in eval_parameters(state).items()}
+    wanted = {name: t.detach()[kept] for name, t in eval_parameters(setup, state).items()}
     moments = {name: t[kept] for name, t in state.adam.exp_avg_sq.items()}
     assert cleaned(setup, state) == len(gone) > 0
-    assert state.states[STATE].values == {"count": 3}
+    assert state.states["weight-averaging"].values == {"count": 3}
     assert state.states["other"].per_primitive["rows"].tolist() == kept.tolist()
-    assert all(torch.equal(eval_parameters(state)[name].detach(), t) for name, t in wanted.items())
+    assert all(
+        torch.equal(eval_parameters(setup, state)[name].detach(), t) for name, t in wanted.items()
+    )
     assert all(torch.equal(state.adam.exp_avg_sq[name], t) for name, t in moments.items())
     take_step(setup, state)
 
 
 def test_it_is_the_average_that_is_looked_at_where_it_is_shown():
-    setup = setup_of(weight_averaging=1.0)
+    setup = setup_of(rules={"weight-averaging": {"share": 1.0}})
     state = scattered(setup)
     take_step(setup, state)
     gone = floaters(setup, state)
@@ -170,7 +182,7 @@ def test_a_set_of_which_nothing_would_be_left_stays():
     # Behind this camera, and beyond what the others see of that place.
     positions[:] = (behind.center + 0.2 * behind.center / behind.center.norm()).float()
     assert len(floaters(setup, state)) == len(positions)
-    assert rows_without_floaters(setup, state) is None
+    assert Floaters().crossgrad_final_edit(shown(setup, state)) is None
 
 
 def looking(name, points, seen=None, forward=(0, 1, 0)):
@@ -218,32 +230,34 @@ def test_nothing_floats_where_nothing_says_what_is_empty():
     setup = setup_of(scene=blind)
     assert len(floaters(setup, scattered(setup))) == 0
     with pytest.raises(UserError, match="no photo observes enough points"):
-        refuse_settings_for_nothing(setup.config.model_copy(update={"floaters": "remove"}), setup)
+        refuse_settings_for_nothing(
+            setup.config.model_copy(update={"rules": {"floaters": {}}}), setup
+        )
 
 
 @pytest.mark.parametrize(
     ("given", "what"),
     [
-        ({}, "remove"),
-        ({"recipe": {"name": "published"}}, "keep"),
-        ({"densifier": ComponentChoice(name="none")}, "keep"),
-        ({"recipe": {"name": "published"}, "floaters": "remove"}, "remove"),
-        ({"floaters": "keep"}, "keep"),
-        ({"densifier": ComponentChoice(name="none"), "floaters": "remove"}, "remove"),
+        ({}, True),
+        ({"recipe": {"name": "published"}}, False),
+        ({"densifier": ComponentChoice(name="none")}, False),
+        ({"recipe": {"name": "published"}, "rules": {"floaters": True}}, True),
+        ({"rules": {"floaters": False}}, False),
+        ({"densifier": ComponentChoice(name="none"), "rules": {"floaters": {}}}, True),
     ],
 )
 def test_the_default_and_what_is_said_of_it(given, what):
-    assert resolved(setup_of(**given)).floaters == what
+    assert bool(resolved(setup_of(**given)).rules.get("floaters")) == what
 
 
 def test_only_none_keeps_its_set():
     never = {n for n in entries("densifiers") if not build(Densifier, n, {}).edits}
     assert never == {"none"}
-    said = (Path(__file__).parents[3] / "docs" / "settings.md").read_text(encoding="utf-8")
-    row = next(line for line in said.splitlines() if line.startswith("| `floaters`"))
+    said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
+    row = next(line for line in said.splitlines() if line.startswith("| `rules.floaters`"))
     assert "none" in row
 
 
 def test_one_and_many_in_words():
-    assert told_of(1).startswith("floaters: 1 primitive was removed")
-    assert told_of(1200).startswith("floaters: 1,200 primitives were removed")
+    assert removed(1).startswith("floaters: 1 primitive was removed")
+    assert removed(1200).startswith("floaters: 1,200 primitives were removed")

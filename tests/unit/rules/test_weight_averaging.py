@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.blocks import Edit, LearningRate, PluginState, Rows
+from crossgrad_core.contract.blocks import EMPTY_STATE, Edit, LearningRate, PluginState, Rows
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
@@ -16,10 +16,11 @@ from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import step as stepping
-from crossgrad_core.training.averaging import STATE, eval_parameters, tail_lr_factor, update_average
 from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.rules import eval_parameters, rate_factor
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Snapshot, TrainState
+from crossgrad_plugins.rules.weight_averaging import NAME, WeightAveraging
 
 CONSTANT, DECAYING = LearningRate(0.05), LearningRate(1.0, 0.01)
 STEPS = 10
@@ -39,6 +40,11 @@ def setup_of(backbone="vanilla", densifier="none", **settings):
     return assemble(RunConfig(**given), sample_scene(), "none")
 
 
+def using(rule, **options):
+    """The settings of a run that uses a rule."""
+    return {"rules": {rule: options}}
+
+
 def trained(setup, steps=STEPS, state=None):
     """The state after some steps, and the parameters after each of them."""
     state = state or first_state(setup)
@@ -56,7 +62,6 @@ def same(one, two):
 @pytest.mark.parametrize(
     ("share", "step", "left"),
     [
-        (0.0, 1000, 1.0),
         (0.2, 800, 1.0),
         (0.2, 900, 0.1),
         (0.2, 950, 0.01**0.75),
@@ -70,16 +75,16 @@ def same(one, two):
     ],
 )
 def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left):
-    setup = setup_of(lr_tail=share, steps=1000)
-    assert tail_lr_factor(setup, CONSTANT, step) == pytest.approx(left, rel=1e-12)
-    assert tail_lr_factor(setup, DECAYING, step) == 1.0
-    assert tail_lr_factor(setup, LearningRate(0.3, 0.3), step) == pytest.approx(left, rel=1e-12)
+    setup = setup_of(**using("lr-tail", share=share), steps=1000)
+    assert rate_factor(setup, CONSTANT, step) == pytest.approx(left, rel=1e-12)
+    assert rate_factor(setup, DECAYING, step) == 1.0
+    assert rate_factor(setup, LearningRate(0.3, 0.3), step) == pytest.approx(left, rel=1e-12)
 
 
 def test_what_is_left_of_a_rate_is_an_option():
-    setup = setup_of(lr_tail=0.5, lr_tail_factor=0.25, steps=100)
-    assert tail_lr_factor(setup, CONSTANT, 100) == 0.25
-    assert tail_lr_factor(setup, CONSTANT, 75) == 0.5
+    setup = setup_of(**using("lr-tail", share=0.5, factor=0.25), steps=100)
+    assert rate_factor(setup, CONSTANT, 100) == 0.25
+    assert rate_factor(setup, CONSTANT, 75) == 0.5
 
 
 def recorded(setup):
@@ -99,9 +104,9 @@ def recorded(setup):
 def runs(request):
     """Runs of a backbone: as published, averaged, and with both; the last one also in two parts."""
     setups = {
-        "plain": setup_of(request.param, lr_tail=0.0),
-        "averaged": setup_of(request.param, weight_averaging=0.4, lr_tail=0.0),
-        "both": setup_of(request.param, weight_averaging=0.5, lr_tail=0.5),
+        "plain": setup_of(request.param, rules={"lr-tail": False}),
+        "averaged": setup_of(request.param, rules={NAME: {"share": 0.4}, "lr-tail": False}),
+        "both": setup_of(request.param, rules={NAME: {"share": 0.5}, "lr-tail": {"share": 0.5}}),
     }
     found = {name: recorded(setup) for name, setup in setups.items()}
     half, _ = trained(setups["both"], steps=7)
@@ -127,9 +132,9 @@ def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(runs):
 def test_the_average_is_that_of_the_last_steps_and_changes_no_training(runs):
     (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
-    assert STATE not in plain.states
-    assert state.states[STATE].values["count"] == 4
-    found = eval_parameters(state)
+    assert NAME not in plain.states
+    assert state.states[NAME].values["count"] == 4
+    found = eval_parameters(runs.setups["averaged"], state)
     assert found.keys() == state.parameters.keys()
     averaged = {n for block in runs.setups["averaged"].trained_blocks for n in block.tensors}
     for name, tensor in found.items():
@@ -144,7 +149,7 @@ def test_what_is_drawn_is_the_average(runs):
     setup, state = runs.setups["averaged"], runs.averaged[0]
     view = sample_scene().test_views[0]
     raw = TrainState(state.parameters, state.adam, state.rngs, step=state.step)
-    mean = TrainState(eval_parameters(state), state.adam, state.rngs, step=state.step)
+    mean = TrainState(eval_parameters(setup, state), state.adam, state.rngs, step=state.step)
     with torch.no_grad():
         drawn, expected, other = (renderer(setup, s)(view) for s in (state, mean, raw))
     assert torch.equal(drawn, expected) and not torch.equal(drawn, other)
@@ -153,31 +158,42 @@ def test_what_is_drawn_is_the_average(runs):
 def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
     whole = runs.both[0]
     assert same(whole.parameters, runs.again.parameters)
-    assert whole.states[STATE].values == runs.again.states[STATE].values == {"count": 5}
-    assert same(whole.states[STATE].tensors, runs.again.states[STATE].tensors)
+    (one, two) = (each.states[NAME] for each in (whole, runs.again))
+    assert one.values == two.values == {"count": 5}
+    assert same(one.tensors, two.tensors) and same(one.per_primitive, two.per_primitive)
 
 
 def test_a_snapshot_keeps_the_average_of_its_moment():
-    setup = setup_of(weight_averaging=1.0)
+    setup = setup_of(**using(NAME, share=1.0))
     state, _ = trained(setup, steps=4)
-    before = {name: tensor.clone() for name, tensor in eval_parameters(state).items()}
+    before = {name: tensor.clone() for name, tensor in eval_parameters(setup, state).items()}
     snapshot = Snapshot.of(state)
     trained(setup, steps=8, state=state)
     snapshot.hand_over(state)
-    assert state.step == 4 and same(eval_parameters(state), before)
+    assert state.step == 4 and same(eval_parameters(setup, state), before)
 
 
-def fake(total, share, states=None):
+class Counted:
     """A run of one tensor, to count the steps of an average."""
-    block = SimpleNamespace(tensors=("x",))
-    setup = SimpleNamespace(
-        config=RunConfig(weight_averaging=share),
-        schedule=SimpleNamespace(total=total),
-        trained_blocks=(block,),
-    )
-    state = SimpleNamespace(step=0, parameters={"x": torch.zeros(1)}, states=states or {})
-    state.commit = state.states.update
-    return setup, state
+
+    def __init__(self, total, share):
+        block = SimpleNamespace(tensors=("x",), per_primitive=False)
+        self.backbone = SimpleNamespace(trained_blocks=lambda: (block,))
+        self.rule, self.edited = WeightAveraging(share=share), False
+        self.schedule = SimpleNamespace(total=total)
+        self.step, self.parameters, self.held = 0, {"x": torch.zeros(1)}, EMPTY_STATE
+
+    def state(self, name):
+        assert name == NAME
+        return self.held
+
+    def take(self, step):
+        """Take a step; whether it changed the average."""
+        self.step = step
+        answer = self.rule.crossgrad_step_done(self)
+        if answer is not None:
+            self.held = answer.states[NAME]
+        return answer is not None
 
 
 @pytest.mark.parametrize(
@@ -194,14 +210,9 @@ def fake(total, share, states=None):
     ],
 )
 def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, share, count):
-    setup, state = fake(total, share)
-    taken = []
-    for step in range(1, total + 1):
-        state.step, before = step, state.states.get(STATE)
-        update_average(setup, state)
-        if state.states.get(STATE) is not before:
-            taken.append(step)
-    assert len(taken) == state.states[STATE].values["count"] == count
+    run = Counted(total, share)
+    taken = [step for step in range(1, total + 1) if run.take(step)]
+    assert len(taken) == run.held.values["count"] == count
     assert taken[-1] == total and taken[0] > (1 - share) * total
     assert len(set(np.diff(taken))) == 1
 
@@ -210,34 +221,30 @@ def test_no_length_and_share_has_more_than_a_hundred():
     for total in (99, 100, 1000, 1490, 2001):
         for share in np.linspace(0.01, 1.0, 12):
             window = sum(step > (1.0 - share) * total for step in range(1, total + 1))
-            setup, state = fake(total, float(share))
-            state.commit = lambda _: taken.append(state.step)  # noqa: B023 - called in this turn
-            taken = []
-            for state.step in range(1, total + 1):
-                update_average(setup, state)
-            assert min(window, 50) <= len(taken) <= 100
+            run = Counted(total, float(share))
+            taken = sum(map(run.take, range(1, total + 1)))
+            assert min(window, 50) <= taken <= 100
 
 
 def test_sums_of_many_states_lose_nothing():
-    setup, state = fake(10_000, 1.0)
+    run = Counted(10_000, 1.0)
     for step in range(1, 10_001):
-        state.step = step
-        state.parameters = {"x": torch.tensor([1.0 + 1e-3 * np.sin(step / 100)])}
-        update_average(setup, state)
+        run.parameters = {"x": torch.tensor([1.0 + 1e-3 * np.sin(step / 100)])}
+        run.take(step)
     steps = np.arange(100, 10_001, 100)
     expected = np.mean(1.0 + 1e-3 * np.sin(steps / 100))
-    assert float(eval_parameters(state)["x"]) == pytest.approx(expected, abs=1e-6)
+    shown = run.rule.crossgrad_eval_parameters({NAME: run.held})
+    assert float(shown["x"]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
-    setup, state = fake(100, 0.1)
-    for state.step in range(1, 96):
-        update_average(setup, state)
-    assert state.states[STATE].values["count"] == 5
-    longer, _ = fake(200, 0.1)
-    state.step = 96
-    update_average(longer, state)
-    assert STATE not in state.states
+    run = Counted(100, 0.1)
+    for step in range(1, 96):
+        run.take(step)
+    assert run.held.values["count"] == 5
+    run.schedule = SimpleNamespace(total=200)
+    assert run.take(96) and not run.held.values
+    assert run.rule.crossgrad_eval_parameters({NAME: run.held}) is None
 
 
 @pytest.mark.parametrize(
@@ -253,7 +260,7 @@ def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
 )
 def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeypatch):
     """Of ten steps the last six are averaged, and the edit comes in the eighth."""
-    setup = setup_of(weight_averaging=0.6)
+    setup = setup_of(**using(NAME, share=0.6))
 
     def densify(self, context, state):
         answer = edit(context.parameters) if context.step == 8 else Edit()
@@ -261,22 +268,23 @@ def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeyp
 
     monkeypatch.setattr(type(setup.densifier), "densify", densify)
     state, seen = trained(setup)
-    assert state.states[STATE].values["count"] == count
+    assert state.states[NAME].values["count"] == count
     expected = torch.stack([each["opacities"] for each in seen[-count:]]).mean(dim=0)
-    assert torch.allclose(eval_parameters(state)["opacities"], expected, atol=1e-6)
+    assert torch.allclose(eval_parameters(setup, state)["opacities"], expected, atol=1e-6)
 
 
 def test_noise_after_every_step_does_not_keep_the_average_from_growing():
-    setup = setup_of(densifier="mcmc", densify_until=2, weight_averaging=0.5)
+    setup = setup_of(densifier="mcmc", densify_until=2, **using(NAME, share=0.5))
     state, _ = trained(setup)
-    assert state.states[STATE].values["count"] == 5
+    assert state.states[NAME].values["count"] == 5
 
 
-def test_the_published_rule_has_neither():
-    config = resolved(setup_of(recipe={"name": "published"})).model_dump()
-    assert (config["lr_tail"], config["weight_averaging"]) == (0.0, 0.0)
-    asked = resolved(setup_of(recipe={"name": "published"}, lr_tail=0.2, weight_averaging=0.1))
-    assert (asked.lr_tail, asked.weight_averaging) == (0.2, 0.1)
+def test_the_published_recipe_has_neither():
+    published = {"recipe": {"name": "published"}}
+    assert resolved(setup_of(**published)).rules == {}
+    both = {"lr-tail": {"share": 0.2}, NAME: {"share": 0.1}}
+    wanted = {"lr-tail": {"share": 0.2, "factor": 0.01}, NAME: {"share": 0.1}}
+    assert resolved(setup_of(**published, rules=both)).rules == wanted
 
 
 def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
@@ -286,29 +294,30 @@ def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
     )
     setup = assemble(config, sample_scene(), "none")
     written = resolved(setup)
-    assert written.lr_tail == 0.0
+    assert written.rules["lr-tail"] is False
     again = RunConfig.model_validate(written.model_dump() | {"reader": {"name": "auto"}})
-    assert resolved(assemble(again, sample_scene(), "none")).lr_tail == 0.0
+    assert resolved(assemble(again, sample_scene(), "none")).rules == written.rules
 
 
 def test_a_run_says_what_it_does_at_its_end():
     shown = {row.setting: row.value for row in setup_of().decisions if row.override}
-    assert resolved(setup_of()).lr_tail == shown["lr_tail"] == 0.25
-    assert "lr_tail" not in {row.setting for row in setup_of(lr_tail=0.0).decisions}
+    assert shown["rules.lr-tail"] == {"share": 0.25}
+    without = setup_of(rules={"lr-tail": False})
+    assert "rules.lr-tail" not in {row.setting for row in without.decisions}
 
 
-@pytest.mark.parametrize(
-    "spoiled",
-    [
-        PluginState({"count": 2}, {"means": torch.zeros(1, 3)}),
-        PluginState({"count": 2}, {"gone": torch.zeros(1)}),
-        PluginState({"count": 0}, {}),
-        PluginState({}, {}),
-    ],
-)
-def test_an_average_of_something_else_is_refused(spoiled):
-    setup = setup_of(weight_averaging=0.5)
+def test_an_average_of_other_primitives_is_refused():
+    setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
-    state.commit({STATE: spoiled})
+    state.commit({NAME: PluginState({"count": 2}, {}, {"means": torch.zeros(1, 3)})})
     with pytest.raises(UserError, match="does not fit the run"):
         from_checkpoint(setup, to_checkpoint(state))
+
+
+@pytest.mark.parametrize("sums", [{"gone": torch.zeros(1)}, {"means": torch.zeros(1)}], ids=str)
+def test_an_average_of_other_tensors_is_not_shown(sums):
+    setup = setup_of(**using(NAME, share=0.5))
+    state, _ = trained(setup, steps=2)
+    state.commit({NAME: PluginState({"count": 2}, sums)})
+    with pytest.raises(UserError, match="crossgrad_eval_parameters with something else"):
+        eval_parameters(setup, state)

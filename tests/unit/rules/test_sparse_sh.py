@@ -1,4 +1,4 @@
-"""Tensors that learn in some steps only: `sh_every`."""
+"""Tensors that learn in some steps only: the rule `sparse-sh`."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -15,12 +15,14 @@ from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.rates import rates_at
+from crossgrad_core.training.setup import learns_in
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.rasterizers import numba_cpu
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.numba_kernels import frame
 
 STEPS, EVERY = 12, 3
+RULES = {"sparse-sh": {"every": EVERY}}
 
 
 class Decay:
@@ -73,21 +75,21 @@ def changes(setup):
     ids=str,
 )
 def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(settings, plugins):
-    setup = setup_of(sh_every=EVERY, **settings)
+    setup = setup_of(rules=RULES, **settings)
     for plugin in plugins:
         setup.manager.register(plugin())
     found, state = changes(setup)
     # In the published order the last step has none of the optimizer.
     last = STEPS - ("recipe" in settings)
-    due = [step for step in range(1, last + 1) if not setup.schedule.rests(step)]
+    due = [step for step in range(1, last + 1) if learns_in(step, EVERY)]
     assert found.pop("f_rest") == due
     assert state.adam.steps["f_rest"] == len(due)
     assert all(steps == list(range(1, last + 1)) for steps in found.values())
 
 
 def test_what_rests_is_handed_over_without_a_gradient_and_the_rasterizer_leaves_it_out(monkeypatch):
-    setup = setup_of(sh_every=EVERY, views_per_step=2)
-    due = [step for step in range(1, STEPS + 1) if not setup.schedule.rests(step)]
+    setup = setup_of(rules=RULES, views_per_step=2)
+    due = [step for step in range(1, STEPS + 1) if learns_in(step, EVERY)]
     decoded, worked_out = [], []
     decode = Vanilla.decode
 
@@ -121,7 +123,7 @@ class Together(NumbaRasterizer):
 
 
 def test_views_that_are_drawn_together_give_the_same_parameters():
-    apart = setup_of(sh_every=EVERY, views_per_step=2)
+    apart = setup_of(rules=RULES, views_per_step=2)
     selection = replace(apart.selection, rasterizer=Together())
     ours, theirs = changes(replace(apart, selection=selection)), changes(apart)
     assert ours[0] == theirs[0]
@@ -130,12 +132,12 @@ def test_views_that_are_drawn_together_give_the_same_parameters():
 
 
 def test_a_run_writes_down_in_which_steps_its_bands_learn():
-    assert resolved(setup_of(sh_every=EVERY)).sh_every == EVERY
-    assert resolved(setup_of()).sh_every == 1
+    assert resolved(setup_of(rules=RULES)).rules["sparse-sh"] == {"every": EVERY}
+    assert "sparse-sh" not in resolved(setup_of()).rules
 
 
-def test_without_the_setting_all_learn_in_every_step_at_their_own_rate():
-    plain, every = setup_of(sh_every=1), setup_of(sh_every=EVERY)
+def test_without_the_rule_all_learn_in_every_step_at_their_own_rate():
+    plain, every = setup_of(), setup_of(rules=RULES)
     assert changes(plain)[0]["f_rest"] == list(range(1, STEPS + 1))
     ours, theirs = rates_at(every, 1), rates_at(plain, 1)
     assert ours.pop("f_rest") == pytest.approx(theirs.pop("f_rest") * EVERY**0.5)
@@ -143,5 +145,5 @@ def test_without_the_setting_all_learn_in_every_step_at_their_own_rate():
 
 
 def test_backbones_without_harmonics_are_not_concerned():
-    setup = setup_of("scaffold", sh_every=EVERY)
+    setup = setup_of("scaffold", rules=RULES)
     assert not any(setup.resting(step) for step in range(1, STEPS + 1))

@@ -1,0 +1,79 @@
+"""Contract checks of rules: short runs on the sample scene."""
+
+from copy import deepcopy
+
+import torch
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.rule import Rule
+from crossgrad_core.numerics.threads import on_one_thread
+from crossgrad_core.registry.entries import name_of
+from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
+from crossgrad_core.testing.components import COMPONENT_CHECKS
+from crossgrad_core.testing.contract import (
+    Check,
+    Make,
+    global_randomness_untouched,
+    require,
+    revived,
+)
+from crossgrad_core.testing.short_runs import require_repeated, require_sound, setup_of, train
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.step import final_edits
+
+#: Steps of a run, and the step after which it is stopped. Averages and tails are at work by then.
+_STEPS, _STOP = 8, 6
+
+
+def trains_soundly(make: Make[Rule]) -> None:
+    """A run with it trains finite parameters, and the same ones again."""
+    setup = _setup(make)
+    with on_one_thread(), global_randomness_untouched():
+        run = train(setup, _STEPS)
+        require_sound(run)
+        require_repeated(run, train(setup, _STEPS))
+
+
+def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
+    """A run that is stopped and resumed ends with the bits of a run that is not."""
+    setup = _setup(make)
+    with on_one_thread():
+        state = first_state(setup)
+        _steps(setup, state, _STOP)
+        again = from_checkpoint(setup, deepcopy(to_checkpoint(state)))
+        again.states = {name: revived(held) for name, held in again.states.items()}
+        for each in (state, again):
+            _steps(setup, each, _STEPS)
+            for _ in final_edits(setup, each):
+                require(each.primitives(setup), "no primitive is left at the end of a run")
+    for name, tensor in state.parameters.items():
+        same = torch.equal(tensor, again.parameters[name])
+        require(same, f"a resumed run differs in {name}: keep what a rule remembers in its state")
+
+
+def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
+    """The reason why it would change nothing is a text, empty if there is none."""
+    setup = _setup(make)
+    reason = make().unused(setup.backbone, setup.scene)
+    require(isinstance(reason, str), f"unused() answers {reason!r}, not a text")
+
+
+def _setup(make: Make[Rule]) -> Setup:
+    rule = make()
+    return setup_of(RunConfig(steps=_STEPS, device="cpu")).with_rules({name_of(rule): rule})
+
+
+def _steps(setup: Setup, state: TrainState, until: int) -> None:
+    while state.step < until:
+        timed_step(setup, state)
+
+
+RULE_CHECKS: tuple[Check[Rule], ...] = (
+    *COMPONENT_CHECKS,
+    trains_soundly,
+    goes_on_from_a_checkpoint,
+    says_why_it_would_do_nothing,
+)

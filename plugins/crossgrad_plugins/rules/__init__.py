@@ -1,0 +1,1 @@
+"""Built-in rules: what acts during training and is not part of the basic loop."""

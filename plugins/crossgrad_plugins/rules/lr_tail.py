@@ -1,0 +1,34 @@
+"""Learning rates that fade at the end of a run.
+
+The rates of opacity, scale and colour are constant as published, so that renders still fluctuate at
+the end of a run. Fading rates end that (docs/steady-ends.md).
+"""
+
+from typing_extensions import override
+
+from crossgrad_core.plugin import Backbone, Field, LearningRate, Rule, Scene, Schedule, hookimpl
+
+
+class LrTail(Rule):
+    """Lets constant learning rates fade over the last share of the steps."""
+
+    share: float = Field(
+        0.25, gt=0, le=1, description="share of the steps, the last ones, in which rates fade"
+    )
+    factor: float = Field(0.01, gt=0, le=1, description="factor of a rate in the last step")
+
+    @hookimpl
+    def crossgrad_rate_factor(
+        self, rate: LearningRate, step: int, schedule: Schedule
+    ) -> float | None:
+        """Fade log-linearly from 1 to `factor`; rates that decay do so as published."""
+        total = schedule.total
+        step, start = min(step, total), (1.0 - self.share) * total
+        if rate.decays or step <= start:
+            return None
+        return float(self.factor ** ((step - start) / (total - start)))
+
+    @override
+    def unused(self, backbone: Backbone, scene: Scene) -> str:
+        constant = any(not block.lr.decays for block in backbone.trained_blocks())
+        return "" if constant else "the backbone has no constant rates"
