@@ -83,6 +83,14 @@ class Facts:
             return schedule.step_of(schedule.length)
         return self.planned
 
+    def intervals(self) -> list[Decision]:
+        """Return the rows of evaluations and checkpoints, which no result depends on."""
+        steps = self.planned or self.total
+        return [
+            Decision("eval_every", max(1, steps // 10), "a tenth of the run"),
+            Decision("save_every", max(1, steps // 5), "a fifth of the run"),
+        ]
+
     @property
     def views(self) -> int | None:
         """Planned views, which say how long the run is; None before they are planned."""

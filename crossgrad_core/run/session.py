@@ -116,7 +116,8 @@ class Session:
         with reporting(state):
             checkpoint = to_checkpoint(state, setup.config)
             scalars = {**checkpoint.scalars, KEPT: kept_files(self.folder)}
-            keep = Keep(every=setup.config.save_every)
+            every = None if "save_every" in setup.config.decided else setup.numbers.save_every
+            keep = Keep(every=every)
             save(self.folder, replace(checkpoint, scalars=scalars), keep)
         self._saved_step = state.step
 

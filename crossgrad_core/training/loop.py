@@ -339,16 +339,16 @@ def copies_after(setup: Setup, step: int) -> bool:
 
 def saves_after(setup: Setup, step: int) -> bool:
     """Whether a checkpoint is written after this step of a run that goes on."""
-    every = setup.config.save_every or max(1, _planned(setup) // 5)
-    return step % every == 0 and step < setup.schedule.total
+    return step % setup.numbers.save_every == 0 and step < setup.schedule.total
 
 
 def evaluates_after(setup: Setup, step: int) -> bool:
     """Whether the held-out views are evaluated after this step of a run that goes on."""
-    every = setup.config.eval_every or max(1, _planned(setup) // 10)
+    every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
     # Opacities are reset every tenth of the steps, too: right after that there is hardly a picture.
-    between = setup.config.eval_every is None and setup.schedule.reset_every is not None
+    chosen = "eval_every" not in setup.config.decided
+    between = not chosen and setup.schedule.reset_every is not None
     shift = every // 2 if between else 0
     return step % every == shift and first <= step < setup.schedule.total
 
@@ -358,8 +358,3 @@ def _record(setup: Setup, state: TrainState, sink: RunWriter) -> None:
         sink.evaluate(setup, state)
     if saves_after(setup, state.step):
         sink.save(setup, state)
-
-
-def _planned(setup: Setup) -> int:
-    """Steps that the run was planned with: its length may follow the clock, intervals do not."""
-    return setup.config.steps or setup.schedule.total

@@ -25,6 +25,8 @@ class Numbers:
     min_refinements: int
     reset_every: int
     sh_start: float
+    eval_every: int
+    save_every: int
 
     @classmethod
     def of(cls, config: RunConfig) -> "Numbers":

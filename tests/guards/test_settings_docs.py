@@ -4,11 +4,14 @@ import re
 from pathlib import Path
 
 import pytest
+from support.commands import ended
+from support.scenes import write_tiny_scene
 from typer.main import get_command
 
 from crossgrad_core.cli.main import app
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.system.yaml_values import read_mapping
 
 PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")
 MODELS = {"run": RunConfig, "data": SceneOptions}
@@ -58,3 +61,23 @@ def test_the_default_of_a_setting_is_the_schema_s(model, name):
         assert stated == f"`{default}`"
     else:  # Decided at the start of the run: in words.
         assert not re.fullmatch(r"`\w+`", stated)
+
+
+def empty_settings(config, prefix=""):
+    """Yield the names of the settings that are null, without the index of a list."""
+    for name, value in config.items() if isinstance(config, dict) else ():
+        if value is None:
+            yield f"{prefix}{name}"
+        for inner in value if isinstance(value, list) else [value]:
+            yield from empty_settings(inner, f"{prefix}{name}.")
+
+
+def test_null_in_a_finished_configuration_means_none(tmp_path):
+    scene = write_tiny_scene(tmp_path / "scene", views=8, points=120)
+    out = tmp_path / "run"
+    assert ended("run", scene, "--steps", 2, "--rasterizer", "torch", "-q", "--out", out) == 0
+    config = read_mapping(out / "config.yaml", "a configuration", "repair it")
+    section = PAGE.split("`null` in the config.yaml", 1)[1].split("Options of a component", 1)[0]
+    rows = [line for line in section.splitlines() if line.startswith("| `")]
+    documented = {name for row in rows for name in re.findall(r"`([^`]+)`", row.split("|")[1])}
+    assert set(empty_settings(config)) <= documented

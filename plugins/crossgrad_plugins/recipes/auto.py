@@ -67,6 +67,7 @@ class Auto(Recipe):
             *rates(choice),
             *steps(choice),
             *ends(choice),
+            *facts.intervals(),
         ]
 
 

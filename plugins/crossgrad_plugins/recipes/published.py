@@ -49,4 +49,5 @@ class Published(Recipe):
             "reset_every": resets,
             "rasterizer.near": NEAR * facts.scale,
         }
-        return [Decision(setting, value, BECAUSE, "3DGS") for setting, value in values.items()]
+        rows = [Decision(setting, value, BECAUSE, "3DGS") for setting, value in values.items()]
+        return [*rows, *facts.intervals()]
