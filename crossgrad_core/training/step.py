@@ -261,7 +261,7 @@ def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
 
 
 def put_in_order(setup: Setup, state: TrainState) -> None:
-    """Puts the primitives in the order in which they are kept, when a step has edited them."""
+    """Sort the primitives along the curve after an edit, so that neighbours are near in memory."""
     rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
     if rows is not None:
         _apply(setup, state, Edit(source=rows))

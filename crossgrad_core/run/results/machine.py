@@ -96,7 +96,9 @@ _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-image", "pycolmap", "pl
 
 
 def environment(device: str = "cpu") -> dict[str, Json]:
-    """Machine, device, threads and versions as plain data; needs no package to be imported first.
+    """Return the machine, the device, the threads and the versions as plain data.
+
+    No package is imported for it.
 
     Args:
         device: Torch device that the run used.

@@ -170,7 +170,7 @@ _NULL = "-"
 
 
 def final_table(result: EvaluationResult | None, totals: Totals) -> str:
-    """Metrics overall and per regime, and what they cost, as plain text without a final newline."""
+    """Return the table of metrics, overall and per regime, and a line about the cost of the run."""
     lines = () if result is None else metric_lines(result)
     return "\n".join([*lines, cost_line(totals)])
 

@@ -103,14 +103,14 @@ class StudentisedGap:
 
 
 def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
-    """The variance of the shift along the true gap, relative to that along the sample's.
+    """Return the variance of the shift along the true gap, divided by the one along the sample gap.
 
-    The sample's gap d is the true one plus noise, and noise points where gradients vary most. Its
-    part in d' Sigma d is tr(Sigma^2), half the `floor`, and its part in |d|^2 is tr(Sigma), Sigma
-    the covariance of the difference of the means. Half of both is taken off, less where the whole
-    gap could be noise: what is left is itself uncertain with a dozen views. Where few directions
-    dominate, 95 % intervals of sigma_b^2 hold the truth in up to 99.5 % if nothing is taken off,
-    and in 84 to 97 % if all is.
+    The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
+    gradients vary most. With the covariance Sigma of the difference of the means, noise adds
+    tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of both is
+    subtracted, and less if the whole gap could be noise, because the remainder is itself uncertain
+    with a dozen views. If few directions dominate, 95 % intervals of sigma_b^2 contain the truth in
+    up to 99.5 % of the cases without the subtraction, and in 84 to 97 % if all is subtracted.
     """
     noise, along = float(draws.spread[0]), float(draws.shift_variance[0]) * gap
     if noise <= 0.0 or along <= 0.0:
