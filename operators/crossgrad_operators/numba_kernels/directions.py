@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_part
 from crossgrad_operators.numba_kernels.digits import (
+    Exact,
     Pair,
     Pairs,
     at,
@@ -24,21 +25,22 @@ Solved = tuple[Floats, Flags]
 
 @strict_part
 def directions(
-    gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, problem: Polyhedron
+    gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, cosines: Pairs, exact: Exact
 ) -> int:
-    """Fills norms [K] and the problem's cosines, zero for views that are not present.
+    """Fills norms [K] and cosines [K, K], zero for views that are not present.
 
     Args:
         gramian: [K, K].
-        remainder: [K, K] what rounding took from it; not looked at if the problem has 16 digits.
+        remainder: [K, K] what rounding took from it; not looked at for 16 digits.
         present: [K].
         norms: [K] numbers.
-        problem: Gets the cosines [K, K].
+        cosines: [K, K] numbers.
+        exact: True for 32 digits, None for 16.
 
     Returns:
         How many views are present.
     """
-    exact, cosines, count = problem.rounding.exact, problem.cosines, 0
+    count = 0
     clear(norms)
     for k in range(present.size):
         clear(cosines[k])
@@ -51,13 +53,14 @@ def directions(
         for j in range(i):
             if present[i] and present[j]:
                 cosine = quotient((gramian[i, j], remainder[i, j]), at(norms, i), exact)
-                put(cosines[i], j, _limited(quotient(cosine, at(norms, j), exact)))
+                put(cosines[i], j, limited(quotient(cosine, at(norms, j), exact)))
                 put(cosines[j], i, at(cosines[i], j))
     return count
 
 
 @strict_device
-def _limited(cosine: Pair) -> Pair:
+def limited(cosine: Pair) -> Pair:
+    """A cosine, within -1 and 1."""
     if cosine[0] > 1.0:
         return 1.0, 0.0
     if cosine[0] < -1.0:

@@ -49,12 +49,3 @@ def form(a: Floats, cosines: Floats, b: Floats) -> float:
                 inner += cosines[i, j] * b[j]
             total += a[i] * inner
     return total
-
-
-@strict_kernel
-def times(cosines: Floats, j: int, b: Floats) -> float:
-    """(C b)_j."""
-    total = 0.0
-    for k in range(b.size):
-        total += cosines[j, k] * b[k]
-    return total
