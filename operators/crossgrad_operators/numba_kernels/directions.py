@@ -10,6 +10,9 @@ from crossgrad_operators.numba_kernels.digits import (
     Pairs,
     at,
     clear,
+    plus,
+    product,
+    products,
     put,
     quotient,
     root,
@@ -66,6 +69,24 @@ def limited(cosine: Pair) -> Pair:
     if cosine[0] < -1.0:
         return -1.0, 0.0
     return cosine
+
+
+@strict_device
+def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
+    """The square of the sum of v_k times the k-th direction."""
+    total = 0.0, 0.0
+    for i in range(len(v)):
+        if v[i, 0] != 0.0:
+            inner = products(cosines[i], v, 0, len(v), exact)
+            total = plus(total, product(at(v, i), inner, exact), exact)
+    return total
+
+
+@strict_device
+def cancels(v: Pairs, cosines: Pairs, exact: Exact) -> bool:
+    """Whether only rounding noise is left of the sum of v_k times the k-th direction."""
+    longest = np.abs(v[:, 0]).max()
+    return form(v, cosines, exact)[0] <= CANCELLED * longest * longest
 
 
 @strict_device

@@ -36,16 +36,3 @@ def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) 
                 c = min(max(gramian[i, j] / norms[i] / norms[j], -1.0), 1.0)
             cosines[i, j] = c
             cosines[j, i] = c
-
-
-@strict_kernel
-def form(a: Floats, cosines: Floats, b: Floats) -> float:
-    """a^T C b."""
-    total = 0.0
-    for i in range(a.size):
-        if a[i] != 0.0:
-            inner = 0.0
-            for j in range(b.size):
-                inner += cosines[i, j] * b[j]
-            total += a[i] * inner
-    return total

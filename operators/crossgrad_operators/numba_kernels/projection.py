@@ -3,12 +3,11 @@
 A vector v is a sum of unit gradients; its coefficients are numbers of 16 or 32 digits.
 """
 
-from typing import Final
-
 import numpy as np
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_operators.numba_kernels.digits import (
+    ONE,
     Exact,
     Pair,
     Pairs,
@@ -22,7 +21,7 @@ from crossgrad_operators.numba_kernels.digits import (
     quotient,
     root,
 )
-from crossgrad_operators.numba_kernels.directions import Solved, directions, limited
+from crossgrad_operators.numba_kernels.directions import Solved, directions, form, limited
 from crossgrad_operators.numba_kernels.normal import (
     CANCELLED,
     CAUTION,
@@ -32,8 +31,6 @@ from crossgrad_operators.numba_kernels.normal import (
     Floats,
     Indices,
 )
-
-_ONE: Final = (1.0, 0.0)
 
 
 @strict_device
@@ -55,12 +52,7 @@ def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
 @strict_device
 def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
     """The length of a projected vector; it becomes zero where only rounding noise is left."""
-    square, longest = (0.0, 0.0), 0.0
-    for k in range(len(v)):
-        if v[k, 0] != 0.0:
-            inner = products(cosines[k], v, 0, len(v), exact)
-            square = plus(square, product(at(v, k), inner, exact), exact)
-            longest = max(longest, abs(v[k, 0]))
+    square, longest = form(v, cosines, exact), np.abs(v[:, 0]).max()
     if square[0] <= CANCELLED * longest * longest:
         clear(v)
         return 0.0, 0.0
@@ -70,7 +62,7 @@ def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 @strict_device
 def _is_opposite(cosine: Pair, exact: Exact) -> bool:
     """Whether 1 + cos is rounding noise."""
-    return plus(_ONE, cosine, exact)[0] <= OPPOSITE
+    return plus(ONE, cosine, exact)[0] <= OPPOSITE
 
 
 @strict_device
@@ -118,7 +110,7 @@ def projected(
             if not present[b, i]:
                 continue
             _start(v, i)
-            size = _ONE
+            size = ONE
             for j in order[i]:
                 if j == i or not gates[b, i, j] or not present[b, j] or size[0] == 0.0:
                     continue
@@ -147,14 +139,14 @@ def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
 @strict_device
 def _sine(cosine: Pair, exact: Exact) -> Pair:
     """The sine of an angle between 0 and pi."""
-    one, other = minus(_ONE, cosine, exact), plus(_ONE, cosine, exact)
+    one, other = minus(ONE, cosine, exact), plus(ONE, cosine, exact)
     return root(product(one, other, exact), exact)
 
 
 @strict_device
 def _moved(target: float, phi: Pair, beta: float, exact: Exact) -> float:
     """(1 - beta) t + beta phi, kept within +-0.999."""
-    kept = product(minus(_ONE, (beta, 0.0), exact), (target, 0.0), exact)
+    kept = product(minus(ONE, (beta, 0.0), exact), (target, 0.0), exact)
     moved = plus(kept, product((beta, 0.0), phi, exact), exact)[0]
     return min(max(moved, -0.999), 0.999)
 
@@ -200,7 +192,7 @@ def aligned_to_targets(
             if not present[b, i]:
                 continue
             _start(v, i)
-            size = _ONE
+            size = ONE
             for j in order[i]:
                 if j == i or not present[b, j] or size[0] == 0.0:
                     continue
