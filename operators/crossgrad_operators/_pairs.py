@@ -39,17 +39,16 @@ def project(
         threshold: Only cosines below minus this count as a conflict.
         strength: The share of the conflicting component that is taken away.
     """
-    from crossgrad_operators.numba_kernels.exact_projection import exact_projected
     from crossgrad_operators.numba_kernels.projection import projected
 
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
+    rule = (float(threshold), float(strength))
     # Two views take one step each, whose errors are those of the cosine. More of them add up, to
     # nothing that float32 gradients would show.
     many = gramians.shape[1] > 2  # noqa: PLR2004
     if context.unit < NARROW and many and context.rounding_residuals is not None:
-        rule = (float(threshold), float(strength))
-        return exact_projected(
-            gramians, context.rounding_residuals(), context.present, order, gates, rule
-        )
-    return projected(gramians, context.present, order, gates, threshold, strength)
+        rest = context.rounding_residuals()
+        return projected(gramians, rest, context.present, order, gates, rule, True)
+    rest = np.zeros_like(gramians)
+    return projected(gramians, rest, context.present, order, gates, rule, None)

@@ -43,6 +43,31 @@ def refine(
     return weights
 
 
+class CautiousKernel(Protocol):
+    """A kernel that is told from which relative error on a weight of 16 digits is doubtful."""
+
+    def __call__(
+        self,
+        gramians: Floats,
+        rounding_residuals: Floats,
+        present: Flags,
+        unit: float,
+        exact: Literal[True] | None,
+        /,
+    ) -> tuple[Floats, Flags]: ...
+
+
+def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) -> Floats:
+    """Weights of 16 digits, and of 32 where the kernel finds these doubtful."""
+    nothing = np.zeros_like(gramians)
+    weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
+
+    def exact(part: Floats, rounding_residuals: Floats, present: Flags) -> Floats:
+        return kernel(part, rounding_residuals, present, context.unit, True)[0]
+
+    return refine(weights, ill_conditioned, gramians, context, exact)
+
+
 class Kernel(Protocol):
     """A kernel: Gramians, remainders, presence, True for 32 digits -> weights, which to doubt."""
 

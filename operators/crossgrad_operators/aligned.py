@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import refine
+from crossgrad_operators._weights import doubted
 
 
 class Aligned(Weighting):
@@ -25,7 +25,5 @@ class Aligned(Weighting):
         self, gramians: NDArray[np.float64], context: OperatorContext
     ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import aligned
-        from crossgrad_operators.numba_kernels.exact_balance import exact_aligned
 
-        weights, ill_conditioned = aligned(gramians, context.present, context.unit)
-        return refine(weights, ill_conditioned, gramians, context, exact_aligned)
+        return doubted(aligned, gramians, context)

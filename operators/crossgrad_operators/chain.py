@@ -122,7 +122,7 @@ def _remainders(
         return None
 
     def work_out() -> NDArray[np.float64]:
-        from crossgrad_operators.numba_kernels.exact_linear import lost_between
+        from crossgrad_operators.numba_kernels.linear import lost_between
 
         return lost_between(product, gramians, whole(), seen)
 

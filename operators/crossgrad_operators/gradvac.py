@@ -32,22 +32,22 @@ class GradVac(GramianOperator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        from crossgrad_operators.numba_kernels.exact_projection import exact_aligned_to_targets
         from crossgrad_operators.numba_kernels.projection import aligned_to_targets
 
         views = gramians.shape[1]
         targets = recall(state, context, "target", (views, views))
         before, order = targets.copy(), random_order(views, rng)
+        rule = self.beta, context.unit
         matrices, ill_conditioned = aligned_to_targets(
-            gramians, context.present, order, targets, self.beta, context.unit
+            gramians, np.zeros_like(gramians), context.present, order, targets, *rule, None
         )
 
         def exact(
             gramians: Floats, rounding_residuals: Floats, present: NDArray[np.bool_]
         ) -> Floats:
             again = before[ill_conditioned]
-            rows = exact_aligned_to_targets(
-                gramians, rounding_residuals, present, order, again, self.beta
+            rows, _ = aligned_to_targets(
+                gramians, rounding_residuals, present, order, again, *rule, True
             )
             targets[ill_conditioned] = again
             return rows

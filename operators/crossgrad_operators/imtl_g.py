@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import refine
+from crossgrad_operators._weights import doubted
 
 
 class IMTLG(Weighting):
@@ -25,7 +25,5 @@ class IMTLG(Weighting):
         self, gramians: NDArray[np.float64], context: OperatorContext
     ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import imtl_g
-        from crossgrad_operators.numba_kernels.exact_balance import exact_imtl_g
 
-        weights, ill_conditioned = imtl_g(gramians, context.present, context.unit)
-        return refine(weights, ill_conditioned, gramians, context, exact_imtl_g)
+        return doubted(imtl_g, gramians, context)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from crossgrad_core.plugin import OperatorContext, Weighting
-from crossgrad_operators._weights import refine
+from crossgrad_operators._weights import doubted
 
 
 class Nash(Weighting):
@@ -25,7 +25,5 @@ class Nash(Weighting):
         self, gramians: NDArray[np.float64], context: OperatorContext
     ) -> NDArray[np.float64]:
         from crossgrad_operators.numba_kernels.balance import nash
-        from crossgrad_operators.numba_kernels.exact_balance import exact_nash
 
-        weights, ill_conditioned = nash(gramians, context.present, context.unit)
-        return refine(weights, ill_conditioned, gramians, context, exact_nash)
+        return doubted(nash, gramians, context)

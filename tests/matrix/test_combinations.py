@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from support.pairwise import pairs_of, pairwise
 from support.refusals import every_combination, from_lines, refused
 
 from crossgrad_core.errors import IncompatibleSelectionError
@@ -15,7 +16,6 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import load
 from crossgrad_core.testing.short_runs import require_repeated, require_sound, setup_of, train
 from crossgrad_plugins.authoring.matrix.combinations import SLOTS, STEPS, as_lines, config_of
-from crossgrad_plugins.authoring.matrix.pairwise import pairs_of, pairwise
 
 #: What operators count; everything else that a step counts is density control.
 AGGREGATION = {"zero", "disjoint", "dropped", "conflict"}

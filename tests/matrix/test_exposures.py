@@ -7,6 +7,7 @@ from itertools import product
 
 import pytest
 import torch
+from support.pairwise import pairwise
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics.threads import configure_threads
@@ -17,7 +18,6 @@ from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.per_image_params import STATE
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.authoring.matrix.combinations import NEEDED
-from crossgrad_plugins.authoring.matrix.pairwise import pairwise
 
 FEW, MANY = 3, 60
 

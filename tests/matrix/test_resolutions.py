@@ -8,6 +8,7 @@ from itertools import product
 
 import pytest
 import torch
+from support.pairwise import pairwise
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.numerics.threads import configure_threads
@@ -17,7 +18,6 @@ from crossgrad_core.testing.fixtures import NoisePhoto, sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.authoring.matrix.combinations import NEEDED
-from crossgrad_plugins.authoring.matrix.pairwise import pairwise
 
 STEPS = 8
 #: An edit at a small scale, one at a larger one, and one at full size.

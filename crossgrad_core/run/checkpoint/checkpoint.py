@@ -229,13 +229,12 @@ def read_state(folder: Path) -> dict[str, Any]:
 
 
 def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
-    """Refuses a state that is not what was written, as far as it says so itself.
+    """Refuses a state that is not what was written.
 
     Raises:
         UserError: The digest differs, or something is missing or of another type.
     """
-    # Runs of before there was a digest go on.
-    if state.get(_DIGEST, digest(state)) != digest(state):
+    if state.get(_DIGEST) != digest(state):
         raise damaged(folder, f"{STATE} is not what was written (its SHA-256 differs)")
     wrong = [name for name, holds in _PARTS.items() if not holds(state.get(name))]
     if wrong:

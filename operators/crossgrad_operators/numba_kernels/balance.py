@@ -1,7 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
 
-Each kernel also says for which blocks rounding of the Gramian itself may show in the result:
-`exact_balance` has the same methods with twice the digits.
+Each kernel works with 16 or 32 digits, and says for which blocks rounding of the Gramian itself may
+show in a result of 16.
 """
 
 import math
@@ -9,6 +9,22 @@ import math
 import numpy as np
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_operators.numba_kernels.digits import (
+    ONE,
+    Exact,
+    Pair,
+    Pairs,
+    at,
+    longest_of,
+    minus,
+    plus,
+    product,
+    products,
+    put,
+    quotient,
+    root,
+)
+from crossgrad_operators.numba_kernels.directions import Solved, cancels, directions
 from crossgrad_operators.numba_kernels.linear import (
     eigen,
     smallest_pivot,
@@ -23,8 +39,6 @@ from crossgrad_operators.numba_kernels.normal import (
     Flags,
     Floats,
     Indices,
-    form,
-    normalised,
 )
 
 #: Newton steps of Nash-MTL at most; about ten are usual.
@@ -35,122 +49,157 @@ DECREMENT = 1e-13
 CLOSE = 0.25
 #: A beta beyond which a bargain has no end: 7e5 sqrt(K) is already zero by `CANCELLED`.
 ENDLESS = 3e7
+#: Newton steps at most that follow with 32 digits; two are enough unless kappa is above 1e5.
+POLISHING = 20
 
 
 @strict_part
-def _compact(
-    gramian: Floats, present: Flags, norms: Floats, cosines: Floats, places: Indices
-) -> int:
-    """Norms and cosines of the present views only, at the front; returns their number."""
+def _of_present(
+    gramian: Floats, remainder: Floats, present: Flags, exact: Exact
+) -> tuple[Indices, Pairs, Pairs]:
+    """The places [n] of the views that are present, and their norms [n] and cosines [n, n]."""
     views = present.size
-    all_norms, all_cosines = np.empty(views), np.empty((views, views))
-    normalised(gramian, present, all_norms, all_cosines)
-    count = 0
-    for k in range(views):
-        if present[k]:
-            places[count] = k
-            count += 1
-    for i in range(count):
-        norms[i] = all_norms[places[i]]
-        for j in range(count):
-            cosines[i, j] = all_cosines[places[i], places[j]]
-    return count
+    norms, cosines = np.zeros((views, 2)), np.zeros((views, views, 2))
+    count = directions(gramian, remainder, present, norms, cosines, exact)
+    places = np.flatnonzero(present)
+    if count < views:
+        return places, norms[places], cosines[places][:, places, :]
+    return places, norms, cosines
 
 
-@strict_part
-def _shortest_solution(norms: Floats, cosines: Floats, rank: int) -> Floats:
-    """The shortest v with least |G v - (|g_k|)| for G of the given rank below full."""
-    n = norms.size
-    # G = D C D has the rank of C, which its own eigenvalues would not show at large norm ratios.
-    gramian, vectors = np.empty((n, n)), np.empty((n, n))
+@strict_device
+def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
+    """D C D [n, n] with D the norms over the longest one.
+
+    It has the rank of C, which its own eigenvalues would not show at large norm ratios.
+    """
+    n = len(norms)
+    longest, _ = longest_of(norms)
+    shares, gramian = np.empty((n, 2)), np.empty((n, n, 2))
+    for i in range(n):
+        put(shares, i, quotient(at(norms, i), longest, exact))
     for i in range(n):
         for j in range(n):
-            gramian[i, j] = norms[i] * cosines[i, j] * norms[j]
-    values = eigen(gramian, vectors)
-    order = np.argsort(values)
-    v = np.zeros(n)
-    for place in range(n - rank, n):
-        i = order[place]
-        inner, size = 0.0, 0.0
-        for k in range(n):
-            inner += vectors[k, i] * norms[k]
-            size += abs(vectors[k, i]) * norms[k]
-        # An eigenvector at right angles to the norms contributes nothing, not its rounding noise.
-        if abs(inner) > OPPOSITE * size:
-            for k in range(n):
-                v[k] += inner / values[i] * vectors[k, i]
-    return v
+            half = product(at(shares, i), at(cosines[i], j), exact)
+            put(gramian[i], j, product(half, at(shares, j), exact))
+    return gramian
+
+
+@strict_device
+def _add(out: Pairs, factor: Pair, vector: Pairs, exact: Exact) -> None:
+    """Adds a vector times a factor."""
+    for k in range(len(out)):
+        put(out, k, plus(at(out, k), product(factor, at(vector, k), exact), exact))
+
+
+@strict_device
+def _add_solution(
+    matrix: Pairs,
+    vectors: Pairs,
+    chosen: Indices,
+    right: Pairs,
+    least: float,
+    v: Pairs,
+    exact: Exact,
+) -> None:
+    """Adds x_i (x_i.r) / l_i of the chosen eigenvectors x_i and eigenvalues l_i.
+
+    An eigenvector whose terms cancel, up to a share `least`, contributes nothing: it is at right
+    angles to r but for rounding noise.
+    """
+    for i in chosen:
+        inner = products(vectors[:, i], right, 0, len(v), exact)
+        size = 0.0
+        for k in range(len(v)):
+            size += abs(vectors[k, i, 0]) * right[k, 0]
+        if abs(inner[0]) > least * size:
+            _add(v, quotient(inner, at(matrix[i], i), exact), vectors[:, i], exact)
 
 
 @strict_part
-def _equal_projections(norms: Floats, cosines: Floats, v: Floats) -> float:
+def _equal_projections(norms: Pairs, cosines: Pairs, v: Pairs, exact: Exact) -> float:
     """Solves G v = (|g_k|); the shortest least-squares solution where G is singular.
 
     Returns:
         The smallest eigenvalue of the cosines over the largest one.
     """
-    n = norms.size
-    vectors = np.empty((n, n))
-    values = eigen(cosines.copy(), vectors)
+    n = len(norms)
+    matrix, vectors = cosines.copy(), np.empty((n, n, 2))
+    values = eigen(matrix, vectors, exact)
+    smallest: float = values.min() / values.max()
     rank = 0
     for i in range(n):
         rank += values[i] > OPPOSITE * values.max()
-    if rank == n:
-        solve(cosines, np.arange(n), n, np.ones(n), v)
-        v[:] = v / norms
+    if rank < n:
+        matrix = _graded(norms, cosines, exact)
+        order = np.argsort(eigen(matrix, vectors, exact))
+        _add_solution(matrix, vectors, order[n - rank :], norms, OPPOSITE, v, exact)
+        return smallest
+    if exact is None:
+        solve(cosines[:, :, 0].copy(), np.arange(n), n, np.ones(n), v[:, 0])
     else:
-        v[:] = _shortest_solution(norms, cosines, rank)
-    smallest: float = values.min() / values.max()
+        ones = np.zeros((n, 2))
+        ones[:, 0] = 1.0
+        _add_solution(matrix, vectors, np.arange(n), ones, 0.0, v, exact)
+    for i in range(n):
+        put(v, i, quotient(at(v, i), at(norms, i), exact))
     return smallest
 
 
-@strict_device
-def _cancels(v: Floats, norms: Floats, cosines: Floats) -> bool:
-    """Whether the v, or the gradients times v, add up to no more than their rounding noise."""
-    total, longest = v.sum(), np.abs(v).max()
-    if total * total <= CANCELLED * longest * longest:
-        return True
-    x = v * norms
-    longest = np.abs(x).max()
-    return bool(form(x, cosines, x) <= CANCELLED * longest * longest)
-
-
 @strict_kernel
-def imtl_g(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags]:
+def imtl_g(
+    gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
+) -> Solved:
     """Weights that add up to 1 and give u equal projections on all unit gradients.
 
     Args:
         gramians: [B, K, K].
+        rounding_residuals: [B, K, K] what rounding took from them; not looked at for 16 digits.
         present: [B, K].
-        unit: Relative error from which a result is doubtful.
+        unit: Relative error from which a result of 16 digits is doubtful.
+        exact: True for 32 digits, None for 16.
 
     Returns:
         [B, K] weights and [B] whether they are doubtful.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
-    norms, cosines = np.empty(views), np.empty((views, views))
-    places = np.empty(views, np.int64)
     for b in range(blocks):
-        n = _compact(gramians[b], present[b], norms, cosines, places)
-        if n == 0:
-            continue
-        if n <= 2:
-            total = norms[:n].sum()
-            for i in range(n):
-                result[b, places[i]] = 1.0 if n == 1 else norms[1 - i] / total
-            if n == 2 and 1.0 + cosines[0, 1] <= OPPOSITE:
-                result[b] = 0.0
-            continue
-        scaled, own = norms[:n] / norms[:n].max(), cosines[:n, :n].copy()
-        v = np.empty(n)
-        smallest = _equal_projections(scaled, own, v)
-        total, sizes = v.sum(), np.abs(v).sum()
-        ill_conditioned[b] = CAUTION * n * EPSILON * sizes > unit * smallest * abs(total)
-        if not _cancels(v, scaled, own):
-            for i in range(n):
-                result[b, places[i]] = v[i] / total
+        places, norms, cosines = _of_present(gramians[b], rounding_residuals[b], present[b], exact)
+        n = places.size
+        if n == 1:
+            result[b, places[0]] = 1.0
+        elif n == 2:
+            if 1.0 + cosines[0, 1, 0] > OPPOSITE:
+                for i in range(n):
+                    result[b, places[i]] = norms[1 - i, 0] / (norms[0, 0] + norms[1, 0])
+        elif n > 2:
+            ill_conditioned[b] = _same_shares(norms, cosines, places, unit, result[b], exact)
     return result, ill_conditioned
+
+
+@strict_part
+def _same_shares(
+    norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
+) -> bool:
+    """Fills the weights of more than two views; returns whether they are doubtful."""
+    n = places.size
+    longest, _ = longest_of(norms)
+    scaled, v, x = np.empty((n, 2)), np.zeros((n, 2)), np.empty((n, 2))
+    for i in range(n):
+        put(scaled, i, quotient(at(norms, i), longest, exact))
+    smallest = _equal_projections(scaled, cosines, v, exact)
+    total, sizes, largest = (0.0, 0.0), 0.0, 0.0
+    for i in range(n):
+        total = plus(total, at(v, i), exact)
+        sizes += abs(v[i, 0])
+        largest = max(largest, abs(v[i, 0]))
+        put(x, i, product(at(v, i), at(scaled, i), exact))
+    # The v, or the gradients times v, may add up to no more than their rounding noise.
+    if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
+        for i in range(n):
+            weights[places[i]] = quotient(at(v, i), total, exact)[0]
+    return CAUTION * n * EPSILON * sizes > unit * smallest * abs(total[0])
 
 
 @strict_device
@@ -203,6 +252,46 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
     return False
 
 
+@strict_part
+def _polish(cosines: Pairs, beta: Floats) -> None:
+    """Newton steps of the bargain with slopes of 32 digits, until beta has 16 right ones."""
+    n = beta.size
+    matrix, slope, step, pairs = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros((n, 2))
+    last = np.inf
+    for _ in range(POLISHING):
+        pairs[:, 0] = beta
+        for i in range(n):
+            inner = product(products(cosines[i], pairs, 0, n, True), at(pairs, i), True)
+            slope[i] = minus(ONE, inner, True)[0]
+            for j in range(n):
+                matrix[i, j] = beta[i] * cosines[i, j, 0] * beta[j]
+        solve_shifted(matrix, slope, step)
+        size = np.abs(step).max()
+        if not size < 0.5 * last:
+            return
+        last = size
+        for i in range(n):
+            beta[i] += beta[i] * step[i]
+
+
+@strict_part
+def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
+    """Fills beta [n]; False where it has no end."""
+    n = beta.size
+    beta[:] = 1.0
+    if n == 2:
+        apart = plus(ONE, at(cosines[0], 1), exact)
+        if apart[0] < EPSILON:
+            apart = (EPSILON, 0.0)
+        beta[:] = quotient(ONE, root(apart, exact), exact)[0]
+    elif n > 2:
+        if not bargain(cosines[:, :, 0].copy(), beta):
+            return False
+        if exact is not None:
+            _polish(cosines, beta)
+    return True
+
+
 @strict_kernel
 def geometric_mean(values: Floats) -> float:
     """The n-th root of a product, with the exponents apart so that it neither fades nor loses."""
@@ -218,82 +307,67 @@ def geometric_mean(values: Floats) -> float:
 
 
 @strict_kernel
-def nash(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags]:
+def nash(
+    gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
+) -> Solved:
     """Weights alpha with G alpha = 1 / alpha, times the geometric mean of the norms.
 
-    Args:
-        gramians: [B, K, K].
-        present: [B, K].
-        unit: Relative error from which a result is doubtful.
-
-    Returns:
-        [B, K] weights and [B] whether they are doubtful.
+    The arguments and the answer are as in `imtl_g`.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
-    norms, cosines = np.empty(views), np.empty((views, views))
-    places = np.empty(views, np.int64)
     for b in range(blocks):
-        n = _compact(gramians[b], present[b], norms, cosines, places)
-        if n == 0:
-            continue
-        beta = np.ones(n)
-        if n == 2:
-            beta[:] = 1.0 / np.sqrt(max(1.0 + cosines[0, 1], EPSILON))
-        elif n > 2 and not bargain(cosines[:n, :n].copy(), beta):
+        places, norms, cosines = _of_present(gramians[b], rounding_residuals[b], present[b], exact)
+        n = places.size
+        beta = np.empty(n)
+        if n == 0 or not _bargained(cosines, beta, exact):
             continue
         largest = beta.max()
         # |u|^2 is n, and errors of the cosines grow with the summands over |u|.
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON * max(largest / np.sqrt(n), 1.0) > unit
         if n > 1 and n <= CANCELLED * largest * largest:
             continue
-        longest = norms[:n].max()
-        mean = geometric_mean(norms[:n] / longest)
+        longest = norms[:, 0].max()
+        mean = geometric_mean(norms[:, 0] / longest)
         for i in range(n):
-            result[b, places[i]] = beta[i] * mean * (longest / norms[i])
+            result[b, places[i]] = beta[i] * mean * (longest / norms[i, 0])
     return result, ill_conditioned
 
 
 @strict_kernel
-def aligned(gramians: Floats, present: Flags, unit: float) -> tuple[Floats, Flags]:
+def aligned(
+    gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
+) -> Solved:
     """Weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and G = V L V^T.
 
-    Args:
-        gramians: [B, K, K].
-        present: [B, K].
-        unit: Relative error from which a result is doubtful.
-
-    Returns:
-        [B, K] weights and [B] whether they are doubtful.
+    The arguments and the answer are as in `imtl_g`.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
-    norms, cosines = np.empty(views), np.empty((views, views))
-    places = np.empty(views, np.int64)
     for b in range(blocks):
-        n = _compact(gramians[b], present[b], norms, cosines, places)
+        places, norms, cosines = _of_present(gramians[b], rounding_residuals[b], present[b], exact)
+        n = places.size
         if n == 0:
             continue
         # Eigenvalues of D C D have the relative errors of those of C.
-        ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * smallest_pivot(cosines, n)
-        longest = norms[:n].max()
-        gramian, vectors = np.empty((n, n)), np.empty((n, n))
-        for i in range(n):
-            for j in range(n):
-                gramian[i, j] = (norms[i] / longest) * cosines[i, j] * (norms[j] / longest)
-        values = eigen(gramian, vectors)
+        pivot = smallest_pivot(cosines[:, :, 0].copy(), n)
+        ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * pivot
+        matrix, vectors = _graded(norms, cosines, exact), np.empty((n, n, 2))
+        values = eigen(matrix, vectors, exact)
         floor = n * EPSILON * values.max()
-        if n == 2 and 1.0 + cosines[0, 1] <= OPPOSITE:
+        if n == 2 and 1.0 + cosines[0, 1, 0] <= OPPOSITE:
             floor = values.min()
-        smallest = np.inf
-        for i in range(n):
-            if values[i] > floor:
-                smallest = min(smallest, values[i])
-        for i in range(n):
-            inner = vectors[:, i].sum()
+        kept = np.flatnonzero(values > floor)
+        least = kept[np.argmin(values[kept])]
+        ones, w = np.zeros((n, 2)), np.zeros((n, 2))
+        ones[:, 0] = 1.0
+        for i in kept:
+            inner = products(vectors[:, i], ones, 0, n, exact)
             # An eigenvector at right angles to p contributes nothing, not its rounding noise.
-            if values[i] > floor and abs(inner) > OPPOSITE:
-                factor = np.sqrt(smallest / values[i]) * inner / views
-                for k in range(n):
-                    result[b, places[k]] += factor * vectors[k, i]
+            if abs(inner[0]) > OPPOSITE:
+                ratio = quotient(at(matrix[least], least), at(matrix[i], i), exact)
+                factor = product(root(ratio, exact), inner, exact)
+                _add(w, quotient(factor, (float(views), 0.0), exact), vectors[:, i], exact)
+        for i in range(n):
+            result[b, places[i]] = w[i, 0]
     return result, ill_conditioned

@@ -70,7 +70,7 @@ def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: 
     problem = polyhedron(views, exact)
     norms, z = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        directions(gramians[b], rounding_residuals[b], present[b], norms, problem)
+        directions(gramians[b], rounding_residuals[b], present[b], norms, problem.cosines, exact)
         problem.ill_conditioned[0] = False
         for k in range(views):
             if present[b, k]:
@@ -93,7 +93,10 @@ def dualproj(gramians: Floats, rounding_residuals: Floats, present: Flags, exact
     problem = polyhedron(views, exact)
     norms, z = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) == 0:
+        count = directions(
+            gramians[b], rounding_residuals[b], present[b], norms, problem.cosines, exact
+        )
+        if count == 0:
             continue
         longest, _ = longest_of(norms)
         for k in range(views):

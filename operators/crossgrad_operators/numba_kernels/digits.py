@@ -4,7 +4,7 @@ A number is a pair (high, low). `exact` is True for 32 digits and None for 16, w
 of the pair counts: a type of its own, so that Numba compiles the two cases apart.
 """
 
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ Pair = tuple[float, float]
 Exact = Literal[True] | None
 #: [n, 2] numbers, or [n, n, 2].
 Pairs = NDArray[np.float64]
+ONE: Final = (1.0, 0.0)
 
 
 @strict_device

@@ -5,10 +5,14 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_part
 from crossgrad_operators.numba_kernels.digits import (
+    Exact,
     Pair,
     Pairs,
     at,
     clear,
+    plus,
+    product,
+    products,
     put,
     quotient,
     root,
@@ -24,21 +28,22 @@ Solved = tuple[Floats, Flags]
 
 @strict_part
 def directions(
-    gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, problem: Polyhedron
+    gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, cosines: Pairs, exact: Exact
 ) -> int:
-    """Fills norms [K] and the problem's cosines, zero for views that are not present.
+    """Fills norms [K] and cosines [K, K], zero for views that are not present.
 
     Args:
         gramian: [K, K].
-        remainder: [K, K] what rounding took from it; not looked at if the problem has 16 digits.
+        remainder: [K, K] what rounding took from it; not looked at for 16 digits.
         present: [K].
         norms: [K] numbers.
-        problem: Gets the cosines [K, K].
+        cosines: [K, K] numbers.
+        exact: True for 32 digits, None for 16.
 
     Returns:
         How many views are present.
     """
-    exact, cosines, count = problem.rounding.exact, problem.cosines, 0
+    count = 0
     clear(norms)
     for k in range(present.size):
         clear(cosines[k])
@@ -51,18 +56,37 @@ def directions(
         for j in range(i):
             if present[i] and present[j]:
                 cosine = quotient((gramian[i, j], remainder[i, j]), at(norms, i), exact)
-                put(cosines[i], j, _limited(quotient(cosine, at(norms, j), exact)))
+                put(cosines[i], j, limited(quotient(cosine, at(norms, j), exact)))
                 put(cosines[j], i, at(cosines[i], j))
     return count
 
 
 @strict_device
-def _limited(cosine: Pair) -> Pair:
+def limited(cosine: Pair) -> Pair:
+    """A cosine, within -1 and 1."""
     if cosine[0] > 1.0:
         return 1.0, 0.0
     if cosine[0] < -1.0:
         return -1.0, 0.0
     return cosine
+
+
+@strict_device
+def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
+    """The square of the sum of v_k times the k-th direction."""
+    total = 0.0, 0.0
+    for i in range(len(v)):
+        if v[i, 0] != 0.0:
+            inner = products(cosines[i], v, 0, len(v), exact)
+            total = plus(total, product(at(v, i), inner, exact), exact)
+    return total
+
+
+@strict_device
+def cancels(v: Pairs, cosines: Pairs, exact: Exact) -> bool:
+    """Whether only rounding noise is left of the sum of v_k times the k-th direction."""
+    longest = np.abs(v[:, 0]).max()
+    return form(v, cosines, exact)[0] <= CANCELLED * longest * longest
 
 
 @strict_device

@@ -3,13 +3,13 @@
 import numpy as np
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_operators.numba_kernels.directions import directions
 from crossgrad_operators.numba_kernels.normal import (
     CANCELLED,
     UNRELATED,
     Flags,
     Floats,
     Indices,
-    normalised,
 )
 
 #: A norm this close to its target, relative to the mean norm, has met it.
@@ -33,15 +33,16 @@ def confident(
     """
     blocks, views, _ = gramians.shape
     gates = np.zeros((blocks, views, views), np.bool_)
-    norms, cosines = np.empty(views), np.empty((views, views))
+    norms, cosines = np.zeros((views, 2)), np.zeros((views, views, 2))
+    nothing = np.zeros((views, views))
     effective = (1.0 + beta) / (1.0 - beta)
     for b in range(blocks):
-        normalised(gramians[b], present[b], norms, cosines)
+        directions(gramians[b], nothing, present[b], norms, cosines, None)
         for i in range(views):
             for j in range(views):
-                if i == j or abs(cosines[i, j]) <= UNRELATED:
+                c = cosines[i, j, 0]
+                if i == j or abs(c) <= UNRELATED:
                     continue
-                c = cosines[i, j]
                 moments[b, 0, i, j] = beta * moments[b, 0, i, j] + (1.0 - beta) * c
                 moments[b, 1, i, j] = beta * moments[b, 1, i, j] + (1.0 - beta) * c * c
                 moments[b, 2, i, j] += 1.0

@@ -2,15 +2,33 @@
 
 import numpy as np
 
-from crossgrad_core.numerics.jit import strict_kernel
+from crossgrad_core.numerics.jit import strict_device, strict_kernel, strict_part
+from crossgrad_operators.numba_kernels.digits import (
+    ONE,
+    Exact,
+    Pair,
+    Pairs,
+    at,
+    minus,
+    plus,
+    product,
+    products,
+    put,
+    quotient,
+    root,
+)
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Smallest pivot of a Cholesky factor of cosines. Smaller ones are rounding noise of a singular
 #: matrix; the solution is then dominated by the null vector, which is what callers look for.
 PIVOT = 1e-15
 
-#: Sweeps of Jacobi's method; six are enough for sixteen rows.
+#: Sweeps of Jacobi's method; six are enough for sixteen rows, eight for 32 digits.
 SWEEPS = 30
+#: With 32 digits, off-diagonal elements up to this share of the diagonal ones count as zero.
+NEGLIGIBLE = 1e-31
+#: So does this share of the largest element, whose inverse can still be squared.
+VANISHING = 1e-140
 
 
 @strict_kernel
@@ -110,52 +128,110 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
     return pivot
 
 
+@strict_device
+def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair, Pair, Pair]:
+    """Tangent, cosine and sine of the rotation that clears what is between two of a diagonal."""
+    theta = quotient(minus(other, one, exact), product((2.0, 0.0), between, exact), exact)
+    # Beyond this the square of theta is too large, or 1 is lost beside it.
+    far = 1e150 if exact is None else 1e17
+    if abs(theta[0]) > far:
+        t = quotient((0.5, 0.0), theta, exact)
+    else:
+        sign = 1.0 if theta[0] >= 0.0 else -1.0
+        hypotenuse = root(plus(product(theta, theta, exact), ONE, exact), exact)
+        size = sign * theta[0], sign * theta[1]
+        t = quotient((sign, 0.0), plus(size, hypotenuse, exact), exact)
+    cosine = quotient(ONE, root(plus(product(t, t, exact), ONE, exact), exact), exact)
+    return t, cosine, product(t, cosine, exact)
+
+
+@strict_device
+def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) -> None:
+    """Turns the numbers a and b at p and q of a row: c a - s b and s a + c b."""
+    a, b = at(row, p), at(row, q)
+    put(row, p, minus(product(cosine, a, exact), product(sine, b, exact), exact))
+    put(row, q, plus(product(sine, a, exact), product(cosine, b, exact), exact))
+
+
+@strict_part
+def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None:
+    """One Jacobi rotation of a matrix and of its eigenvectors, which clears the element (p, q)."""
+    between = at(matrix[p], q)
+    one, other = at(matrix[p], p), at(matrix[q], q)
+    t, cosine, sine = _rotation(one, other, between, exact)
+    moved = product(t, between, exact)
+    put(matrix[p], p, minus(one, moved, exact))
+    put(matrix[q], q, plus(other, moved, exact))
+    put(matrix[p], q, (0.0, 0.0))
+    put(matrix[q], p, (0.0, 0.0))
+    for k in range(len(matrix)):
+        if k not in (p, q):
+            _turn(matrix[k], p, q, cosine, sine, exact)
+            put(matrix[p], k, at(matrix[k], p))
+            put(matrix[q], k, at(matrix[k], q))
+        _turn(vectors[k], p, q, cosine, sine, exact)
+
+
 @strict_kernel
-def eigen(matrix: Floats, vectors: Floats) -> Floats:
-    """Eigenvalues [n] of a positive semi-definite matrix (destroyed), vectors [n, n] as columns.
+def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
+    """Eigenvalues [n] of a positive semi-definite matrix, which are left on its diagonal.
 
     Jacobi's method with the stopping rule |a_ij| <= eps sqrt(a_ii a_jj): small eigenvalues of
     matrices D C D with a well-conditioned C keep their relative accuracy, whatever the diagonal D
     (Demmel and Veselic 1992).
+
+    Args:
+        matrix: [n, n] numbers, overwritten.
+        vectors: [n, n] numbers, the eigenvectors as columns.
+        exact: True for 32 digits, None for 16.
     """
-    n = matrix.shape[0]
+    n = len(matrix)
     vectors[:] = 0.0
+    largest = 0.0
     for i in range(n):
-        vectors[i, i] = 1.0
+        vectors[i, i, 0] = 1.0
+        largest = max(largest, abs(matrix[i, i, 0]))
+    share = 1.1e-16 if exact is None else NEGLIGIBLE
+    least = 0.0 if exact is None else VANISHING * largest
     for _ in range(SWEEPS):
         rotated = False
         for p in range(n - 1):
             for q in range(p + 1, n):
-                apq = matrix[p, q]
-                scale = np.sqrt(max(matrix[p, p], 0.0)) * np.sqrt(max(matrix[q, q], 0.0))
-                if apq == 0.0 or abs(apq) <= 1.1e-16 * scale:
-                    continue
-                rotated = True
-                theta = (matrix[q, q] - matrix[p, p]) / (2.0 * apq)
-                if abs(theta) > 1e150:
-                    t = 0.5 / theta
-                else:
-                    t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                    t = t if theta >= 0.0 else -t
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                matrix[p, p] -= t * apq
-                matrix[q, q] += t * apq
-                matrix[p, q] = 0.0
-                matrix[q, p] = 0.0
-                for k in range(n):
-                    if k not in (p, q):
-                        akp, akq = matrix[k, p], matrix[k, q]
-                        matrix[k, p] = c * akp - s * akq
-                        matrix[p, k] = matrix[k, p]
-                        matrix[k, q] = s * akp + c * akq
-                        matrix[q, k] = matrix[k, q]
-                    vkp, vkq = vectors[k, p], vectors[k, q]
-                    vectors[k, p] = c * vkp - s * vkq
-                    vectors[k, q] = s * vkp + c * vkq
+                one, other = max(matrix[p, p, 0], 0.0), max(matrix[q, q, 0], 0.0)
+                if abs(matrix[p, q, 0]) > max(share * (np.sqrt(one) * np.sqrt(other)), least):
+                    rotated = True
+                    _rotate(matrix, vectors, p, q, exact)
         if not rotated:
             break
     values = np.empty(n)
     for i in range(n):
-        values[i] = matrix[i, i]
+        values[i] = matrix[i, i, 0]
     return values
+
+
+@strict_kernel
+def lost_between(
+    matrices: Floats, gramians: Floats, rounding_residuals: Floats, rounded: Floats
+) -> Floats:
+    """[B, R, R] what rounding took from M Gram M^T: its exact value minus `rounded`.
+
+    Args:
+        matrices: [B, R, K] M.
+        gramians: [B, K, K].
+        rounding_residuals: [B, K, K] what rounding took from them.
+        rounded: [B, R, R].
+    """
+    blocks, rows, views = matrices.shape
+    result = np.empty(rounded.shape)
+    matrix, gramian = np.zeros((rows, views, 2)), np.empty((views, views, 2))
+    half = np.empty((views, 2))
+    for b in range(blocks):
+        matrix[:, :, 0] = matrices[b]
+        gramian[:, :, 0], gramian[:, :, 1] = gramians[b], rounding_residuals[b]
+        for i in range(rows):
+            for k in range(views):
+                put(half, k, products(gramian[k], matrix[i], 0, views, True))
+            for j in range(rows):
+                whole = products(half, matrix[j], 0, views, True)
+                result[b, i, j] = minus(whole, (rounded[b, i, j], 0.0), True)[0]
+    return result

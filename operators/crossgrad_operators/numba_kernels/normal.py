@@ -1,9 +1,7 @@
-"""Gramians as norms and cosines, which no ratio of norms can spoil."""
+"""What counts as rounding noise in norms and cosines, which no ratio of norms can spoil."""
 
 import numpy as np
 from numpy.typing import NDArray
-
-from crossgrad_core.numerics.jit import strict_kernel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -20,41 +18,3 @@ UNRELATED = 1e-14
 EPSILON = 2.220446049250313e-16
 #: Errors of float64 algorithms on K rows, in units of K eps, generously.
 CAUTION = 4.0
-
-
-@strict_kernel
-def normalised(gramian: Floats, present: Flags, norms: Floats, cosines: Floats) -> None:
-    """Fills norms [K] and cosines [K, K] of one Gramian; zero for views that are not present."""
-    views = present.size
-    for k in range(views):
-        norms[k] = np.sqrt(gramian[k, k]) if present[k] else 0.0
-    for i in range(views):
-        cosines[i, i] = 1.0 if present[i] else 0.0
-        for j in range(i):
-            c = 0.0
-            if present[i] and present[j]:
-                c = min(max(gramian[i, j] / norms[i] / norms[j], -1.0), 1.0)
-            cosines[i, j] = c
-            cosines[j, i] = c
-
-
-@strict_kernel
-def form(a: Floats, cosines: Floats, b: Floats) -> float:
-    """a^T C b."""
-    total = 0.0
-    for i in range(a.size):
-        if a[i] != 0.0:
-            inner = 0.0
-            for j in range(b.size):
-                inner += cosines[i, j] * b[j]
-            total += a[i] * inner
-    return total
-
-
-@strict_kernel
-def times(cosines: Floats, j: int, b: Floats) -> float:
-    """(C b)_j."""
-    total = 0.0
-    for k in range(b.size):
-        total += cosines[j, k] * b[k]
-    return total

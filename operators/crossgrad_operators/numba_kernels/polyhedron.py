@@ -34,7 +34,6 @@ from crossgrad_operators.numba_kernels.digits import (
     root,
 )
 
-Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 

@@ -1,11 +1,27 @@
 """Pairwise projections: each gradient is changed against the others, one after the other.
 
-`exact_projection` has the same methods with twice the digits.
+A vector v is a sum of unit gradients; its coefficients are numbers of 16 or 32 digits.
 """
 
 import numpy as np
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
+from crossgrad_operators.numba_kernels.digits import (
+    ONE,
+    Exact,
+    Pair,
+    Pairs,
+    at,
+    clear,
+    minus,
+    plus,
+    product,
+    products,
+    put,
+    quotient,
+    root,
+)
+from crossgrad_operators.numba_kernels.directions import Solved, directions, form, limited
 from crossgrad_operators.numba_kernels.normal import (
     CANCELLED,
     CAUTION,
@@ -14,46 +30,56 @@ from crossgrad_operators.numba_kernels.normal import (
     Flags,
     Floats,
     Indices,
-    form,
-    normalised,
-    times,
 )
 
 
 @strict_device
-def _as_row(factors: Floats, norms: Floats, i: int, row: Floats) -> None:
+def _start(v: Pairs, i: int) -> None:
+    """Makes v the direction of g_i."""
+    clear(v)
+    v[i, 0] = 1.0
+
+
+@strict_device
+def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
     """Coefficients of unit vectors, in units of |g_i|, as coefficients of the gradients."""
-    for k in range(norms.size):
-        row[k] = 0.0 if factors[k] == 0.0 else factors[k] * (norms[i] / norms[k])
+    for k in range(len(v)):
+        if v[k, 0] != 0.0:
+            ratio = quotient(at(norms, i), at(norms, k), exact)
+            row[k] = product(at(v, k), ratio, exact)[0]
 
 
 @strict_device
-def _remaining(v: Floats, cosines: Floats) -> float:
+def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
     """The length of a projected vector; it becomes zero where only rounding noise is left."""
-    square = form(v, cosines, v)
-    longest = np.abs(v).max()
-    if square <= CANCELLED * longest * longest:
-        v[:] = 0.0
-        return 0.0
-    return float(np.sqrt(square))
+    square, longest = form(v, cosines, exact), np.abs(v[:, 0]).max()
+    if square[0] <= CANCELLED * longest * longest:
+        clear(v)
+        return 0.0, 0.0
+    return root(square, exact)
 
 
 @strict_device
-def _conflicts(along: float, size: float, threshold: float) -> bool:
-    """Whether a cosine along / size is below -threshold, by more than rounding noise."""
-    # Without a threshold the rule is continuous, and the sign of zero makes no difference.
-    margin = 0.0 if threshold == 0.0 else OPPOSITE
-    return along < 0.0 and along < -(threshold + margin) * size
+def _is_opposite(cosine: Pair, exact: Exact) -> bool:
+    """Whether 1 + cos is rounding noise."""
+    return plus(ONE, cosine, exact)[0] <= OPPOSITE
+
+
+@strict_device
+def _conflicts(along: Pair, size: Pair, least: Pair, exact: Exact) -> bool:
+    """Whether a cosine along / size is below -least."""
+    return along[0] < 0.0 and plus(along, product(least, size, exact), exact)[0] < 0.0
 
 
 @strict_kernel
 def projected(
     gramians: Floats,
+    rounding_residuals: Floats,
     present: Flags,
     order: Indices,
     gates: Flags,
-    threshold: float,
-    strength: float,
+    rule: tuple[float, float],
+    exact: Exact,
 ) -> Floats:
     """[B, K, K] rows v_i: g_i without (a share of) its components against the others.
 
@@ -63,52 +89,79 @@ def projected(
 
     Args:
         gramians: [B, K, K].
+        rounding_residuals: [B, K, K] what rounding took from them; not looked at for 16 digits.
         present: [B, K].
         order: [K, K] for each i the order of the partners (i itself is passed over).
         gates: [B, K, K] whether i may be projected along j at all.
-        threshold: 0 or more.
-        strength: From 0 to 1.
+        rule: Threshold, 0 or more, and strength, from 0 to 1.
+        exact: True for 32 digits, None for 16.
     """
+    threshold, strength = rule
+    # Without a threshold the rule is continuous, and the sign of zero makes no difference.
+    margin = 0.0 if threshold == 0.0 else OPPOSITE
+    least = plus((threshold, 0.0), (margin, 0.0), exact)
     blocks, views, _ = gramians.shape
     result = np.zeros((blocks, views, views))
-    norms = np.empty(views)
-    cosines = np.empty((views, views))
+    norms, v = np.zeros((views, 2)), np.zeros((views, 2))
+    cosines = np.zeros((views, views, 2))
     for b in range(blocks):
-        normalised(gramians[b], present[b], norms, cosines)
+        directions(gramians[b], rounding_residuals[b], present[b], norms, cosines, exact)
         for i in range(views):
             if not present[b, i]:
                 continue
-            v = np.zeros(views)
-            v[i] = 1.0
-            size = 1.0
+            _start(v, i)
+            size = ONE
             for j in order[i]:
-                if j == i or not gates[b, i, j] or not present[b, j] or size == 0.0:
+                if j == i or not gates[b, i, j] or not present[b, j] or size[0] == 0.0:
                     continue
-                along = times(cosines, j, v)
-                if _conflicts(along, size, threshold):
-                    if strength == 1.0 and 1.0 + along / size <= OPPOSITE:
-                        v[:] = 0.0
-                        size = 0.0
+                along = products(cosines[j], v, 0, views, exact)
+                if _conflicts(along, size, least, exact):
+                    if strength == 1.0 and _is_opposite(quotient(along, size, exact), exact):
+                        clear(v)
+                        size = (0.0, 0.0)
                     else:
-                        v[j] -= strength * along
-                        size = _remaining(v, cosines)
-            _as_row(v, norms, i, result[b, i])
+                        taken = product((strength, 0.0), along, exact)
+                        put(v, j, minus(at(v, j), taken, exact))
+                        size = _remaining(v, cosines, exact)
+            _as_row(v, norms, i, result[b, i], exact)
     return result
 
 
 @strict_device
-def _blur(v: Floats, size: float, phi: float, t: float) -> float:
+def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
     """What errors of the cosines grow by on their way to a target, or through it to the result."""
-    share = np.abs(v).max() / size
+    share = np.abs(v[:, 0]).max() / size
     steep = 1.0 + abs(t) / np.sqrt((1.0 - t) * (1.0 + t))
     across = max(np.sqrt((1.0 - phi) * (1.0 + phi)), 1e-6)
     return float(share * share * steep / across)
 
 
+@strict_device
+def _sine(cosine: Pair, exact: Exact) -> Pair:
+    """The sine of an angle between 0 and pi."""
+    one, other = minus(ONE, cosine, exact), plus(ONE, cosine, exact)
+    return root(product(one, other, exact), exact)
+
+
+@strict_device
+def _moved(target: float, phi: Pair, beta: float, exact: Exact) -> float:
+    """(1 - beta) t + beta phi, kept within +-0.999."""
+    kept = product(minus(ONE, (beta, 0.0), exact), (target, 0.0), exact)
+    moved = plus(kept, product((beta, 0.0), phi, exact), exact)[0]
+    return min(max(moved, -0.999), 0.999)
+
+
 @strict_kernel
 def aligned_to_targets(
-    gramians: Floats, present: Flags, order: Indices, targets: Floats, beta: float, unit: float
-) -> tuple[Floats, Flags]:
+    gramians: Floats,
+    rounding_residuals: Floats,
+    present: Flags,
+    order: Indices,
+    targets: Floats,
+    beta: float,
+    unit: float,
+    exact: Exact,
+) -> Solved:
     """Rows v_i of GradVac; `targets` [B, K, K] are updated in place.
 
     For i, for j in order[i]: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of g_j that
@@ -117,43 +170,47 @@ def aligned_to_targets(
 
     Args:
         gramians: [B, K, K].
+        rounding_residuals: As in `projected`.
         present: [B, K].
         order: [K, K].
         targets: [B, K, K].
         beta: Weight of the newest cosine.
-        unit: Relative error from which a result is doubtful.
+        unit: Relative error from which a result of 16 digits is doubtful.
+        exact: True for 32 digits, None for 16.
 
     Returns:
         [B, K, K] rows, and [B] whether they, or the targets, are doubtful.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
-    norms = np.empty(views)
-    cosines = np.empty((views, views))
+    norms, v = np.zeros((views, 2)), np.zeros((views, 2))
+    cosines = np.zeros((views, views, 2))
+    least = unit / (CAUTION * views * EPSILON)
     for b in range(blocks):
-        normalised(gramians[b], present[b], norms, cosines)
-        least = unit / (CAUTION * views * EPSILON)
+        directions(gramians[b], rounding_residuals[b], present[b], norms, cosines, exact)
         for i in range(views):
             if not present[b, i]:
                 continue
-            v = np.zeros(views)
-            v[i] = 1.0
-            size = 1.0
+            _start(v, i)
+            size = ONE
             for j in order[i]:
-                if j == i or not present[b, j] or size == 0.0:
+                if j == i or not present[b, j] or size[0] == 0.0:
                     continue
-                along = times(cosines, j, v)
-                phi = min(max(along / size, -1.0), 1.0)
-                t = targets[b, i, j]
-                ill_conditioned[b] |= _blur(v, size, phi, t) > least
-                targets[b, i, j] = min(max((1.0 - beta) * t + beta * phi, -0.999), 0.999)
-                if phi < t:
-                    if 1.0 + phi <= OPPOSITE:
-                        v[:] = 0.0
-                        size = 0.0
+                along = products(cosines[j], v, 0, views, exact)
+                phi = limited(quotient(along, size, exact))
+                target = targets[b, i, j]
+                if exact is None:
+                    ill_conditioned[b] |= _blur(v, size[0], phi[0], target) > least
+                targets[b, i, j] = _moved(target, phi, beta, exact)
+                if minus(phi, (target, 0.0), exact)[0] < 0.0:
+                    if _is_opposite(phi, exact):
+                        clear(v)
+                        size = (0.0, 0.0)
                     else:
-                        across = size * np.sqrt((1.0 - phi) * (1.0 + phi))
-                        v[j] += across * t / np.sqrt((1.0 - t) * (1.0 + t)) - along
-                        size = _remaining(v, cosines)
-            _as_row(v, norms, i, result[b, i])
+                        across = product(size, _sine(phi, exact), exact)
+                        across = product(across, (target, 0.0), exact)
+                        raised = quotient(across, _sine((target, 0.0), exact), exact)
+                        put(v, j, plus(at(v, j), minus(raised, along, exact), exact))
+                        size = _remaining(v, cosines, exact)
+            _as_row(v, norms, i, result[b, i], exact)
     return result, ill_conditioned

@@ -121,7 +121,10 @@ def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Ex
     problem = polyhedron(views, exact)
     norms, x = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) == 0:
+        count = directions(
+            gramians[b], rounding_residuals[b], present[b], norms, problem.cosines, exact
+        )
+        if count == 0:
             continue
         _reciprocals(norms, present[b], problem.heights, exact)
         problem.ill_conditioned[0] = False
@@ -396,7 +399,10 @@ def cagrad(
     problem = polyhedron(views, exact)
     norms, q = np.zeros((views, 2)), np.zeros((views, 2))
     for b in range(blocks):
-        if directions(gramians[b], rounding_residuals[b], present[b], norms, problem) > 0:
+        count = directions(
+            gramians[b], rounding_residuals[b], present[b], norms, problem.cosines, exact
+        )
+        if count > 0:
             problem.ill_conditioned[0] = False
             _reciprocals(norms, present[b], problem.heights, exact)
             _cagrad(problem, norms, q, c, result[b])

@@ -1,13 +1,23 @@
 """`crossgrad stress`: operators against exact arithmetic on stiff and extreme gradients."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import typer
 
-from crossgrad_core.commands import Progress, UserError, announce, check_file, check_new
+from crossgrad_core.commands import (
+    Progress,
+    UserError,
+    announce,
+    argument,
+    check_file,
+    check_new,
+    command_of,
+    option,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -48,85 +58,79 @@ class Precision(StrEnum):
         return tuple(both.values()) if self == Precision.BOTH else (both[self.value],)
 
 
-def stress(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
-    operators: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="OPERATOR...", help="Names of operators. Default: all installed."),
-    ] = None,
-    case: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="Only cases whose name contains this text.")
-    ] = None,
-    elements: Annotated[
-        int | None,
-        typer.Option(
-            min=1000, metavar="N", help=f"Elements of the largest gradients. Default: {LARGE:,}."
-        ),
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write the table to a CSV file.")
-    ] = None,
-    search: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="Instead of the fixed cases: look at random for the worst gradients, that long.",
-        ),
-    ] = None,
-    matrices: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Instead of the fixed cases: whether results are finite on N short random ones.",
-        ),
-    ] = None,
-    rows: Annotated[
-        str | None,
-        typer.Option(
-            metavar="[[...],...]",
-            help="Instead of the fixed cases: this one, a row per view, as a search prints it.",
-        ),
-    ] = None,
-    precision: Annotated[
-        Precision | None,
-        typer.Option(
-            "--type", help="Type of gradients for --search, --matrices and --rows. Default: both."
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, metavar="N", help="Seed of --search and --matrices. Default: 0."),
-    ] = None,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The options of the command."""
+
+    operators: list[str] | None = argument(
+        "OPERATOR...", "Names of operators. Default: all installed.", default=None
+    )
+    case: str | None = option(None, "Only cases whose name contains this text.", "TEXT")
+    elements: int | None = option(
+        None, f"Elements of the largest gradients. Default: {LARGE:,}.", "N", min=1000
+    )
+    csv: Path | None = option(None, "Also write the table to a CSV file.", "FILE")
+    search: float | None = option(
+        None,
+        "Instead of the fixed cases: look at random for the worst gradients, that long.",
+        "SECONDS",
+    )
+    matrices: int | None = option(
+        None,
+        "Instead of the fixed cases: whether results are finite on N short random ones.",
+        "N",
+        min=1,
+    )
+    rows: str | None = option(
+        None,
+        "Instead of the fixed cases: this one, a row per view, as a search prints it.",
+        "[[...],...]",
+    )
+    precision: Precision | None = option(
+        None,
+        "Type of gradients for --search, --matrices and --rows. Default: both.",
+        flag="--type",
+    )
+    seed: int | None = option(None, "Seed of --search and --matrices. Default: 0.", "N", min=0)
+
+
+@command_of(Options)
+def stress(given: Options) -> None:
     """Hold operators against exact arithmetic on extreme gradients.
 
     Results are compared with 50 digits; exit status 1 if an operator breaks its promise.
     """
     announce()
-    modes = {"--search": search, "--matrices": matrices, "--rows": rows}
-    given = {"--case": case, "--elements": elements, "--type": precision, "--seed": seed}
-    _refuse_idle(modes, {name: value for name, value in given.items() if value is not None})
+    _refuse_idle(given)
     from crossgrad_operators.stress.suite import installed
 
+    csv, seed = given.csv, given.seed or 0
     if csv is not None:
         check_file(csv)
         check_new(csv)
-    names = operators or installed()
-    dtypes = (precision or Precision.BOTH).dtypes
-    if search is not None:
-        right = _search(names, dtypes, (seed or 0, search), csv)
-    elif matrices is not None:
-        right = _matrices(names, dtypes, (seed or 0, matrices), csv)
-    elif rows is not None:
-        right = _rows(names, dtypes, rows, csv)
+    names = given.operators or installed()
+    dtypes = (given.precision or Precision.BOTH).dtypes
+    if given.search is not None:
+        right = _search(names, dtypes, (seed, given.search), csv)
+    elif given.matrices is not None:
+        right = _matrices(names, dtypes, (seed, given.matrices), csv)
+    elif given.rows is not None:
+        right = _rows(names, dtypes, given.rows, csv)
     else:
-        right = _cases(names, case, elements or LARGE, csv)
+        right = _cases(names, given.case, given.elements or LARGE, csv)
     if not right:
         raise typer.Exit(1)
 
 
-def _refuse_idle(modes: Mapping[str, object], others: Mapping[str, object]) -> None:
+def _refuse_idle(given: Options) -> None:
     """Refuses options that the chosen kind of run does nothing with."""
+    modes = {"--search": given.search, "--matrices": given.matrices, "--rows": given.rows}
+    others = {
+        "--case": given.case,
+        "--elements": given.elements,
+        "--type": given.precision,
+        "--seed": given.seed,
+    }
     chosen = [name for name, value in modes.items() if value is not None]
     if len(chosen) > 1:
         raise UserError(
@@ -134,7 +138,7 @@ def _refuse_idle(modes: Mapping[str, object], others: Mapping[str, object]) -> N
             todo="leave all but one of them out; each is a run of its own",
         )
     mode = chosen[0] if chosen else ""
-    idle = [name for name in others if mode not in _USED[name]]
+    idle = [name for name, value in others.items() if value is not None and mode not in _USED[name]]
     if idle:
         raise UserError(
             f"{' and '.join(idle)} does nothing with {mode or 'the fixed cases'}",

@@ -10,6 +10,8 @@ from scipy.stats import rankdata
 _ROUNDING = 1e-9
 #: Decimals of a difference of logarithms that are no rounding.
 _DIGITS = 9
+#: Bins of pairs by how much their distances differ.
+_BINS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,16 +19,13 @@ class DistanceConflict:
     """Conflict of pairs of views against how far apart their distances are.
 
     Attributes:
-        variance: Variance of the distances over their squared mean.
-        edges: [Q + 1] edges of |log r_i - log r_j|, quantiles over pairs.
-        rates: [Q] conflict rate of the pairs of each bin; NaN in an empty one.
+        rates: [4] conflict rate of the pairs of each quarter by |log r_i - log r_j|; NaN in an
+            empty one.
         correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j|, ranks among
             all pairs; NaN where either is constant.
         p_value: Share of relabelled cameras (Mantel's permutations) with as large a correlation.
     """
 
-    variance: float
-    edges: NDArray[np.float64]
     rates: NDArray[np.float64]
     correlation: float
     p_value: float
@@ -37,7 +36,6 @@ def conflict_by_distance(
     distances: NDArray[np.float64],
     rng: np.random.Generator,
     *,
-    bins: int = 4,
     permutations: int = 499,
 ) -> DistanceConflict:
     """The paper's Observation 1 within one scene, for one block.
@@ -49,22 +47,19 @@ def conflict_by_distance(
         gramian: [V, V].
         distances: [V] camera distances, any unit.
         rng: For the permutations.
-        bins: Q.
         permutations: How many.
     """
-    variance = relative_variance(distances)
     positive = np.flatnonzero(distances > 0.0)
     logs, products = np.log(distances[positive]), gramian[np.ix_(positive, positive)]
     first, second = np.triu_indices(len(positive), 1)
     counted = products[first, second] != 0.0
     if not counted.any():
-        nothing = np.full(bins, np.nan)
-        return DistanceConflict(variance, np.full(bins + 1, np.nan), nothing, np.nan, np.nan)
+        return DistanceConflict(np.full(_BINS, np.nan), np.nan, np.nan)
     ranks = _pair_ranks(logs)
     first, second = first[counted], second[counted]
     apart = _apart(logs, first, second)
     negative = products[first, second] < 0.0
-    edges = np.quantile(apart, np.linspace(0.0, 1.0, bins + 1))
+    edges = np.quantile(apart, np.linspace(0.0, 1.0, _BINS + 1))
     # The first order is the cameras' own.
     orders = [
         np.arange(len(positive)),
@@ -76,7 +71,7 @@ def conflict_by_distance(
     above = int((correlations[1:] >= correlations[0] - _ROUNDING).sum())
     p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
     rates = _rates(apart, negative, edges)
-    return DistanceConflict(variance, edges, rates, float(correlations[0]), p_value)
+    return DistanceConflict(rates, float(correlations[0]), p_value)
 
 
 def relative_variance(distances: NDArray[np.float64]) -> float:

@@ -19,7 +19,6 @@ _DARK, _BRIGHT = 30.0, 235.0
 #: whose scales differ by less than 1.5 well (docs/prepare.md).
 _RUNG: Final = 1.4
 _MOST_RUNGS: Final = 12
-_ROUND: Final = 10.0
 
 
 @dataclass(frozen=True)

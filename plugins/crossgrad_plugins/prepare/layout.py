@@ -191,13 +191,12 @@ def clear_leftovers(layout: Layout) -> None:
     for folder in (layout.work, layout.scene):
         clear_half_written(folder)
     for path in layout.masks.rglob(".*.tmp*"):
-        # Earlier versions ended the names of theirs with the form.
-        if is_leftover(path) or path.name.endswith(".tmp.png"):
+        if is_leftover(path):
             path.unlink()
 
 
 def clear_damaged(layout: Layout) -> None:
-    """Deletes what earlier versions left cut short on a full disk, and what was made of it."""
+    """Deletes models that are cut short, and what was made of them."""
     damaged = False
     for made in (layout.models, layout.placed, layout.model):
         damaged = damaged or not _is_sound(layout, made)

@@ -218,7 +218,7 @@ def test_a_mask_that_cannot_be_written_gets_no_name(model, layout, monkeypatch):
 
 def test_half_written_masks_of_killed_processes_go(layout):
     layout.masks.mkdir()
-    names = (".a.jpg.png.12.tmp", ".a.jpg.png.tmp.png", "a.jpg.png", ".mine.png")
+    names = (".a.jpg.png.12.tmp", "a.jpg.png", ".mine.png")
     for name in names:
         (layout.masks / name).touch()
     clear_leftovers(layout)

@@ -5,8 +5,9 @@ from itertools import combinations, product
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.pairwise import pairs_of, pairwise
 
-from crossgrad_plugins.authoring.matrix.pairwise import meetings, pairs_of, pairwise
+from crossgrad_plugins.authoring.matrix.pairwise import meetings
 
 
 def pairs(rows):
