@@ -330,9 +330,16 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"operator": "pcgrad", "views": 2}, {"sh_every": 3}], ids=str
+    ("settings", "stop"),
+    [
+        ({}, 6),
+        ({}, 13),
+        ({"operator": "pcgrad", "views": 2}, 14),
+        ({"sh_every": 3}, 6),
+        ({"sh_every": 3}, 13),
+    ],
+    ids=str,
 )
-@pytest.mark.parametrize("stop", [6, 13, 14])
 def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
     tmp_path, monkeypatch, stop, settings
 ):
