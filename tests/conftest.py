@@ -58,8 +58,14 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
+def pytest_collection():
+    """Nothing becomes garbage while tests are collected; looking for it took a fifth of the time."""
+    gc.disable()
+
+
 def pytest_collection_finish():
     """What is there now stays: looking for garbage among a million objects takes a second."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 
