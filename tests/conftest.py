@@ -5,6 +5,7 @@ cores, and spinning took as much time as the work. Ctrl-C is not ignored, as it 
 starts in the background.
 """
 
+import gc
 import os
 import signal
 
@@ -55,6 +56,18 @@ def pytest_collection_modifyitems(items):
         return 0 if contract and any(name in item.name for name in HEAVIEST) else 2 - contract
 
     items.sort(key=place)
+
+
+def pytest_collection():
+    """Nothing becomes garbage while tests are collected; looking for it took a fifth of the time."""
+    gc.disable()
+
+
+def pytest_collection_finish():
+    """What is there now stays: looking for garbage among a million objects takes a second."""
+    gc.enable()
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack
 
 import pytest
 from support.commands import ended
@@ -84,8 +85,8 @@ def foreign(tmp_path_factory):
     place = tmp_path_factory.mktemp("foreign")
     scene = write_tiny_scene(place / "Łódź\x1b[31m", views=5)
     options = ("--steps", "2", "--threads", "1", "-q")
-    ended = in_ascii("run", scene, *options, "--out", place / "żółw\x1b[31m")
-    return place / "żółw\x1b[31m", ended
+    done = in_ascii("run", scene, *options, "--out", place / "żółw\x1b[31m")
+    return place / "żółw\x1b[31m", done
 
 
 def in_ascii(*arguments):
@@ -98,20 +99,29 @@ def in_ascii(*arguments):
 
 
 def test_a_run_says_where_its_results_are_on_every_terminal(foreign):
-    folder, ended = foreign
-    assert ended.returncode == 0, ended.stderr
-    assert rb"results in" in ended.stdout and rb"\u017c\xf3\u0142w\x1b[31m" in ended.stdout
+    folder, done = foreign
+    assert done.returncode == 0, done.stderr
+    assert rb"results in" in done.stdout and rb"\u017c\xf3\u0142w\x1b[31m" in done.stdout
     log = (folder / "log.txt").read_text(encoding="utf-8")
     assert r"Łódź\x1b[31m" in log and "\x1b" not in log
 
 
 @pytest.mark.parametrize("command", ["export", "render", "compare"])
-def test_a_command_says_where_its_results_are_on_every_terminal(foreign, command, tmp_path):
+def test_a_command_says_where_its_results_are_on_every_terminal(
+    foreign, command, tmp_path, monkeypatch
+):
     out = tmp_path / "ó\x1b[31m"
     place = out.with_suffix(".ply") if command == "export" else out
-    ended = in_ascii(command, foreign[0], "--out", place)
-    assert ended.returncode == 0, ended.stderr
-    assert rb"\xf3\x1b[31m" in ended.stdout and b"\x1b" not in ended.stdout + ended.stderr
+    said = {name: tmp_path / name for name in ("stdout", "stderr")}
+    with ExitStack() as files, monkeypatch.context() as patched:
+        for name, path in said.items():
+            patched.setattr(sys, name, files.enter_context(path.open("w", encoding="ascii")))
+        streams.outlast_readers()  # As the command does with the streams of its process.
+        assert ended(command, foreign[0], "--out", place) == 0, said["stderr"].read_bytes()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    stdout, stderr = (path.read_bytes() for path in said.values())
+    assert rb"\xf3\x1b[31m" in stdout and b"\x1b" not in stdout + stderr
     assert place.exists()
 
 

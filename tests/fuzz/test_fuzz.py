@@ -20,7 +20,7 @@ from crossgrad_fuzz.targets import TARGETS
 
 MAKEFILE = Path(__file__).parents[2] / "Makefile"
 #: Executions of each short search: about ten seconds for all parsers.
-SHORT = 50
+SHORT = 25
 #: Of a search for a defect that begins with the inputs on which parsers once failed.
 DIRECT = 60
 

@@ -95,7 +95,7 @@ def test_the_written_config_repeats_the_run(scene, tmp_path):
 @pytest.mark.parametrize("sampler", ["epoch", "random", "near-far"])
 def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     # Edits fall before and behind the stop.
-    settings = {"steps": 60, "sampler": {"name": sampler}, "eval_every": 20, **GROWTH}
+    settings = {"steps": 40, "sampler": {"name": sampler}, "eval_every": 20, **GROWTH}
     run(scene, tmp_path / "whole", **settings)
     assert run(scene, tmp_path / "parts", stop_after=23, **settings) == 0
     assert json.loads((tmp_path / "parts/summary.json").read_text())["status"] == "stopped"
@@ -213,22 +213,28 @@ def test_joint_backward_agrees_to_rounding_and_counts_one_pass(scene, tmp_path):
         assert next(csv.DictReader(file))["backward_passes"] == "3"
 
 
+@pytest.fixture(scope="module")
+def in_place(scene, tmp_path_factory):
+    """A run of the scene in its own unit and place."""
+    out = tmp_path_factory.mktemp("in place") / "run"
+    run(scene, out, steps=40)
+    return out
+
+
 @pytest.mark.parametrize("scale", [1000.0, 0.001])
-def test_the_unit_of_length_does_not_matter(scene, tmp_path, scale):
+def test_the_unit_of_length_does_not_matter(in_place, tmp_path, scale):
     write_tiny_scene(tmp_path / "scaled", views=9, scale=scale)
-    run(scene, tmp_path / "a", steps=40)
     run(tmp_path / "scaled", tmp_path / "b", steps=40)
-    a, b = quality(tmp_path / "a")[-1], quality(tmp_path / "b")[-1]
+    a, b = quality(in_place)[-1], quality(tmp_path / "b")[-1]
     assert float(a["psnr"]) == pytest.approx(float(b["psnr"]), abs=1e-3)
     assert a["primitives"] == b["primitives"]
 
 
 @pytest.mark.parametrize("offset", [(4e5, 5.6e6, 120.0), (1e6, 1e6, 1e6)])
-def test_far_from_the_origin_the_export_is_in_place(scene, tmp_path, offset):
+def test_far_from_the_origin_the_export_is_in_place(in_place, tmp_path, offset):
     write_tiny_scene(tmp_path / "utm", views=9, offset=offset)
-    run(scene, tmp_path / "a", steps=40)
     run(tmp_path / "utm", tmp_path / "b", steps=40)
-    near = read_ply(tmp_path / "a" / "point_cloud.ply").means
+    near = read_ply(in_place / "point_cloud.ply").means
     far = read_ply(tmp_path / "b" / "point_cloud.ply").means
     assert np.abs(np.median(far, 0) - np.median(near, 0) - np.array(offset)).max() < 0.05
 

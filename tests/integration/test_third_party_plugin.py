@@ -83,10 +83,9 @@ def installed(python, tmp_path_factory):
 
 @pytest.fixture
 def broken(python, installed, tmp_path):
-    """The same package with three defects, until the test is over."""
-    source = tmp_path / "broken"
-    shutil.copytree(installed, source)
-    package = source / "crossgrad_example"
+    """The installed package has three defects, until the test is over."""
+    (package,) = python.parents[1].glob("**/site-packages/crossgrad_example")
+    whole = shutil.copytree(package, tmp_path / "whole")
     replace(
         package / "equal_length.py",
         "np.maximum(context.present.sum(axis=1), 1)",
@@ -95,9 +94,9 @@ def broken(python, installed, tmp_path):
     replace(package / "equal_length.py", "lengths = np.sqrt(", "lengths = np.sqrt(1e-8 + ")
     replace(package / "least_seen.py", "context.rng.random", "np.random.random")
     replace(package / "clip.py", "return answer.with_state", "answer.with_state")
-    install(python, source)
     yield
-    install(python, installed)
+    shutil.rmtree(package)
+    shutil.copytree(whole, package)
 
 
 def replace(path, old, new):

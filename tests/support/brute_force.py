@@ -142,6 +142,7 @@ class Splatter:
         self.high = (size - self.principal) / self.focals + margin
         x, y = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
         self.centers = np.stack(np.meshgrid(x, y), -1)  # [H, W, 2]
+        self._covariances: dict[int, Array] = {}
 
     def jacobian(self, i: int) -> Array:
         """[2, 3] of the projection at Gaussian i, world to pixels."""
@@ -161,8 +162,10 @@ class Splatter:
 
     def covariance(self, i: int) -> Array:
         """[2, 2] of Gaussian i in pixels, without dilation."""
-        jacobian, axes = self.jacobian(i), self.axes(i)
-        return np.asarray(jacobian @ axes @ axes.T @ jacobian.T)
+        if i not in self._covariances:
+            flat = self.jacobian(i) @ self.axes(i)
+            self._covariances[i] = flat @ flat.T
+        return self._covariances[i]
 
     def mip_factor(self, covariance: Array) -> float:
         """Factor of the opacity: 1 unless the response is antialiased."""
@@ -187,7 +190,9 @@ class Splatter:
             return np.asarray(self.opacities[i] * _window_integral(offset, covariance))
         dilated = covariance + self.dilation * np.eye(2)
         opacity = self.opacities[i] * self.mip_factor(covariance)
-        square = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(dilated), offset)
+        (a, b), (_, c) = np.linalg.inv(dilated)
+        x, y = offset[..., 0], offset[..., 1]
+        square = a * x * x + 2 * b * x * y + c * y * y
         return np.asarray(opacity * np.exp(-square / 2))
 
     def extents(self) -> Array:

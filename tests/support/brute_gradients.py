@@ -54,6 +54,7 @@ def pixel_gradients(
     max_alpha: float = 0.99,
     near: float = 1e-3,
     dilation: float = 0.3,
+    drawn: Trace | None = None,
 ) -> PixelGradients:
     """The gradients of sum over `image`, `alpha` and `depth` of weight times value.
 
@@ -65,8 +66,9 @@ def pixel_gradients(
         max_alpha: Cap of alpha.
         near: Near plane, local units.
         dilation: Used where the Gaussians bring none.
+        drawn: The trace of all this, where it is known.
     """
-    drawn = trace(gaussians, camera, max_alpha=max_alpha, near=near, dilation=dilation)
+    drawn = drawn or trace(gaussians, camera, max_alpha=max_alpha, near=near, dilation=dilation)
     scene = Splatter(gaussians, camera, near, dilation)
     slopes, doubt = _by_alpha(drawn, weights, np.array(background), max_alpha)
     gradients = np.zeros((*slopes.shape, 2))

@@ -37,16 +37,19 @@ def refused(rows):
 
 def from_lines(lines, rows):
     """The refusals that lines of `as_lines` stand for."""
-    patterns = []
+    # The places that lines name -> the names there -> reasons: few lines name other places.
+    patterns = {}
     for line in lines:
         named, reason = line.split(": ", 1)
-        pairs = (part.split("=", 1) for part in named.split())
-        patterns.append(([(SLOTS.index(slot), name) for slot, name in pairs], reason))
+        slots, names = zip(*(part.split("=", 1) for part in named.split()), strict=True)
+        places = tuple(map(SLOTS.index, slots))
+        patterns.setdefault(places, {}).setdefault(names, []).append(reason)
     found = {}
     for row in rows:
-        for pattern, reason in patterns:
-            if all(row[i] == name for i, name in pattern):
-                found.setdefault(row, []).append(reason)
+        for places, reasons in patterns.items():
+            names = tuple(row[i] for i in places)
+            if names in reasons:
+                found.setdefault(row, []).extend(reasons[names])
     return found
 
 

@@ -15,9 +15,22 @@ from crossgrad_plugins.compare.figures.style import (
 )
 
 
-@pytest.mark.parametrize("share", [1.0, 0.62])
-@pytest.mark.parametrize("letters", ["ochota_kap_hybrid, gain ", "W"])
-@pytest.mark.parametrize("length", [1, 8, 20, 45, 200])
+WORDS, WIDE = "ochota_kap_hybrid, gain ", "W"
+
+
+@pytest.mark.parametrize(
+    ("length", "letters", "share"),
+    [
+        (1, WORDS, 1.0),
+        (1, WIDE, 0.62),
+        (8, WORDS, 0.62),
+        (20, WIDE, 1.0),
+        (45, WORDS, 1.0),
+        (45, WIDE, 0.62),
+        (200, WORDS, 0.62),
+        (200, WIDE, 1.0),
+    ],
+)
 def test_a_legend_fits_its_figure_whatever_its_labels(length, letters, share):
     labels = [f"{number} {letters * 200}"[:length] for number in range(9)]
     with styled(), warnings.catch_warnings():

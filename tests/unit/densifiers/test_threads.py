@@ -33,8 +33,8 @@ def test_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
         schedule_unit="steps",
         densify_from=1,
         densify_until=9,
-        densify_every=3,
-        reset_every=6,
+        densify_every=2,
+        reset_every=4,
         sh_from=3,
         densifier=ComponentChoice(name=name, **OPTIONS.get(name, {})),
         backbone=ComponentChoice(**BACKBONES.get(name, {"name": "vanilla"})),
@@ -44,7 +44,7 @@ def test_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
     for threads in (1, 2):
         configure_threads(threads)
         state = first_state(setup)
-        records = [timed_step(setup, state) for _ in range(7)]
+        records = [timed_step(setup, state) for _ in range(5)]
         states.append(state)
     one, two = states
     assert (edits_in(records) > 0) == (name != "none")

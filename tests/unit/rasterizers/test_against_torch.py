@@ -232,10 +232,10 @@ def drawn_shaken(made, weights, seed):
     return draw(REFERENCE, shaken(made, seed), weights, torch.float64, noise)[0]
 
 
-def decided(made, weights):
+def decided(made, weights, drawn):
     """[N] bool: no rounding can move a pixel to another bin or turn its gradient around."""
     options = {**made.options, "background": made.background}
-    exact = pixel_gradients(made.gaussians, made.camera, weights=weights, **options)
+    exact = pixel_gradients(made.gaussians, made.camera, weights=weights, drawn=drawn, **options)
     shakes = [shaken(made, seed) for seed in range(DRAWS)]
     along = [places(shake.gaussians, shake.camera) for shake in shakes]
     moved = np.max([np.abs(each - exact.along) for each in along], axis=0)
@@ -262,7 +262,7 @@ def test_agrees_with_the_reference(name, case_name):
     expected, screen = draw(REFERENCE, made, weights, torch.float64)
     found, fast = draw(name, made, weights, torch.float32)
     shakes = [drawn_shaken(made, weights, seed) for seed in range(DRAWS)]
-    binned = decided(made, weights)
+    binned = decided(made, weights, exact)
     assert binned.float().mean() > 0.5 or not len(binned)
     counts = expected["bin counts"].sum(-1)
     for key, rows in expected.items():

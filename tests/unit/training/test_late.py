@@ -333,8 +333,17 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
-@pytest.mark.parametrize("settings", [{}, {"operator": "pcgrad", "views": 2}, THIRD], ids=str)
-@pytest.mark.parametrize("stop", [6, 13, 14])
+@pytest.mark.parametrize(
+    ("settings", "stop"),
+    [
+        ({}, 6),
+        ({}, 13),
+        ({"operator": "pcgrad", "views": 2}, 14),
+        (THIRD, 6),
+        (THIRD, 13),
+    ],
+    ids=str,
+)
 def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
     tmp_path, monkeypatch, stop, settings
 ):

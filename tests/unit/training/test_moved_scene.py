@@ -45,7 +45,12 @@ def in_place(tmp_path_factory):
     return written(tmp_path_factory.mktemp("scenes") / "tiny")
 
 
-@pytest.fixture(scope="module", params=WAYS)
+#: `make slow` trains the two ways that a run does not take by default.
+DEFAULT = "as by default"
+OTHERS = [pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != DEFAULT]
+
+
+@pytest.fixture(scope="module", params=[*OTHERS, DEFAULT])
 def spread(in_place, request):
     """How a run steps, PSNR in place, and how far apart runs from perturbed positions end."""
     plain = psnr(in_place, request.param)
