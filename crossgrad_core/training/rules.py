@@ -1,4 +1,4 @@
-"""What rules change: the Gaussians of a view, learning rates, and the parameters to be shown."""
+"""Ask rules about the Gaussians of a view, learning rates, and the parameters to be shown."""
 
 from dataclasses import replace
 from math import inf, prod
