@@ -14,7 +14,6 @@ from crossgrad_plugins.compare.figures.style import (
     styled,
 )
 
-
 WORDS, WIDE = "ochota_kap_hybrid, gain ", "W"
 
 
