@@ -11,6 +11,7 @@ from support.run_folders import RunFolder
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import compared
+from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import headline
@@ -252,7 +253,8 @@ def test_no_figure_is_at_infinity(folder, name, value):
     assert error.value.where == f"--{name}"
 
 
-def test_a_comparison_that_was_broken_off_is_replaced(folder):
+def test_a_comparison_that_was_broken_off_is_replaced(folder, monkeypatch):
+    monkeypatch.setattr(app, "drawn_figures", lambda found: [draw_differences(found)])
     out = folder / "out"
     app.compare([folder], Options(), out, skip_broken=False)
     (out / "index.html").unlink()
