@@ -130,7 +130,7 @@ def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scen
         a["psnr"] != b["psnr"] for a, b in zip(rows[2:], raw[2:], strict=True)
     )
     exported = read_ply(tmp_path / "whole" / "point_cloud.ply").logit_opacities
-    sums, count = whole.plugins["average"].tensors["opacities"], 10
+    sums, count = whole.plugins["weight-averaging"].per_primitive["opacities"], 10
     assert np.allclose(
         np.sort(exported.ravel()), np.sort((sums / count).numpy().ravel()), atol=1e-5
     )

@@ -33,7 +33,7 @@ GIB = 2**30
         ({"views": 8, "separate": True}, 17),
         ({"views": 8, "separate": True, "watched": True}, 18),
         ({"views": 1, "joint": True}, 10),
-        ({"views": 1, "averaged": True}, 13),
+        ({"views": 1, "copies": 3}, 13),
         ({"views": 4, "joint": True}, 6 + 2 + 4 * 3),  # four graphs instead of an edit
     ],
 )

@@ -65,6 +65,11 @@ def of_context(self, context):
 
 
 @hookimpl
+def of_rate(self, step):
+    self.spring(step)
+
+
+@hookimpl
 def of_record(self, record):
     self.spring(record.step)
 
@@ -82,13 +87,17 @@ HOOKS = [
     ("sample_views", after, BEFORE),
     ("choose_scales", before, BEFORE),
     ("choose_scales", after, BEFORE),
+    ("view_gaussians", of_context, BEFORE),
     ("pixel_weights", of_context, BEFORE),
     ("regularize", of_context, BEFORE),
     ("aggregate_gradients", before, BEFORE),
     ("aggregate_gradients", after, BEFORE),
+    ("rate_factor", of_rate, WHILE),
+    ("after_optimizer", of_context, WHILE),
     ("densify", before, WHILE),
     ("densify", after, WHILE),
     ("after_step", of_context, WHILE),
+    ("step_done", of_context, WHILE),
     ("step_end", of_record, AFTERWARDS),
     ("model_ready", of_model, AFTERWARDS),
 ]
@@ -279,6 +288,9 @@ def test_an_error_found_beside_training_ends_it_after_the_step():
 
 
 def test_the_traps_cover_every_hook_of_a_step():
-    outside = {"validate_selection", "run_start", "evaluation", "length_changed", "log", "run_end"}
+    outside = {
+        *("validate_selection", "run_start", "update_intervals", "eval_parameters", "final_edit"),
+        *("evaluation", "length_changed", "log", "run_end"),
+    }
     hooks = {name for name in vars(HookSpecs) if name.startswith("crossgrad_")}
     assert hooks == {f"crossgrad_{name}" for name in (*outside, *(hook for hook, *_ in HOOKS))}
