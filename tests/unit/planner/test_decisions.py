@@ -46,14 +46,20 @@ MEASURED = {
     "ochota_kap_hybrid_gain": ("two modes", 0.946, 2.14, 2.61, 0.094, 0.096, "none"),
     "brighton_beach": ("one mode, one distance", 0.751, 1.03, 1.05, 0.433, 0.734, "gain"),
 }
-#: The length of a run on them that was given none, views.
-VIEWS = {
-    "city_hybrid": 11_200,
-    "city_unimodal": 6_500,
-    "boruszyn_kap": 2_400,
-    "ochota_kap_hybrid": 3_200,
-    "ochota_kap_hybrid_gain": 3_200,
-    "brighton_beach": 1_400,
+#: Settings that the plan of a run without a length changes on these scenes.
+FAR_FIRST = {
+    "sampler": "horizon",
+    "sampler.coarse": [5, 1],
+    "grouping": "altitude",
+    "grouping.cut": "otsu",
+}
+CHANGED = {
+    "city_hybrid": {**FAR_FIRST, "max_views": 11_200},
+    "city_unimodal": {"max_views": 6_500},
+    "boruszyn_kap": {"exposure": "gain", "max_views": 2_400},
+    "ochota_kap_hybrid": {"exposure": "gain", "max_views": 3_200},
+    "ochota_kap_hybrid_gain": {"max_views": 3_200},
+    "brighton_beach": {"exposure": "gain", "max_views": 1_400},
 }
 #: Scene, depth over focal length as a logarithm, and height of each training camera.
 TABLE = Path(__file__).with_name("cameras.csv")
@@ -141,11 +147,10 @@ def test_the_scenes_themselves(name):
     figures = plan.of_part("modes").figures
     assert plan.of_part("modes").choice == choice
     assert plan.of_part("exposure").choice == exposure
-    assert plan.settings["max_views"] == VIEWS[name]
+    assert plan.settings == CHANGED[name]
     assert figures["separability"] == pytest.approx(separability, abs=0.002)
     assert figures["far_over_near"] == pytest.approx(ratio, rel=0.01)
     assert figures["range"] == pytest.approx(spread, rel=0.01)
-    assert plan.seconds < 20.0
 
 
 @pytest.fixture(scope="module")
