@@ -34,6 +34,14 @@ def test_a_densifier_has_40_lines():
     assert len(lines("crossgrad.densifiers")) <= 40
 
 
+def test_a_rule_has_30_lines_and_with_a_recipe_and_their_documentation_40():
+    readme = (EXAMPLE / "README.md").read_text(encoding="utf-8").splitlines()
+    rows = [line for line in readme if line.startswith(("| recipe |", "| rule |"))]
+    rule, recipe = lines("crossgrad.rules"), lines("crossgrad.recipes")
+    assert len(rows) == 2 and len(rule) <= 30
+    assert len(rule) + len(recipe) + len(rows) <= 40
+
+
 @pytest.mark.parametrize("file", sorted((EXAMPLE / "crossgrad_example").glob("*.py")), ids=str)
 def test_it_comes_through_the_doors(file):
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
