@@ -7,11 +7,10 @@ from typing import Final
 from crossgrad_core.commands import RunConfig, UserError, configured
 from crossgrad_core.contract.schedule import ViewsPerStepSpec
 from crossgrad_plugins.compare.load_runs import without_length
-from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.settings import ABSENT, Settings, settings_of
+from crossgrad_plugins.compare.run import ABSENT, Run, Settings, settings_of
 from crossgrad_plugins.sweep.best import LENGTHS
 from crossgrad_plugins.sweep.grid import Choice, Grid
-from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.job import Layout
 from crossgrad_plugins.sweep.summary import earlier_rows
 
 #: What a run decides at its start.

@@ -10,7 +10,7 @@ from _asked import Asked, asked_for, of_earlier_grids, only
 from _paper_data import Reading
 
 from crossgrad_core.commands import find_runs, read_rows
-from crossgrad_plugins.compare.checks.scenes import check_scenes
+from crossgrad_plugins.compare.checks import check_scenes
 from crossgrad_plugins.compare.contrasts import Runs
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.run import Run

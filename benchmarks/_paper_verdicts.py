@@ -12,8 +12,7 @@ from crossgrad_plugins.compare.contrasts import Contrast, Pair, contrast
 from crossgrad_plugins.compare.narrative import interval_text, needed_text, opposed_text
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
-from crossgrad_plugins.compare.statistics.verdict import Verdict, corrected, verdicts
+from crossgrad_plugins.compare.statistics import Estimate, Verdict, corrected, estimate, verdicts
 
 #: A p-value below which something is sure, and the share of pairs whose loss leaves a claim open.
 _SURE, _LOST = 0.05, 0.25

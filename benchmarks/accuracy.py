@@ -18,8 +18,8 @@ from _machine import facts, peak_mib
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.registry.entries import build
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")

@@ -16,7 +16,7 @@ from statistics import fmean, stdev
 from _asked import of_earlier_grids, only
 
 from crossgrad_core.commands import UserError
-from crossgrad_plugins.compare.checks.scenes import check_scenes
+from crossgrad_plugins.compare.checks import check_scenes
 from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.narrative import verdict_text

@@ -20,7 +20,7 @@ from _machine import facts
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.raster_constants import SH_C0
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.run.assemble import assemble, read_scene
 from crossgrad_core.training.loop import timed_step

@@ -13,7 +13,7 @@ import torch
 from _machine import facts
 from support.extremes import cases, jittered, outcome
 
-from crossgrad_core.contract.backbone import Backbone
+from crossgrad_core.contract.slots.backbone import Backbone
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.testing.fixtures import sample_camera
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import Groups
-from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
+from crossgrad_plugins.diagnostics.intervals import split_intervals
 
 HEAVY = ("student3", "radial5", "lognormal")
 KINDS = ("normal", "decaying", *HEAVY, "finite")

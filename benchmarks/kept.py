@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from crossgrad_core.commands import UserError, read_rows, summary_of, write_atomically
-from crossgrad_core.system.tables import csv_bytes
+from crossgrad_core.system.text_files import csv_bytes
 
 #: The table of a sweep: which run is what.
 TABLE = "runs.csv"

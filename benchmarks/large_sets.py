@@ -82,7 +82,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     begun = monotonic()
     from crossgrad_core.run.load_run import set_up
     from crossgrad_core.run.settings import parsed
-    from crossgrad_core.scene.photo_check import check_photos, fits
+    from crossgrad_core.scene.photos.photos_ahead import check_photos, fits
     from crossgrad_core.training.loop import Prefetcher, timed_step
     from crossgrad_core.training.start import first_state, warm_up
 

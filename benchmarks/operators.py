@@ -28,7 +28,7 @@ from crossgrad_core.contract.blocks import EMPTY_STATE, Block, BlockKind, Learni
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gradients import SeparateGradients
 from crossgrad_core.contract.gramian_operator import MatrixOperator, operator_context
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.slots.operator import Operator
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.numerics.threads import configure_threads

@@ -33,7 +33,7 @@ from crossgrad_core.contract.blocks import AdamRule, AdamState
 from crossgrad_core.contract.gaussians import OnDemand
 from crossgrad_core.contract.scene import Camera
 from crossgrad_core.contract.schedule import Phase, Schedule
-from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.raster_constants import SH_C0
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam.adam import adam_step, counted
 from crossgrad_core.training.adam.axes import step_along_axes

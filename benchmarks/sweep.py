@@ -19,7 +19,7 @@ from pathlib import Path
 import yaml
 from _machine import code, facts
 
-from crossgrad_plugins.sweep.records import read_records
+from crossgrad_plugins.sweep.run_status import read_records
 
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 

@@ -44,8 +44,7 @@ import viewer
 
 import crossgrad_core as cg
 from crossgrad_core.contract.scene import Scene
-from crossgrad_plugins.compare.statistics.estimate import Estimate, estimate
-from crossgrad_plugins.compare.statistics.verdict import verdicts
+from crossgrad_plugins.compare.statistics import Estimate, estimate, verdicts
 
 Row = dict[str, Any]
 

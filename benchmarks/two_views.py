@@ -20,7 +20,7 @@ from arms import REGIMES, Runs, arms, head, read
 
 from crossgrad_plugins.compare.contrasts import Contrast, judged
 from crossgrad_plugins.compare.narrative import needed_text, verdict_text
-from crossgrad_plugins.compare.statistics.verdict import Verdict
+from crossgrad_plugins.compare.statistics import Verdict
 
 ONE, TWO = "one view", "two views"
 #: What is held equal -> two arms, the one with two views first.

@@ -18,8 +18,15 @@ from crossgrad_core.registry.commands import load_command, summary
 from crossgrad_core.registry.entries import Entry, build, entries, load_entry, offers
 from crossgrad_core.registry.entries import load as load_component
 from crossgrad_core.registry.requirements import unmet_requirement
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, OWN_COMMANDS
-from crossgrad_core.registry.strays import Stray, strays
+from crossgrad_core.registry.slots import (
+    COMMANDS,
+    GROUPS,
+    MANY,
+    OFFERED,
+    OWN_COMMANDS,
+    Stray,
+    strays,
+)
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.lock import locked, writer_of
 from crossgrad_core.system.check_writable import check_file, check_folder, check_new
@@ -29,7 +36,7 @@ from crossgrad_core.system.checksums import (
     drop_checksums,
     write_checksums,
 )
-from crossgrad_core.system.command_options import argument, command_of, option
+from crossgrad_core.system.command_options import GroupedCommand, argument, command_of, option
 from crossgrad_core.system.files import clear_leftovers as clear_half_written
 from crossgrad_core.system.files import (
     disk_errors,
@@ -38,13 +45,10 @@ from crossgrad_core.system.files import (
     text_bytes,
     write_atomically,
 )
-from crossgrad_core.system.help_groups import GroupedCommand
 from crossgrad_core.system.interrupts import exit_code, resume_hint, signal_names, tell
-from crossgrad_core.system.progress import Progress
-from crossgrad_core.system.startup import announce, finish
-from crossgrad_core.system.tables import table_bytes, write_table
+from crossgrad_core.system.startup import Progress, announce, finish
 from crossgrad_core.system.terminal import controls_of, is_live
-from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_core.system.text_files import parse_number, read_rows, table_bytes, write_table
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
     count,
@@ -68,8 +72,8 @@ if TYPE_CHECKING:
     from crossgrad_core.run.results.panels import panels_of, read_panel
     from crossgrad_core.run.results.reading import RunResults, find_runs
     from crossgrad_core.run.results.reading import read_run as read_results
+    from crossgrad_core.run.select import views_per_step_of
     from crossgrad_core.run.settings import layered, merged
-    from crossgrad_core.run.usual_views import views_per_step_of
     from crossgrad_core.scene.shown_points import photos_per_point
     from crossgrad_core.system.yaml_values import read_mapping as read_settings
     from crossgrad_core.training.probe_gradients import view_gradients
@@ -212,7 +216,7 @@ _LATE: Final = {
     "read_settings": "system.yaml_values:read_mapping",
     "table_of": "run.decisions",
     "view_gradients": "training.probe_gradients",
-    "views_per_step_of": "run.usual_views",
+    "views_per_step_of": "run.select",
 }
 
 
@@ -239,7 +243,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         UserError: The disk is full, or the folder is read-only.
     """
-    from crossgrad_core.run.config_version import marked
+    from crossgrad_core.run.results.config_file import marked
 
     write_mapping(path, marked(settings))
 

@@ -6,7 +6,6 @@ Names that are listed here keep their meaning within a minor version; see docs/p
 from pydantic import Field
 
 from crossgrad_core.contract import screen_statistics
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import (
     EMPTY_STATE,
     NO_EDIT,
@@ -20,7 +19,7 @@ from crossgrad_core.contract.blocks import (
     Rows,
     apply_to_parameters,
 )
-from crossgrad_core.contract.component import Component, ViewCounts
+from crossgrad_core.contract.component import Component, ViewCounts, hookimpl
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -48,9 +47,6 @@ from crossgrad_core.contract.contexts import (
     ViewSample,
 )
 from crossgrad_core.contract.decision import Decision
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.exporter import Exporter, Rounding
-from crossgrad_core.contract.exposure import Exposure, Fitted, PerPhoto
 from crossgrad_core.contract.figure import Figure
 from crossgrad_core.contract.gaussians import Gaussians, Render, Response, Screen
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
@@ -61,26 +57,7 @@ from crossgrad_core.contract.gramian_operator import (
     diagonals,
     transformed,
 )
-from crossgrad_core.contract.grouping import (
-    GradientProbe,
-    Grouping,
-    GroupingRule,
-    Quantity,
-    Regrouping,
-)
-from crossgrad_core.contract.initializer import Initializer, MorePoints
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.metric import Compared, Metric
 from crossgrad_core.contract.objections import objections_to_views, set_for_nothing
-from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.reader import Reader
-from crossgrad_core.contract.recipe import Facts, Recipe, with_rows
-from crossgrad_core.contract.resolution import Resolution, octave
-from crossgrad_core.contract.rule import FinalEdit, GaussiansContext, GaussiansResult, Rule
-from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import (
     COORDINATES_TAG,
     INPUT,
@@ -114,9 +91,31 @@ from crossgrad_core.contract.schedule import (
     shortness,
 )
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.exporter import Exporter, Rounding
+from crossgrad_core.contract.slots.exposure import Exposure, Fitted, PerPhoto
+from crossgrad_core.contract.slots.grouping import (
+    GradientProbe,
+    Grouping,
+    GroupingRule,
+    Quantity,
+    Regrouping,
+)
+from crossgrad_core.contract.slots.initializer import Initializer, MorePoints
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.metric import Compared, Metric
+from crossgrad_core.contract.slots.observer import Observer
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.reader import Reader
+from crossgrad_core.contract.slots.recipe import Facts, Recipe, with_rows
+from crossgrad_core.contract.slots.resolution import Resolution, octave
+from crossgrad_core.contract.slots.rule import FinalEdit, GaussiansContext, GaussiansResult, Rule
+from crossgrad_core.contract.slots.sampler import Sampler
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.evaluation.metrics import psnr
-from crossgrad_core.recipe.lines import full_lines, short_lines, table_lines
+from crossgrad_core.evaluation.evaluation import psnr
+from crossgrad_core.recipe.table import full_lines, short_lines, table_lines
 from crossgrad_core.registry.entries import build as build_component
 from crossgrad_core.registry.entries import entries as installed_plugins
 from crossgrad_core.registry.entries import name_of as component_name

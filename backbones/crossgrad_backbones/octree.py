@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_backbones.anchors.base import AnchorBackbone, Used
-from crossgrad_backbones.levels import fitting
+from crossgrad_backbones.levels import lattice as fitting
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.neighbours import nearest_neighbour_scales
 from crossgrad_core.plugin import (

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from crossgrad_backbones.neighbours import nearest_neighbour_scales
 from crossgrad_core.numerics.elementwise import sigmoid
-from crossgrad_core.numerics.spherical import COEFFICIENTS, SH_C0
+from crossgrad_core.numerics.raster_constants import COEFFICIENTS, SH_C0
 from crossgrad_core.plugin import (
     Backbone,
     Block,

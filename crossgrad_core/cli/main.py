@@ -9,7 +9,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 from typing_extensions import override
 
-from crossgrad_core.cli import evaluate, export, render, run
+from crossgrad_core.cli import run, trained
 from crossgrad_core.cli.streams import outlast_readers
 from crossgrad_core.defaults import EXAMPLE_OPERATOR, GROUP_SAMPLER
 from crossgrad_core.errors import UserError
@@ -17,8 +17,8 @@ from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.commands import as_group_member, load_command, summary
 from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.registry.slots import COMMANDS
+from crossgrad_core.system.command_options import GroupedCommand
 from crossgrad_core.system.files import is_too_long, path_too_long
-from crossgrad_core.system.help_groups import GroupedCommand
 from crossgrad_core.system.startup import finish
 from crossgrad_core.system.version import VERSION
 
@@ -136,9 +136,9 @@ def crossgrad(
 
 
 app.command("run", cls=GroupedCommand)(run.run)
-app.command("eval", cls=GroupedCommand)(evaluate.evaluate)
-app.command("render", cls=GroupedCommand)(render.render)
-app.command("export", cls=GroupedCommand)(export.export)
+app.command("eval", cls=GroupedCommand)(trained.evaluate)
+app.command("render", cls=GroupedCommand)(trained.render)
+app.command("export", cls=GroupedCommand)(trained.export)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,7 @@ from crossgrad_core.contract.flags import CONFIGURATION, HEADINGS, RESULTS, SCEN
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.options import OPTIONS, Option
-from crossgrad_core.system.help_groups import print_all_options
+from crossgrad_core.system.command_options import print_all_options
 from crossgrad_core.system.startup import announce
 from crossgrad_core.wording import listed
 

@@ -1,8 +1,9 @@
-"""Components: frozen pydantic models whose fields are their options."""
+"""Components: frozen pydantic models whose fields are their options, and hook marks."""
 
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
+import pluggy
 from pydantic import BaseModel, ConfigDict
 from typing_extensions import override
 
@@ -11,6 +12,9 @@ from crossgrad_core.errors import UserError
 
 A = TypeVar("A")
 B = TypeVar("B")
+PROJECT = "crossgrad"
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 class Component(BaseModel):

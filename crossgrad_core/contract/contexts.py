@@ -27,9 +27,9 @@ from crossgrad_core.contract.scene import Camera, Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 
 if TYPE_CHECKING:
-    from crossgrad_core.contract.backbone import Backbone
-    from crossgrad_core.contract.loss import Loss
-    from crossgrad_core.contract.rasterizer import Rasterizer
+    from crossgrad_core.contract.slots.backbone import Backbone
+    from crossgrad_core.contract.slots.loss import Loss
+    from crossgrad_core.contract.slots.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)

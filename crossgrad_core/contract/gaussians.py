@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.numerics.spherical import COEFFICIENTS
+from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 
 Response = Literal["plain", "antialiased", "analytic"]
 _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")

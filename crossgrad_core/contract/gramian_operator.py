@@ -14,7 +14,7 @@ from crossgrad_core.contract.blocks import Block, BlockKind, PluginState
 from crossgrad_core.contract.component import answered, with_state
 from crossgrad_core.contract.contexts import AggregateContext, AggregateResult, OperatorContext
 from crossgrad_core.contract.gradients import Granularity, SeparateGradients
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.slots.operator import Operator
 from crossgrad_core.errors import UserError
 
 #: Gradients whose unit roundoff is below this show the rounding of float64 weights.

@@ -9,7 +9,7 @@ must answer with a value; None is an error.
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from crossgrad_core.contract.markers import hookspec
+from crossgrad_core.contract.component import hookspec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
         ScaleResult,
         StepRecord,
     )
-    from crossgrad_core.contract.rule import FinalEdit, GaussiansContext, GaussiansResult
     from crossgrad_core.contract.schedule import Schedule
     from crossgrad_core.contract.selection import Selection
+    from crossgrad_core.contract.slots.rule import FinalEdit, GaussiansContext, GaussiansResult
 
 
 class HookSpecs:

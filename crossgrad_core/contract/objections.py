@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping
 
 from crossgrad_core.contract.component import Component
 from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.selection import HasUnusedOptions, Selection
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 
 
 def objections_to(selection: Selection) -> list[str]:

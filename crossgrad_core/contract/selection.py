@@ -4,21 +4,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.exposure import Exposure
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.initializer import Initializer
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.metric import Metric
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.resolution import Resolution
-from crossgrad_core.contract.rule import Rule
-from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.schedule import ViewsPerStepSpec
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.slots.exposure import Exposure
+from crossgrad_core.contract.slots.grouping import Grouping
+from crossgrad_core.contract.slots.initializer import Initializer
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.metric import Metric
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.resolution import Resolution
+from crossgrad_core.contract.slots.rule import Rule
+from crossgrad_core.contract.slots.sampler import Sampler
 
 
 @dataclass(frozen=True)

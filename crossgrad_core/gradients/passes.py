@@ -1,14 +1,18 @@
-"""Which passes take which columns."""
+"""Gramians of any mixture of gradient columns, and their rounding errors in float64."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from crossgrad_core.gradients import generic, native
 from crossgrad_core.gradients.columns import Column, is_native
+
+#: Largest magnitudes of float64 gradients whose squares and products stay well inside float64.
+SAFE: Final = (1e-140, 1e140)
 
 
 class Passes(Protocol):
@@ -32,3 +36,96 @@ class Passes(Protocol):
 def passes_of(*columns: Column) -> Passes:
     """The compiled passes where they take all of the columns, else those of torch."""
     return native if all(map(is_native, columns)) else generic
+
+
+def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64]:
+    """[T, K, K] float64 Gramians; NaN or infinite in rows of views that are not finite.
+
+    float32 products are exact in float64 and can neither overflow nor vanish there. Where float64
+    gradients have magnitudes outside `SAFE`, all Gramians are those of the gradients times one
+    power of two.
+    """
+    gramians = np.zeros((len(columns), views, views))
+    touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]
+    compiled = [t for t in touched if is_native(columns[t])]
+    others = [t for t in touched if not is_native(columns[t])]
+    scale = _scale(columns)
+    if compiled:
+        gramians[compiled] = native.gramians([columns[t] for t in compiled])
+        if scale != 1.0:
+            gramians[compiled] *= scale**2
+    if others:
+        found = torch.stack([generic.gramian(columns[t], scale) for t in others])
+        gramians[others] = found.cpu().numpy()
+    return gramians
+
+
+def column_remainders(
+    columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[B, K, K] what rounding took from the sums `gramians` of `column_gramians`.
+
+    Args:
+        columns: T columns.
+        group: [T] which of the sums each column is part of; -1 for none.
+        gramians: [B, K, K].
+    """
+    return rounding_residuals(columns, group, gramians, _scale(columns))
+
+
+def _scale(columns: Sequence[Column]) -> float:
+    """The power of two that keeps products of float64 gradients inside float64."""
+    touched = [column for column in columns if any(g is not None for g in column)]
+    wide = [column for column in touched if _dtype(column) == torch.float64]
+    if not wide:
+        return 1.0
+    sizes = torch.stack([generic.largest(column) for column in wide]).cpu().numpy()
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    if not sizes.size or (sizes.min() > SAFE[0] and sizes.max() < SAFE[1]):
+        return 1.0
+    return float(2.0 ** -np.frexp(sizes.max())[1])
+
+
+def _dtype(column: Column) -> torch.dtype:
+    return next(g.dtype for g in column if g is not None)
+
+
+def rounding_residuals(
+    columns: Sequence[Column],
+    group: NDArray[np.int64],
+    gramians: NDArray[np.float64],
+    scale: float,
+) -> NDArray[np.float64]:
+    """[B, K, K] what is missing from Gramians, to about 106 bits; NaN where one is not finite.
+
+    Args:
+        columns: T columns.
+        group: [T] Gramian that each column is part of; -1 leaves it out.
+        gramians: [B, K, K] as they were rounded.
+        scale: What the gradients were multiplied by for them.
+    """
+    from crossgrad_core.gradients.numba_kernels.rounding_residuals import add_products, left_over
+
+    high, low = np.zeros(gramians.shape), np.zeros(gramians.shape)
+    for b, column in zip(group.tolist(), columns, strict=True):
+        if b >= 0 and any(gradient is not None for gradient in column):
+            for piece in generic.pieces(column, scale):
+                add_products(piece.cpu().numpy(), high[b], low[b])
+    return left_over(high, low, gramians)
+
+
+def row_remainders(
+    columns: Sequence[Column], rows: int, gramians: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[N, K, K] the same for the Gramians of the rows of a block's tensors."""
+    from crossgrad_core.gradients.numba_kernels.rounding_residuals import (
+        add_row_products,
+        left_over,
+    )
+
+    high, low = np.zeros(gramians.shape), np.zeros(gramians.shape)
+    for column in columns:
+        if rows and any(gradient is not None for gradient in column):
+            for part, wide in generic.row_pieces(column, rows):
+                add_row_products(wide.cpu().numpy(), high[part], low[part])
+    return left_over(high, low, gramians)

@@ -13,11 +13,11 @@ from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Block
 from crossgrad_core.contract.gradients import Elementwise, Granularity, SeparateGradients
-from crossgrad_core.gradients import exact, generic, native
+from crossgrad_core.gradients import generic, native
+from crossgrad_core.gradients import passes as exact
 from crossgrad_core.gradients.columns import Column, is_native, unit_roundoff
-from crossgrad_core.gradients.passes import passes_of
+from crossgrad_core.gradients.passes import column_gramians, column_remainders, passes_of
 from crossgrad_core.gradients.sparse_rows import PackedRows, dense
-from crossgrad_core.gradients.squares import column_gramians, column_remainders
 
 KINDS: Final = ("geometry", "appearance", "neutral")
 

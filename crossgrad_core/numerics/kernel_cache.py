@@ -221,7 +221,7 @@ def _sources(source: Path) -> set[Path]:
     while waiting:
         path = waiting.pop()
         found.add(path)
-        if path.parent.name == _FOLDERS or path.parent == source.parent:
+        if _FOLDERS in path.parts or path.parent == source.parent:
             waiting |= _imported(path) - found
     return found
 

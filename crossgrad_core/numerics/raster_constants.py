@@ -1,4 +1,4 @@
-"""Constants of the rule set that all rasterizers share (docs/rasterizers.md)."""
+"""Constants of the rule set of rasterizers (docs/rasterizers.md) and of harmonics."""
 
 from typing import Final
 
@@ -8,3 +8,7 @@ ALPHA_THRESHOLD: Final = 1.0 / 255.0
 TRANSMITTANCE_STOP: Final = 1e-4
 #: The Jacobian is evaluated inside the image plus this share of half its extent on either side.
 JACOBIAN_MARGIN: Final = 0.3
+#: Band 0 of the real spherical harmonics: 1 / (2 sqrt(pi)).
+SH_C0: Final = 0.28209479177387814
+#: Number of coefficients up to and including each degree.
+COEFFICIENTS: Final = (1, 4, 9, 16)

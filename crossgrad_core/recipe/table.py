@@ -1,6 +1,6 @@
-"""The table of decided settings: made by a recipe, applied to a configuration, written down."""
+"""The table of decided settings: made by a recipe, applied to a configuration, shown."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.component import answered
 from crossgrad_core.contract.decision import Decision
-from crossgrad_core.contract.recipe import Facts, Recipe
+from crossgrad_core.contract.slots.recipe import Facts, Recipe
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.validation import as_user_error
@@ -29,6 +29,8 @@ DECIDED: Final = (
 )
 #: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.
 RULES: Final = "rules"
+#: Lines of decisions that the terminal shows.
+LINES: Final = 12
 
 
 def recipe_of(config: RunConfig) -> Recipe:
@@ -147,3 +149,48 @@ def _value(config: RunConfig, setting: str) -> object:
     if isinstance(value, ComponentChoice):
         return value.options.get(option) if option else value.name
     return value[option] if name == RULES else value
+
+
+def short_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
+    """Return one line for each decision that differs from the published value, `LINES` at most."""
+    shown = [f"{_value_text(row)}: {row.because} ({row.override})" for row in rows if row.override]
+    left = len(shown) - LINES
+    if left > 0:
+        shown = [*shown[: LINES - 1], f"{left + 1} more decisions (-v shows all)"]
+    return tuple(shown)
+
+
+def full_lines(rows: Iterable[Decision]) -> tuple[str, ...]:
+    """Return one line for each decision, with its evidence."""
+    told = ((row, "; ".join(filter(None, (row.because, row.evidence)))) for row in rows)
+    return tuple(
+        f"{_value_text(row)}: {text}" + (f" ({row.override})" if row.override else "")
+        for row, text in told
+    )
+
+
+def table_lines(rows: Sequence[Decision]) -> tuple[str, ...]:
+    """Return the table in columns: setting, value, reason."""
+    names = max((len(row.setting) for row in rows), default=0)
+    values = max((len(shown(row.value)) for row in rows), default=0)
+    return tuple(
+        f"{row.setting:<{names}}  {shown(row.value):<{values}}  {row.because}" for row in rows
+    )
+
+
+def _value_text(row: Decision) -> str:
+    return f"{row.setting} {shown(row.value)}"
+
+
+def shown(value: object) -> str:
+    """Return a value as a table shows it."""
+    match value:
+        case dict():
+            return ", ".join(f"{name} {shown(each)}" for name, each in value.items()) or "on"
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.3g}"
+        case int():
+            return f"{value:,}"
+    return str(value)

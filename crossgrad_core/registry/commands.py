@@ -12,7 +12,7 @@ from typer.main import get_command
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import Entry, resolve_entry
-from crossgrad_core.system.help_groups import GroupedCommand
+from crossgrad_core.system.command_options import GroupedCommand
 
 if TYPE_CHECKING:
     from typer import _click as click

@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, overload
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.requirements import unmet_requirement
-from crossgrad_core.registry.signatures import wrong_signatures
-from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, PLANNERS, QUICK
-from crossgrad_core.registry.source_location import defined_at, raised_at
-from crossgrad_core.registry.strays import strays
+from crossgrad_core.registry.signatures import defined_at, raised_at, wrong_signatures
+from crossgrad_core.registry.slots import COMMANDS, GROUPS, MANY, OFFERED, PLANNERS, QUICK, strays
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import (
     did_you_mean,
@@ -345,7 +343,9 @@ def _resolve(value: str) -> object:
 
 def _checked(entry: Entry, found: object) -> "type[Component]":
     word = singular(entry.slot)
-    base = cast("type[Component]", _resolve(f"crossgrad_core.contract.{word}:{word.capitalize()}"))
+    base = cast(
+        "type[Component]", _resolve(f"crossgrad_core.contract.slots.{word}:{word.capitalize()}")
+    )
     if not (isinstance(found, type) and issubclass(found, base)):
         raise _wrong_kind(entry, base, f"{found!r}")
     if isabstract(found):

@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.contract.blocks import Edit
-from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.component import PROJECT, Component
 from crossgrad_core.contract.contexts import (
     Answer,
     DensifyResult,
@@ -24,8 +24,7 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.hooks import HookSpecs
-from crossgrad_core.contract.markers import PROJECT
-from crossgrad_core.contract.rule import GaussiansResult
+from crossgrad_core.contract.slots.rule import GaussiansResult
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import installed_as
 from crossgrad_core.wording import did_you_mean, listed, sentences, singular

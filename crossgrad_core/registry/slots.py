@@ -1,6 +1,13 @@
-"""The slots that plugins fill, and their entry-point groups. Imports nothing heavy."""
+"""The slots that plugins fill, their entry-point groups, and groups that do not exist.
 
+Imports nothing heavy.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
+
+from crossgrad_core.wording import plural
 
 #: Slot name -> entry-point group.
 GROUPS: Final[dict[str, str]] = {
@@ -42,3 +49,66 @@ QUICK: Final = {
 }
 #: The core's own commands, which no plugin replaces.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
+_KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
+_PREFIX: Final = "crossgrad"
+#: How alike a group has to be that does not begin with `crossgrad`.
+_ALIKE: Final = 0.85
+
+
+@dataclass(frozen=True)
+class Stray:
+    """An entry point that crossgrad never reads.
+
+    Attributes:
+        name: Its name.
+        group: The group that it is in.
+        meant: The group that is probably meant; empty where none is alike.
+        distribution: Name of its distribution.
+        version: Version of that distribution.
+    """
+
+    name: str
+    group: str
+    meant: str
+    distribution: str
+    version: str
+
+    @property
+    def origin(self) -> str:
+        """The distribution and its version."""
+        return f"{self.distribution} {self.version}"
+
+    @property
+    def reason(self) -> str:
+        """Why it is not read, and what to do."""
+        right = f"write {self.meant}" if self.meant else f"the groups are {', '.join(_KNOWN)}"
+        return f"there is no entry-point group {self.group}: {right}"
+
+
+def strays() -> Iterator[Stray]:
+    """The entry points of all installed distributions that are in such groups."""
+    from importlib.metadata import entry_points
+
+    points = entry_points()
+    for group in sorted(points.groups):
+        if group not in _KNOWN and _is_like_ours(group):
+            for point in sorted(points.select(group=group), key=lambda each: each.name):
+                dist = point.dist
+                origin = ("unknown", "unknown") if dist is None else (dist.name, dist.version)
+                yield Stray(point.name, group, _meant(group), *origin)
+
+
+def _is_like_ours(group: str) -> bool:
+    from difflib import get_close_matches
+
+    return group.lower().startswith(_PREFIX) or bool(get_close_matches(group, _KNOWN, 1, _ALIKE))
+
+
+def _meant(group: str) -> str:
+    """The group that is meant: that of a slot's single word, or the one that is written alike."""
+    from difflib import get_close_matches
+
+    slot = plural(group.lower().removeprefix(_PREFIX).strip("._-:"))
+    if slot in OFFERED:
+        return OFFERED[slot]
+    return next(iter(get_close_matches(group.lower(), _KNOWN, 1)), "")

@@ -17,8 +17,7 @@ import torch
 from crossgrad_core.config import AUTO, RunConfig
 from crossgrad_core.defaults import PREPARING_READER
 from crossgrad_core.errors import UserError
-from crossgrad_core.recipe.lines import short_lines
-from crossgrad_core.recipe.table import open_again
+from crossgrad_core.recipe.table import open_again, short_lines
 from crossgrad_core.registry.entries import failed_plugin, notes_on
 from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.finish import (
@@ -62,7 +61,7 @@ from crossgrad_core.run.unused_settings import (
     without_resets,
 )
 from crossgrad_core.scene.fingerprint import fingerprint_of
-from crossgrad_core.scene.photo_check import check_photos, fits
+from crossgrad_core.scene.photos.photos_ahead import check_photos, fits
 from crossgrad_core.system.check_writable import check_folder
 from crossgrad_core.system.checksums import changed_files, drop_checksums
 from crossgrad_core.system.interrupts import exit_code, resume_hint

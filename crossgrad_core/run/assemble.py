@@ -8,13 +8,13 @@ from pathlib import Path
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import MOST_VIEWS
 from crossgrad_core.contract.component import Component
-from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.objections import objections_to
-from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Counting, ViewsPerStepSpec
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.slots.observer import Observer
+from crossgrad_core.contract.slots.reader import Reader
 from crossgrad_core.defaults import EXPORTER, READER
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.recipe.table import is_complete
@@ -29,9 +29,8 @@ from crossgrad_core.registry.entries import (
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.run.decisions import DEFAULT_STEPS, with_decisions
-from crossgrad_core.run.devices import choose_device
+from crossgrad_core.run.devices import choose_device, with_device
 from crossgrad_core.run.select import select
-from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.scene.self_check.check import checked
 from crossgrad_core.training.modes import mode_note
 from crossgrad_core.training.rngs import make_streams

@@ -16,7 +16,7 @@ from torch import Tensor
 from crossgrad_core.contract.scene import Camera, Scene, Similarity, View
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.validation import as_user_error
-from crossgrad_core.scene.raw_checks import FARTHEST, FARTHEST_LOCAL
+from crossgrad_core.scene.raw import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
 #: Instead of a file: from the farthest photos down to the nearest.

@@ -7,10 +7,10 @@ from typing import Any, TypeAlias, cast
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.decision import Decide, Decision, Length, repeats
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.recipe import Facts
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.recipe import Facts
 from crossgrad_core.defaults import PLANNER
 from crossgrad_core.recipe.table import (
     applied,
@@ -22,11 +22,10 @@ from crossgrad_core.recipe.table import (
 )
 from crossgrad_core.registry.entries import find, load, resolve_entry
 from crossgrad_core.registry.slots import PLANNERS
+from crossgrad_core.run.devices import with_device
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
-from crossgrad_core.run.select import chosen, fitted_backbone, rules_of
+from crossgrad_core.run.select import chosen, fitted_backbone, rules_of, views_per_step_of
 from crossgrad_core.run.settings import layered, parsed
-from crossgrad_core.run.usual_device import with_device
-from crossgrad_core.run.usual_views import views_per_step_of
 from crossgrad_core.scene.shown_points import photos_per_point
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup

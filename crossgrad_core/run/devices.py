@@ -1,8 +1,19 @@
-"""The device of a run by its name."""
+"""The device of a run: named by the user, or a GPU if a rasterizer for it works."""
+
+import logging
 
 import torch
 
+from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
+from crossgrad_core.registry.entries import build, entries, load
+from crossgrad_core.run.rasterizers import demands, fastest_able, speeds_on
+from crossgrad_core.wording import in_one_line, sentences
+
+_LOG = logging.getLogger(__name__)
 
 
 def choose_device(name: str) -> torch.device:
@@ -51,3 +62,74 @@ def _require_cuda(device: torch.device) -> None:
         found=f"torch {torch.__version__}: {found}",
         todo=f"use --device cpu, or {todo}",
     )
+
+
+def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
+    """Return the configuration with the device that `auto` stands for, and a note on it.
+
+    There is no note on a machine without a GPU.
+    """
+    if config.device != AUTO:
+        return config, ()
+    if not torch.cuda.is_available():
+        return config.model_copy(update={"device": "cpu"}), ()
+    gpu = torch.cuda.get_device_name()
+    name, why = _rasterizer(config)
+    why = why or _failure(config, name)
+    if why:
+        device, note = "cpu", f"device cpu: {gpu} is not used, because {why}"
+    else:
+        device, note = "cuda", f"device cuda: rasterizer {name} works on {gpu} (or --device cpu)"
+    return config.model_copy(update={"device": device}), (note,)
+
+
+def _rasterizer(config: RunConfig) -> tuple[str, str]:
+    """Return the rasterizer that would draw on the GPU, and why the GPU is not used, if it is not.
+
+    A rasterizer that the user did not name must be faster there than every one on the CPU.
+    """
+    name = config.rasterizer.name
+    if config.seconds is not None and config.clock == "cpu":
+        return name, "--clock cpu does not count what a GPU does"
+    if name != AUTO:
+        named = load(Rasterizer, name)
+        runs = "cuda" in named.devices
+        return name, named.missing("cuda") if runs else f"rasterizer {name} does not run on it"
+    on_cpu = max(speeds_on("cpu")[0].values(), default=0.0)
+    speeds, notes = speeds_on("cuda")
+    faster = {each: speed for each, speed in speeds.items() if speed > on_cpu}
+    able = fastest_able(faster, demands(config, "cuda", *_trained(config)), notes)
+    if able is not None:
+        return able, ""
+    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster there"
+
+
+def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
+    """Return what the rasterizer would draw, and what needs its statistics."""
+    backbone = build(Backbone, config.backbone.name, config.backbone.options)
+    choice = config.densifier or ComponentChoice(name=AUTO)
+    name = backbone.default_densifier if choice.name == AUTO else choice.name
+    return backbone, build(Densifier, name, choice.options)
+
+
+def _missing() -> list[str]:
+    """Return what installed rasterizers lack to run on the GPU, with the way to install it."""
+    told = []
+    for name in entries("rasterizers"):
+        try:
+            told.append(load(Rasterizer, name).missing("cuda"))
+        except UserError:  # A note says already that it cannot be imported.
+            continue
+    return told
+
+
+def _failure(config: RunConfig, name: str) -> str:
+    """Try the rasterizer, and return what is wrong; empty if it works."""
+    _LOG.info("trying rasterizer %s on the GPU: the first time it may compile for minutes", name)
+    try:
+        build(Rasterizer, name, config.rasterizer.options).self_test("cuda")
+    except UserError as error:
+        return sentences(error.what, *([] if error.found is None else [error.found]))
+    except Exception as error:
+        return f"rasterizer {name} failed: {in_one_line(error)}"
+    return ""

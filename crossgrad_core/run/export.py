@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.blocks import Json
-from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import COORDINATES_TAG, INPUT, Camera, Placed, View
+from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.errors import UserError
-from crossgrad_core.evaluation.evaluation import compare
-from crossgrad_core.evaluation.metrics import psnr
+from crossgrad_core.evaluation.evaluation import compare, psnr
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.training.per_image_params import apply
 from crossgrad_core.training.rules import eval_parameters

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 from crossgrad_core.contract.contexts import RunInfo
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import notes_on
-from crossgrad_core.run.checkpoint.checkpoint import CHECKPOINTS, named_checkpoints
+from crossgrad_core.run.checkpoint import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.results.config_file import read_notes, write_config
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.log import RunLog, roughly
@@ -19,7 +19,7 @@ from crossgrad_core.run.results.metrics_csv import Row, read_metrics
 from crossgrad_core.run.results.seal import seal
 from crossgrad_core.run.results.summary import Status, best_of
 from crossgrad_core.run.session import PANELS, Session
-from crossgrad_core.scene.photo_check import fits
+from crossgrad_core.scene.photos.photos_ahead import fits
 from crossgrad_core.system.checksums import SUMS
 from crossgrad_core.training.budget import Length, seconds_ahead
 from crossgrad_core.training.loop import Stopper, evaluates_after, train

@@ -18,12 +18,13 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.registry.slots import LISTS, MANY
 from crossgrad_core.run.assemble import assemble, check_names, read_and_check, read_scene
-from crossgrad_core.run.checkpoint.checkpoint import (
+from crossgrad_core.run.checkpoint import (
     CHECKPOINTS,
     Checkpoint,
     load_latest,
     named_checkpoints,
 )
+from crossgrad_core.run.devices import with_device
 from crossgrad_core.run.rasterizers import drawn_elsewhere
 from crossgrad_core.run.results.config_file import FILE as CONFIG
 from crossgrad_core.run.results.config_file import read_config, read_notes
@@ -43,9 +44,7 @@ from crossgrad_core.run.results.plugins_file import (
 from crossgrad_core.run.results.scene_file import check_scene
 from crossgrad_core.run.results.summary import Status, summarised_step
 from crossgrad_core.run.settings import parsed
-from crossgrad_core.run.usual_device import with_device
-from crossgrad_core.scene.differences import Weight
-from crossgrad_core.scene.fingerprint import Fingerprint, fingerprint_of
+from crossgrad_core.scene.fingerprint import Fingerprint, Weight, fingerprint_of
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.training.budget import replay_length
 from crossgrad_core.training.per_image_params import check_photos_are

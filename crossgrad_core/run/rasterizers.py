@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
-from crossgrad_core.contract.backbone import Backbone
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Response
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import is_complete, recipe_of
 from crossgrad_core.registry.entries import entries, find, load, quick_answer

@@ -1,37 +1,39 @@
-"""The components of a run: those it names and the usual ones, fitted to its scene."""
+"""The components of a run, chosen and fitted to its scene, and the number of views per step."""
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.component import Component, answered, pair
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.exposure import Exposure, Fitted
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.initializer import Initializer
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.metric import Metric
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.resolution import Resolution
-from crossgrad_core.contract.rule import Rule
-from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, is_in_image
+from crossgrad_core.contract.schedule import ViewsPerStepSpec
 from crossgrad_core.contract.selection import Selection
-from crossgrad_core.defaults import INITIALIZER_WITHOUT_POINTS, METRICS
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.slots.exposure import Exposure, Fitted
+from crossgrad_core.contract.slots.grouping import Grouping
+from crossgrad_core.contract.slots.initializer import Initializer
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.metric import Metric
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.resolution import Resolution
+from crossgrad_core.contract.slots.rule import Rule
+from crossgrad_core.contract.slots.sampler import Sampler
+from crossgrad_core.defaults import CHAIN, INITIALIZER_WITHOUT_POINTS, METRICS
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run.devices import choose_device
 from crossgrad_core.run.rasterizers import choose_rasterizer, demands
 from crossgrad_core.run.results.metrics_csv import columns_for
-from crossgrad_core.run.usual_views import operator_of, views_per_step_of
 from crossgrad_core.scene.point_cloud import CLOUDS
 from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
+#: Up to which K one that suits both is looked for.
+_MOST_VIEWS: Final = 13
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
@@ -231,3 +233,35 @@ def _grouping_choice(
         )
     notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
     return None
+
+
+def operator_of(config: RunConfig) -> tuple[Operator, str]:
+    """The operator of a run, a chain where several are named, and its name."""
+    links = config.operators
+    built = tuple(build(Operator, link.name, link.options) for link in links)
+    operator = built[0] if len(built) == 1 else build(Operator, CHAIN, {"links": built})
+    return operator, "+".join(link.name for link in links)
+
+
+def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
+    """Return K over a run, and why it is not the usual one of the sampler; empty if it is.
+
+    If no K is set, it is the sampler's, or the least one that leaves no operator idle.
+    """
+    if config.view_plan is not None:
+        return config.view_plan, ""
+    sampler = build(Sampler, config.sampler.name, config.sampler.options)
+    operator, _ = operator_of(config)
+    usual = sampler.usual_views
+    of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
+    both = [k for k in of_sampler if operator.views.admits(k)]
+    # Who names no operator expects no more than a sum of one gradient.
+    named = config.operator != RunConfig.model_fields["operator"].default
+    found, why = usual, ""
+    if usual not in both:
+        # If no K suits both, the objections say so.
+        found, why = next(iter(both), usual), f"the operator needs {operator.views}"
+    elif named and operator.needs_more_views(usual):
+        found = next((k for k in both if not operator.needs_more_views(k)), usual)
+        why = "with fewer views the operator does nothing"
+    return ViewsPerStepSpec((found,)), why if found != usual else ""

@@ -10,7 +10,7 @@ from crossgrad_core.contract.contexts import EvaluationReport
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate
 from crossgrad_core.evaluation.result import EvaluationResult
-from crossgrad_core.run.checkpoint.checkpoint import Keep, drop_later, latest, renew_scalars, save
+from crossgrad_core.run.checkpoint import Keep, drop_later, latest, renew_scalars, save
 from crossgrad_core.run.export import Exported, described, export_scene, renderer
 from crossgrad_core.run.load_run import to_checkpoint
 from crossgrad_core.run.results.curve import draw_curve

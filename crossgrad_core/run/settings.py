@@ -13,15 +13,15 @@ from pydantic import ValidationError
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig, current_name
 from crossgrad_core.contract.component import Component
-from crossgrad_core.contract.recipe import Recipe
+from crossgrad_core.contract.slots.recipe import Recipe
 from crossgrad_core.defaults import CHAIN
 from crossgrad_core.errors import UserError
 from crossgrad_core.recipe.table import RULES, without_decided
 from crossgrad_core.registry.entries import installed_as, load
 from crossgrad_core.registry.slots import GROUPS, LISTS, MANY
 from crossgrad_core.registry.validation import as_user_error
-from crossgrad_core.run.config_version import unmarked
 from crossgrad_core.run.options import OPTIONS
+from crossgrad_core.run.results.config_file import unmarked
 from crossgrad_core.system.yaml_values import described, read_mapping, read_yaml
 from crossgrad_core.wording import listed, plural, singular, with_article
 

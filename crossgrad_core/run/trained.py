@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from crossgrad_core.run.checkpoint.checkpoint import CHECKPOINTS, named_checkpoints
+from crossgrad_core.run.checkpoint import CHECKPOINTS, named_checkpoints
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.run.results.summary import read_summary

@@ -14,23 +14,23 @@ from numpy.typing import NDArray
 from crossgrad_core.contract.scene import Camera, Scene, View, footprint
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.choose_photos import ChosenPhotos, choose_photos
-from crossgrad_core.scene.decode import decode_mask, decode_photo
 from crossgrad_core.scene.frame import Frame, camera_centers, make_frame
-from crossgrad_core.scene.photo_names import with_photo_names
-from crossgrad_core.scene.photo_store import PhotoStore, store_folder
-from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
-from crossgrad_core.scene.point_cloud import read_cloud
+from crossgrad_core.scene.photos.choose_photos import ChosenPhotos, choose_photos
+from crossgrad_core.scene.photos.decode import decode_mask, decode_photo
+from crossgrad_core.scene.photos.photo_files import with_photo_names
+from crossgrad_core.scene.photos.photo_store import PhotoStore, store_folder
+from crossgrad_core.scene.photos.photos import FilePhoto, PhotoCache, PhotoSource
+from crossgrad_core.scene.point_cloud import FEWEST, PER_PHOTO, read_cloud, thinned
 from crossgrad_core.scene.points_in_view import check_seen
-from crossgrad_core.scene.raw import RawScene, RawView
-from crossgrad_core.scene.raw_checks import (
+from crossgrad_core.scene.raw import (
     CheckedPoints,
+    RawScene,
+    RawView,
     check_distances,
     check_points,
     check_views,
 )
 from crossgrad_core.scene.split import Label, Split, split_views
-from crossgrad_core.scene.thinning import FEWEST, PER_PHOTO, thinned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line

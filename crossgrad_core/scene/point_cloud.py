@@ -1,17 +1,31 @@
-"""Point clouds: positions and colours from a PLY, LAS or LAZ file."""
+"""Point clouds from PLY, LAS or LAZ files, thinned to the density of SfM points.
 
-from collections.abc import Mapping
+LAS and LAZ files, the formats of laser scanners, are read where the package laspy is installed.
+
+Source of the format: ASPRS, LAS specification 1.4. Positions are whole numbers times the scale plus
+the offset of the header, which laspy applies in float64.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.las import SUFFIXES, read_las
+from crossgrad_core.scene.raw import CheckedPoints
+from crossgrad_core.system.input_files import open_file
 from crossgrad_core.system.ply_table import read_vertices
 
+if TYPE_CHECKING:
+    import laspy
+
+
+#: What the names of such files end in.
+SUFFIXES: Final = (".las", ".laz")
 #: What the names of point clouds end in.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
@@ -21,6 +35,25 @@ _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 #: Properties that Gaussians have and points lack.
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
+_RGB: Final = ("red", "green", "blue")
+_AT_ONCE: Final = 1_000_000
+#: Points that are read of a file, at most: of more, each second, third ... one.
+_MOST_IN_LAS: Final = 20_000_000
+#: Points that are kept by default: this many, or more if there are many photos. Structure from
+#: motion finds a few hundred points per photo.
+FEWEST: Final = 100_000
+PER_PHOTO: Final = 1_000
+#: Cubes of this many sizes are tried, until at least this share of the wanted points is left.
+_TRIES, _ENOUGH = 12, 0.8
+#: Points that are looked at to find how large a cloud is.
+_SAMPLED: Final = 100_000
+#: Points on surfaces: their number falls with the square of the side.
+_SURFACE: Final = 2.0
+#: Rows and layers of cubes, as odd factors of a hash.
+_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
+_FARTHEST: Final = 2.0**62
+#: Side of the cubes where all points are in one place, in input units.
+_SMALLEST: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +123,116 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
     long = len(sizes) > 0 and np.percentile(sizes, _MOST) >= _LONG
     top = 1.0 if sizes.max(initial=0.0) <= 1.0 else 65_535.0 if long else 255.0
     return np.rint(values.clip(0.0, top) * (255.0 / top)).astype(np.uint8)
+
+
+def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
+    """The columns x, y and z of the points, and red, green and blue where the file has colours.
+
+    Raises:
+        UserError: laspy is missing, or the file cannot be read.
+    """
+    _require_laspy(path)
+    import laspy
+
+    try:
+        with open_file(path) as file, laspy.open(file) as reader:
+            rows = list(_rows(reader))
+            expected, names = reader.header.point_count, _names(reader)
+    # Damaged files end in whatever numpy, struct or the decompressor raise.
+    except Exception as error:
+        raise UserError(
+            "the point cloud cannot be read",
+            where=path,
+            expected="a LAS or LAZ file",
+            found=str(error) or type(error).__name__,
+            todo="export the points again, or convert them to PLY",
+        ) from error
+    found = sum(count for count, _ in rows)
+    if found < expected:
+        raise UserError(
+            "LAS file ends too early",
+            where=path,
+            expected=f"{expected:,} points",
+            found=f"{found:,} points",
+            todo="copy or export the file again",
+        )
+    tables = [table for _, table in rows]
+    table = np.concatenate(tables) if tables else np.zeros((0, len(names)))
+    return {name: table[:, i] for i, name in enumerate(names)}
+
+
+def _rows(reader: "laspy.LasReader") -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """How many points a part of the file has, and the rows [n, 3 or 6] that are kept of them."""
+    names, start = _names(reader), 0
+    stride = -(-reader.header.point_count // _MOST_IN_LAS) or 1
+    for part in reader.chunk_iterator(_AT_ONCE):
+        kept = slice(-start % stride, None, stride)
+        columns = [np.asarray(part[name], dtype=np.float64)[kept] for name in names]
+        yield len(part), np.stack(columns, axis=1)
+        start += len(part)
+
+
+def _names(reader: "laspy.LasReader") -> tuple[str, ...]:
+    known = set(reader.header.point_format.dimension_names)
+    return ("x", "y", "z", *(_RGB if known.issuperset(_RGB) else ()))
+
+
+def _require_laspy(path: Path) -> None:
+    packages = ("laspy", "lazrs")[: 1 + (path.suffix.lower() == SUFFIXES[1])]
+    missing = [name for name in packages if find_spec(name) is None]
+    if missing:
+        raise UserError(
+            "point clouds in LAS and LAZ need a package that is not installed",
+            where=path,
+            expected=f"the package {missing[0]}",
+            todo="pip install 'crossgrad[las]', or convert the points to PLY",
+        )
+
+
+def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
+    """At most `most` of the points, one from each cube of a grid, and a note.
+
+    The first point of the file in each cube is kept, so that equal input gives equal points.
+    """
+    count = len(points.xyz)
+    if count <= most:
+        return points, []
+    rows, side = _one_per_cube(points.xyz, most)
+    chosen = np.zeros(count, dtype=np.bool_)
+    chosen[rows] = True
+    how = f"from each cube with a side of {side:.3g} input units" if side else "of so many"
+    kept = f"{len(rows):,} of {count:,} kept, one {how}"
+    return points.selected(chosen), [f"points: {kept} (--set data.max_points=N keeps more)"]
+
+
+def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64], float]:
+    """Rows of the first point in each cube, at most `most`, and the side of the cubes.
+
+    Where no cubes are that few, the points are evenly spread over the file, and the side is 0.
+    """
+    sample = xyz[:: -(-len(xyz) // _SAMPLED)]
+    low, high = np.percentile(sample, [1.0, 99.0], axis=0)
+    span = float((high - low).max())
+    side = max(span, _SMALLEST) / most ** (1.0 / _SURFACE)
+    best = np.arange(0, len(xyz), -(-len(xyz) // most))
+    best_side, few, many = 0.0, np.inf, 0.0
+    for _ in range(_TRIES):
+        rows = _first_in_cubes((xyz - low) / side)
+        if len(rows) <= most:
+            few = side
+            if best_side == 0.0 or len(rows) > len(best):
+                best, best_side = rows, side
+            if len(rows) >= _ENOUGH * most:
+                break
+        else:
+            many = side
+        guess = side * (len(rows) / (0.9 * most)) ** (1.0 / _SURFACE)
+        side = guess if many < guess < few else float(np.sqrt(many * few))
+    return best, best_side
+
+
+def _first_in_cubes(places: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Rising rows of the first of the points [P, 3] in each unit cube."""
+    cubes = np.floor(places.clip(-_FARTHEST, _FARTHEST)).astype(np.int64).astype(np.uint64)
+    keys = (cubes * _FACTORS).sum(axis=1, dtype=np.uint64)
+    return np.sort(np.unique(keys, return_index=True)[1])

@@ -1,12 +1,29 @@
-"""The raw scene: a reader's findings before split, resizing and the local frame."""
+"""The raw scene: a reader's findings before split and local frame, and checks on them."""
 
+import os
+import re
+import unicodedata
+from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.frame import Frame, camera_centers
+from crossgrad_core.scene.wording import count, name_some
+
+#: Coordinates beyond this, in units of the input, are none: their squares must stay within float64.
+FARTHEST = 1e30
+#: And beyond this in local units: their squares must stay within float32.
+FARTHEST_LOCAL = 1e15
+#: Bytes of a file or folder, on every usual file system, and of a whole name.
+LONGEST_PART, LONGEST_NAME = 255, 1024
+_NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
+# Rotations written with six digits pass; a pose with a scale in it does not.
+_RIGID = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +75,139 @@ class RawScene:
     split: tuple[frozenset[str], frozenset[str]] | None = None
     background: tuple[float, float, float] | None = None
     files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedPoints:
+    """The finite points of a scene.
+
+    Attributes:
+        xyz: [P, 3] float64, input frame.
+        colors: [P, 3] uint8.
+        new_row: [Q] int64, row among the finite points of each point of the input, -1 for none.
+    """
+
+    xyz: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    new_row: NDArray[np.int64]
+
+    def rows(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """[S'] sorted, distinct rows of the finite points, from rows of the input's points."""
+        kept = np.unique(self.new_row[rows])
+        return kept[kept >= 0]
+
+    def selected(self, chosen: NDArray[np.bool_]) -> "CheckedPoints":
+        """Those that are marked in `chosen` [P]."""
+        numbers = np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)
+        return CheckedPoints(self.xyz[chosen], self.colors[chosen], numbers[self.new_row])
+
+
+def is_possible_name(text: str) -> bool:
+    """Whether a file can have a name, with folders, on every usual file system."""
+    if any(unicodedata.category(sign) in _NO_SIGNS for sign in text):
+        return False
+    longest = max(len(os.fsencode(part)) for part in re.split(r"[/\\]", text))
+    return longest <= LONGEST_PART and len(os.fsencode(text)) <= LONGEST_NAME
+
+
+def check_views(raw: RawScene) -> None:
+    """Refuses scenes with no view, and views that cannot be told apart or placed.
+
+    Raises:
+        UserError: See above; names the views.
+    """
+    if not raw.views:
+        raise UserError(
+            "the scene has no posed image",
+            where=raw.root,
+            todo="check that the poses were estimated: at least one image must be registered",
+        )
+    for view in raw.views:
+        _check_name(raw, view.name)
+    names = Counter(str(PurePosixPath(view.name)) for view in raw.views)
+    twice = [name for name, number in names.items() if number > 1]
+    if twice:
+        raise UserError(
+            "several poses belong to one image name",
+            where=raw.root,
+            found=name_some(twice),
+            todo="keep one image of each name in the model",
+        )
+    for view in raw.views:
+        _check_view(raw, view)
+
+
+def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
+    """Leaves out points that are not finite, and says so."""
+    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
+    broken = int((~finite).sum())
+    notes = [f"points: {count(broken, 'point')} left out: not finite"] if broken else []
+    new_row = np.where(finite, np.cumsum(finite) - 1, -1)
+    return CheckedPoints(raw.points[finite], raw.point_colors[finite], new_row), notes
+
+
+def check_distances(
+    raw: RawScene, points: CheckedPoints, frame: Frame
+) -> tuple[CheckedPoints, list[str]]:
+    """Leaves out points too far from the training cameras for single precision, and says so.
+
+    Raises:
+        UserError: A camera is too far away.
+    """
+    poses = np.stack([view.world_to_camera for view in raw.views])
+    centers = np.abs(frame.similarity.to_local(camera_centers(poses))).max(1)
+    if centers.max() > FARTHEST_LOCAL:
+        raise UserError(
+            "a camera is too far from the training cameras",
+            where=f"{raw.root}: image {raw.views[int(centers.argmax())].name}",
+            expected=f"at most {FARTHEST_LOCAL:g} times their extent",
+            found=f"{centers.max():.3g} times",
+            todo="remove or re-estimate the image",
+        )
+    near = np.abs(frame.similarity.to_local(points.xyz)).max(1, initial=0.0) <= FARTHEST_LOCAL
+    far = int((~near).sum())
+    if not far:
+        return points, []
+    return points.selected(near), [
+        f"points: {count(far, 'point')} left out: farther than {FARTHEST_LOCAL:g} times the extent "
+        "of the training cameras"
+    ]
+
+
+def _check_name(raw: RawScene, name: str) -> None:
+    path = PurePosixPath(name)
+    absolute = path.is_absolute() or PureWindowsPath(name).drive
+    if not path.name or absolute or ".." in path.parts:
+        raise UserError(
+            "an image name leads out of the image folder",
+            where=raw.root,
+            expected="a path below the image folder",
+            found=repr(name),
+            todo="rename the image in the model and its photo below the image folder",
+        )
+    if not is_possible_name(name):
+        raise UserError(
+            "an image name that no photo can be found or listed by",
+            where=raw.root,
+            expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file "
+            f"or folder and {LONGEST_NAME} in all",
+            found=ascii(name),
+            todo="rename the image in the model, and its photo",
+        )
+
+
+def _check_view(raw: RawScene, view: RawView) -> None:
+    where = f"{raw.root}: image {view.name}"
+    view.calibration.check(where)
+    pose = view.world_to_camera
+    if not (np.abs(pose) <= FARTHEST).all():  # False for NaN
+        raise UserError("a pose is not finite", where=where, todo="remove or re-estimate the image")
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
+        raise UserError(
+            "a pose is not a rotation and a shift",
+            where=where,
+            expected="an orthonormal, right-handed rotation",
+            found=str(rotation.round(4).tolist()),
+            todo="remove the image from the model, or estimate the poses again",
+        )

@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.file_names import FileNames
+from crossgrad_core.scene.photos.file_names import FileNames
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_core.system.input_files import read_file
 

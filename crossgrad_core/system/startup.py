@@ -1,4 +1,4 @@
-"""Progress before a command's first result: a line for each stage, compiling with a clock.
+"""Progress of a command: a line for each stage, a clock while kernels compile, counts.
 
 Listens to the log of the package; what takes long says so there (`reading scene ...`), and so does
 the cache of kernels before it compiles one. Nothing heavy is imported.
@@ -137,3 +137,27 @@ def _say(text: str, *, stays: bool = True) -> None:
         stream.flush()
     except (OSError, ValueError):
         pass  # It is no longer read.
+
+
+class Progress:
+    """Lines on stderr that begin with three dots, one at most in so many seconds.
+
+    Args:
+        pause: Seconds between two lines; 0 shows all of them. A pause begins at once.
+    """
+
+    def __init__(self, pause: float = 0.0) -> None:
+        self._pause = pause
+        self._last = monotonic()
+
+    @property
+    def due(self) -> bool:
+        """Whether a line would be shown now, for texts that take long to make."""
+        return monotonic() - self._last >= self._pause
+
+    def tell(self, text: str) -> None:
+        """Shows a line where one is due."""
+        if self.due:
+            self._last = monotonic()
+            sys.stderr.write(f"... {one_line(text)}\n")
+            sys.stderr.flush()

@@ -7,24 +7,24 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Edit, Parameters, apply_to_parameters, primitives_of
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.defaults import REFERENCE_RASTERIZER
-from crossgrad_core.numerics.spherical import COEFFICIENTS
+from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.entries import build
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     cannot_tell,
     global_randomness_untouched,
     require,
 )
-from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
 from crossgrad_core.wording import listed
 
 #: Steps at which decoding is looked at: before the first, early, the last.

@@ -10,11 +10,11 @@ from unittest import SkipTest
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
 from crossgrad_core.registry.commands import load_command
+from crossgrad_core.registry.signatures import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
-from crossgrad_core.registry.source_location import defined_at, raised_at
 from crossgrad_core.wording import in_one_line, listed, singular
 
-#: `check(make)`, see `crossgrad_core.testing.contract`; of any slot.
+#: `check(make)`, see `crossgrad_core.testing.support.contract`; of any slot.
 AnyCheck: TypeAlias = Callable[[Any], None]
 
 

@@ -13,7 +13,7 @@ from typing import Final
 import typer
 
 from crossgrad_core.registry.commands import Command, as_group_member
-from crossgrad_core.testing.contract import cannot_tell, require
+from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
 #: Libraries that take long to import; a command imports them when it has said that it started.

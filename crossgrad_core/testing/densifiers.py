@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import (
     Block,
     Edit,
@@ -19,14 +18,16 @@ from crossgrad_core.contract.blocks import (
     primitives_of,
 )
 from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.gaussians import Screen
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.defaults import BACKBONE, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build, entries, load
 from crossgrad_core.testing.backbones import created
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     cannot_tell,
@@ -35,11 +36,13 @@ from crossgrad_core.testing.contract import (
     revived,
     same_state,
 )
-from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
-from crossgrad_core.testing.growth import require_bounded, size_of
-from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
-from crossgrad_core.testing.records import view_record
-from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.testing.support.growth import require_bounded, size_of
+from crossgrad_core.testing.support.renders import (
+    gaussians_in_a_run,
+    parameters_in_a_run,
+    renders_of,
+    view_record,
+)
 from crossgrad_core.wording import listed
 
 #: Steps of the published schedule around its second and third edit, at 600 and 700.

@@ -6,12 +6,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Similarity
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
+from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.testing.fixtures import sample_gaussians
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
 _FRAME = Similarity(np.array([1.0, -2.0, 3.0]), 0.5)
 #: Of a few operations in float32, on numbers of about 1.

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.exposure import Exposure, Fitted
+from crossgrad_core.contract.slots.exposure import Exposure, Fitted
 from crossgrad_core.registry.entries import load
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
 #: How far a second projection may move what was projected already.
 _ROUNDING = 1e-5

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.contract.grouping import GradientProbe, Grouping, GroupingRule
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.contract.slots.grouping import GradientProbe, Grouping, GroupingRule
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     cannot_tell,
     global_randomness_untouched,
     require,
 )
-from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.wording import listed
 
 

@@ -5,17 +5,17 @@ from dataclasses import fields
 
 import numpy as np
 
-from crossgrad_core.contract.initializer import Initializer, MorePoints
+from crossgrad_core.contract.slots.initializer import Initializer, MorePoints
 from crossgrad_core.errors import UserError
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     ContractError,
     Make,
     global_randomness_untouched,
     require,
 )
-from crossgrad_core.testing.fixtures import sample_scene
 
 
 def adds_points(make: Make[Initializer]) -> None:

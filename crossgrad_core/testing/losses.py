@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, require
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, Make, require
 
 _HEIGHT, _WIDTH = 24, 32
 #: Relative difference between two ways of one sum in float32.

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.figure import Figure
-from crossgrad_core.contract.metric import Compared, Metric
+from crossgrad_core.contract.slots.metric import Compared, Metric
 from crossgrad_core.defaults import METRICS
 from crossgrad_core.registry.entries import load
 from crossgrad_core.run.results.metrics_csv import columns_for
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, require
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, Make, require
 
 
 def names_its_figure(make: Make[Metric]) -> None:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import NO_EDIT, AdamState, Edit, PluginState
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import (
     AfterStepContext,
     AggregateContext,
@@ -37,21 +37,23 @@ from crossgrad_core.contract.contexts import (
     StepRecord,
     ViewSample,
 )
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.contract.observer import Observer
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.observer import Observer
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.defaults import BACKBONE, LOSS, NO_DENSIFIER, REFERENCE_RASTERIZER
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import call_first_result, make_manager
 from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.select import select
-from crossgrad_core.testing.aggregation import BLOCKS, aggregate_context, sample_gradients
 from crossgrad_core.testing.backbones import created
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.densifiers import DensifierRun, require_good
+from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
+from crossgrad_core.testing.support.aggregation import BLOCKS, aggregate_context, sample_gradients
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     ContractError,
     Make,
@@ -59,12 +61,17 @@ from crossgrad_core.testing.contract import (
     require,
     revived,
 )
-from crossgrad_core.testing.densifiers import DensifierRun, require_good
-from crossgrad_core.testing.fixtures import STEPS, sample_phase, sample_scene, step_fields
-from crossgrad_core.testing.growth import require_bounded, size_of
-from crossgrad_core.testing.in_a_run import gaussians_in_a_run, parameters_in_a_run
-from crossgrad_core.testing.renders import renders_of
-from crossgrad_core.testing.watching import time_hooks, traced_memory
+from crossgrad_core.testing.support.growth import (
+    require_bounded,
+    size_of,
+    time_hooks,
+    traced_memory,
+)
+from crossgrad_core.testing.support.renders import (
+    gaussians_in_a_run,
+    parameters_in_a_run,
+    renders_of,
+)
 from crossgrad_core.wording import in_one_line
 
 #: The hooks of one run's manager; pluggy gives them no types.

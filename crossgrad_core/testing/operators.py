@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from crossgrad_core.contract.blocks import EMPTY_STATE, BlockKind, PluginState
 from crossgrad_core.contract.contexts import OperatorContext
 from crossgrad_core.contract.gramian_operator import GramianOperator, MatrixOperator
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.testing.aggregation import AGGREGATION_CHECKS
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.testing.support.aggregation import AGGREGATION_CHECKS
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     admitted,

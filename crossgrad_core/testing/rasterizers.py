@@ -7,11 +7,11 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render, Screen
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, cannot_tell, require
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_camera, sample_gaussians
-from crossgrad_core.testing.reference import REFERENCE_CHECKS, device_of, moved, tensors_of
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
+from crossgrad_core.testing.support.reference import REFERENCE_CHECKS, device_of, moved, tensors_of
 
 _ROUNDING = 1e-4
 

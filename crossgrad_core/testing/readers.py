@@ -3,11 +3,11 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.contract.slots.reader import Reader
 from crossgrad_core.errors import UserError
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, ContractError, Make, require
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import Check, ContractError, Make, require
 
 
 def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:

@@ -2,12 +2,17 @@
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.decision import Decision
-from crossgrad_core.contract.recipe import Facts, Recipe
+from crossgrad_core.contract.slots.recipe import Facts, Recipe
 from crossgrad_core.recipe.table import DECIDED
 from crossgrad_core.run.decisions import facts_of
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import Check, Make, global_randomness_untouched, require
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
+    Check,
+    Make,
+    global_randomness_untouched,
+    require,
+)
 from crossgrad_core.wording import listed
 
 

@@ -7,10 +7,11 @@ import numpy as np
 
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.contexts import ScaleContext, StepRecord, ViewSample
-from crossgrad_core.contract.resolution import Resolution
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.contract.slots.resolution import Resolution
+from crossgrad_core.testing.fixtures import STEPS, sample_scene, step_fields
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     global_randomness_untouched,
@@ -18,8 +19,7 @@ from crossgrad_core.testing.contract import (
     revived,
     same_state,
 )
-from crossgrad_core.testing.fixtures import STEPS, sample_scene, step_fields
-from crossgrad_core.testing.growth import require_bounded, size_of
+from crossgrad_core.testing.support.growth import require_bounded, size_of
 
 #: Steps that are looked at, spread over a run of the published length.
 _STEPS = tuple(range(1, STEPS + 1, STEPS // 40))

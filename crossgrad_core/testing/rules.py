@@ -5,19 +5,24 @@ from copy import deepcopy
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.rule import Rule
+from crossgrad_core.contract.slots.rule import Rule
 from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_core.registry.entries import name_of
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     global_randomness_untouched,
     require,
     revived,
 )
-from crossgrad_core.testing.short_runs import require_repeated, require_sound, setup_of, train
+from crossgrad_core.testing.support.short_runs import (
+    require_repeated,
+    require_sound,
+    setup_of,
+    train,
+)
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state

@@ -6,11 +6,12 @@ from functools import cache
 import numpy as np
 
 from crossgrad_core.contract.contexts import ViewSample
-from crossgrad_core.contract.grouping import Grouping
-from crossgrad_core.contract.sampler import Sampler
+from crossgrad_core.contract.slots.grouping import Grouping
+from crossgrad_core.contract.slots.sampler import Sampler
 from crossgrad_core.registry.entries import build
-from crossgrad_core.testing.components import COMPONENT_CHECKS
-from crossgrad_core.testing.contract import (
+from crossgrad_core.testing.fixtures import SamplerRun, sample_scene
+from crossgrad_core.testing.support.components import COMPONENT_CHECKS
+from crossgrad_core.testing.support.contract import (
     Check,
     Make,
     admitted,
@@ -20,9 +21,7 @@ from crossgrad_core.testing.contract import (
     revived,
     same_state,
 )
-from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.growth import require_bounded, size_of
-from crossgrad_core.testing.posed import SamplerRun
+from crossgrad_core.testing.support.growth import require_bounded, size_of
 
 #: Steps after which a run is interrupted, and steps that follow.
 _BEFORE, _AFTER = 7, 12

@@ -13,7 +13,7 @@ import numpy as np
 
 from crossgrad_core.contract.blocks import EMPTY_STATE, PluginState
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.sampler import STATE
+from crossgrad_core.contract.slots.sampler import STATE
 from crossgrad_core.system.allocator import use_large_pages
 from crossgrad_core.system.interrupts import end_at_once, signal_names, tell
 from crossgrad_core.training.setup import Setup

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from crossgrad_core.contract.grouping import Grouping
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.slots.grouping import Grouping
 from crossgrad_core.defaults import SAMPLER
 from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 

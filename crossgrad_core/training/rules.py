@@ -8,7 +8,7 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import LearningRate, Parameters
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rule import GaussiansContext, GaussiansResult
+from crossgrad_core.contract.slots.rule import GaussiansContext, GaussiansResult
 from crossgrad_core.registry.manager import call_all, wrong_answer
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any, Final
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Counting, Schedule
+from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 

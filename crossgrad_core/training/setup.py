@@ -11,26 +11,26 @@ import pluggy
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import EMPTY_STATE, Block
 from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.decision import FOLLOWING, Decide, Decision, Length, repeats
-from crossgrad_core.contract.densifier import Densifier
-from crossgrad_core.contract.exposure import Exposure, PerPhoto
-from crossgrad_core.contract.loss import Loss
-from crossgrad_core.contract.metric import Metric
-from crossgrad_core.contract.operator import Operator
-from crossgrad_core.contract.rasterizer import Rasterizer
-from crossgrad_core.contract.rule import Rule
-from crossgrad_core.contract.sampler import Sampler
 from crossgrad_core.contract.scene import Scene, View
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.selection import Selection
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+from crossgrad_core.contract.slots.exposure import Exposure, PerPhoto
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.metric import Metric
+from crossgrad_core.contract.slots.operator import Operator
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.rule import Rule
+from crossgrad_core.contract.slots.sampler import Sampler
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.numerics.hashing import hash32
 from crossgrad_core.registry.manager import make_manager, one_by_one, wrong_answer
-from crossgrad_core.scene.photos_ahead import PhotosAhead
+from crossgrad_core.scene.photos.photos_ahead import PhotosAhead
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 

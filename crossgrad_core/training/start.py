@@ -24,9 +24,9 @@ from crossgrad_core.contract.blocks import (
     primitives_of,
 )
 from crossgrad_core.contract.component import answered
-from crossgrad_core.contract.exporter import Exporter
-from crossgrad_core.contract.loss import Loss
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.slots.exporter import Exporter
+from crossgrad_core.contract.slots.loss import Loss
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.sparse_rows import sparse_rows

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract import sampler
 from crossgrad_core.contract.blocks import (
     EMPTY_STATE,
     AdamRule,
@@ -37,9 +36,10 @@ from crossgrad_core.contract.contexts import (
     ViewSample,
 )
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.grouping import GroupingRule, Regrouping
-from crossgrad_core.contract.rule import FinalEdit
 from crossgrad_core.contract.scene import Scene
+from crossgrad_core.contract.slots import sampler
+from crossgrad_core.contract.slots.grouping import GroupingRule, Regrouping
+from crossgrad_core.contract.slots.rule import FinalEdit
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.finite import is_finite
 from crossgrad_core.gradients.sparse_rows import coalesced, dense

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.numerics.hashing import hash32
 from crossgrad_core.training.scaled_photos import Pair
 

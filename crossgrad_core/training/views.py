@@ -27,8 +27,8 @@ from crossgrad_core.contract.contexts import (
 )
 from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Render
 from crossgrad_core.contract.gradients import Gradients
-from crossgrad_core.contract.rule import GaussiansContext
 from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.slots.rule import GaussiansContext
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.deferred import DeferredSums

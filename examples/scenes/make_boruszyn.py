@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from crossgrad_core.scene.decode import resize
+from crossgrad_core.scene.photos.decode import resize
 
 LONG_SIDE = 400
 QUALITY = 90

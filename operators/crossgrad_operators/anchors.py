@@ -16,7 +16,7 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 from crossgrad_operators._labels import label_objections, labels_of
-from crossgrad_operators._pairs import project, slot_order
+from crossgrad_operators.projection import project, slot_order
 
 
 class Anchors(GramianOperator):

@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 from crossgrad_operators._memory import recall, remember
-from crossgrad_operators._pairs import project, slot_order
+from crossgrad_operators.projection import project, slot_order
 
 _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 

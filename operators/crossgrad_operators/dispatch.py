@@ -30,8 +30,8 @@ from crossgrad_operators._nested import (
     reads_gramians,
 )
 from crossgrad_operators.confgate import ConfGate
+from crossgrad_operators.projection import Symmetric
 from crossgrad_operators.sum import Sum
-from crossgrad_operators.symmetric import Symmetric
 
 _KINDS: Final[tuple[BlockKind, ...]] = ("geometry", "appearance", "neutral")
 _OPACITY = frozenset({"opacity", "opacities"})

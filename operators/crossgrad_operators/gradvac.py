@@ -9,8 +9,8 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState
 from crossgrad_operators._memory import recall, remember
-from crossgrad_operators._pairs import random_order
 from crossgrad_operators._weights import Floats, refine
+from crossgrad_operators.projection import random_order
 
 
 class GradVac(GramianOperator):

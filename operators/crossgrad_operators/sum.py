@@ -1,4 +1,4 @@
-"""The plain sum of the views' gradients."""
+"""The sum and the mean of the views' gradients."""
 
 from typing import ClassVar
 
@@ -56,3 +56,31 @@ def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
         "dropped": int((~finite).any(axis=1).sum()),
     }
     return AggregateResult(gradients.total(divisor), counts)
+
+
+class Mean(MatrixOperator):
+    """u = (1/K) sum of g_k; K counts all views of the step, also those without a gradient.
+
+    Under Adam the same as `sum` up to the optimizer's eps. Needs no separate gradients.
+    """
+
+    separate: ClassVar[bool] = False
+    identity_at_one: ClassVar[bool] = True
+    sparse_rows: ClassVar[bool] = True
+
+    @override
+    def transform(
+        self,
+        gramians: NDArray[np.float64],
+        context: OperatorContext,
+        state: PluginState,
+        rng: np.random.Generator,
+    ) -> tuple[NDArray[np.float64], PluginState]:
+        blocks, views, _ = gramians.shape
+        return np.tile(np.eye(views) / views, (blocks, 1, 1)), state
+
+    @override
+    def aggregate(
+        self, context: AggregateContext, state: PluginState
+    ) -> tuple[AggregateResult, PluginState]:
+        return divided_sum(context, context.gradients.views), state

@@ -389,7 +389,7 @@ def test_a_full_disk_is_one_message_and_earlier_results_stay(scene, tmp_path, ca
 
 def test_a_disk_that_fills_during_the_run_is_one_message(scene, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("crossgrad_core.run.checkpoint.checkpoint.write_tensors", full_disk)
+    monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", full_disk)
     assert failing(["run", str(scene), "--out", str(tmp_path / "out"), *BASE]) == 1
     message = capfd.readouterr().err
     assert message.count("not enough disk space") == 1 and "Traceback" not in message

@@ -126,7 +126,7 @@ def test_nothing_is_overwritten(ran, tmp_path):
         ("class", "cannot be the name"),
         ("../up", "cannot be the name"),
         ("numpy", "an installed package numpy"),
-        ("pcgrad", "crossgrad_operators.pcgrad"),
+        ("pcgrad", "crossgrad_operators.projection"),
     ],
 )
 def test_a_name_that_cannot_be_one_is_refused(ran, tmp_path, name, words):

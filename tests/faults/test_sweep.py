@@ -18,7 +18,7 @@ from support.scenes import write_tiny_scene
 import crossgrad_core
 from crossgrad_core.commands import write_settings
 from crossgrad_plugins.sweep.app import Request, Sweep
-from crossgrad_plugins.sweep.records import read_records
+from crossgrad_plugins.sweep.run_status import read_records
 
 #: 60 steps with edits, checkpoints and evaluations.
 BASE = {

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.commands import configured
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.grouping import views_per_step
 

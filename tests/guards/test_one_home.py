@@ -37,7 +37,7 @@ HOMES = {
     "how a run ended": (
         r"^Status\b.*=",
         # An attempt of a sweep may also have died.
-        {f"{CORE}/run/results/summary.py", "plugins/crossgrad_plugins/sweep/records.py"},
+        {f"{CORE}/run/results/summary.py", "plugins/crossgrad_plugins/sweep/run_status.py"},
     ),
     "published numbers": (r"== \"absolute\" and", {f"{CORE}/contract/schedule.py"}),
     "a calibration": (r"class (Pinhole|Camera)\b", {SCENE}),
@@ -49,7 +49,7 @@ HOMES = {
         r"2(\.0)? \* \(x \* y - w \* z\)",
         {f"{CORE}/numerics/rotations.py", f"{KERNELS}/ewa.py"},
     ),
-    "writing CSV": (r"csv\.(writer|DictWriter)\b", {f"{CORE}/system/tables.py"}),
+    "writing CSV": (r"csv\.(writer|DictWriter)\b", {f"{CORE}/system/text_files.py"}),
     "reading CSV": (r"csv\.(reader|DictReader)\b", {f"{CORE}/system/text_files.py"}),
     "compiled or plain passes": (r"\bnative if .* else generic", {f"{CORE}/gradients/passes.py"}),
     "weights on a diagonal": (r"\[:, :: views \+ 1\]", {f"{CORE}/contract/gramian_operator.py"}),

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
+from crossgrad_core.testing.support.aggregation import aggregate_context, sample_gradients
 from crossgrad_core.training.setup import OperatorScale
 
 PAGE = (Path(__file__).parents[2] / "docs" / "operators.md").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.postprocess import evaluate, export
 from crossgrad_core.run.results.lock import locked
 from crossgrad_core.run.results.metrics_csv import read_metrics

@@ -13,7 +13,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.app import check_clock
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.results import machine
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.machine import WORTH_A_CALIBRATION, Machine, calibrated

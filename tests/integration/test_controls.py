@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from crossgrad_core.contract.blocks import BETAS, EPS, AdamRule, AdamState
-from crossgrad_core.contract.markers import hookimpl
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
-from crossgrad_core.recipe.lines import short_lines
+from crossgrad_core.recipe.table import short_lines
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import redecided
 from crossgrad_core.run.settings import parsed

@@ -18,7 +18,7 @@ from crossgrad_core.run.export import export_scene
 from crossgrad_core.run.postprocess import evaluate, export
 from crossgrad_core.run.postprocess.open_options import AS_IT_IS
 from crossgrad_core.training.start import first_state
-from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_plugins.exporters.ply_file import read_ply
 
 SYSTEMS = {"utm": "EPSG:32633", "epsg:25833": "EPSG:25833", "epsg:4978": "EPSG:4978"}
 COORDINATES = ("input", "local", "enu", *SYSTEMS)

@@ -12,12 +12,11 @@ from crossgrad_core.cli.main import main
 from crossgrad_core.config import ComponentChoice
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.training import loop
 from crossgrad_core.training.state import NonFiniteError
-from crossgrad_plugins.diagnostics import exposure_figure, figure
-from crossgrad_plugins.diagnostics.app import diagnose
-from crossgrad_plugins.diagnostics.command import Options
+from crossgrad_plugins.diagnostics import figure
+from crossgrad_plugins.diagnostics.app import Options, diagnose
 
 PROBED = {"diagnostics.csv", "cameras.csv", "groupings.csv", "diagnostics.png"}
 FILES = {*PROBED, "exposure.csv", "exposure.png"}
@@ -29,7 +28,7 @@ def _without_pictures(request, monkeypatch):
     """Drawing takes half of the time of these tests; those that want pictures ask for `drawn`."""
     if "drawn" not in request.fixturenames:
         monkeypatch.setattr(figure, "draw", lambda *_: b"a picture")
-        monkeypatch.setattr(exposure_figure, "draw_exposure", lambda *_: b"a picture")
+        monkeypatch.setattr(figure, "draw_exposure", lambda *_: b"a picture")
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +213,7 @@ def diagnosed(scene, out):
 def test_a_training_that_fails_reports_its_probes_and_the_reason(
     scene, tmp_path, monkeypatch, capfd
 ):
-    monkeypatch.setattr("crossgrad_plugins.diagnostics.command.affordable_steps", lambda *given: 40)
+    monkeypatch.setattr("crossgrad_plugins.diagnostics.app.affordable_steps", lambda *given: 40)
     failing_from(monkeypatch, 25)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()
@@ -230,9 +229,7 @@ def test_a_training_that_fails_before_the_first_probe_says_so(
     scene, tmp_path, monkeypatch, capfd, compiling
 ):
     if not compiling:
-        monkeypatch.setattr(
-            "crossgrad_plugins.diagnostics.command.affordable_steps", lambda *given: 40
-        )
+        monkeypatch.setattr("crossgrad_plugins.diagnostics.app.affordable_steps", lambda *given: 40)
     failing_from(monkeypatch, 1)
     assert diagnosed(scene, tmp_path / "out") == 1
     printed = capfd.readouterr()

@@ -12,14 +12,14 @@ import torch
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.blocks import Edit, Rows
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import DensifyResult
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app, assemble, session
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.results.metrics_csv import read_metrics
-from crossgrad_core.scene import photos_ahead
-from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_core.scene.photos import photos_ahead
+from crossgrad_plugins.exporters.ply_file import read_ply
 from crossgrad_plugins.rules.floaters import Floaters
 
 STEPS, FAILS_IN = 8, 5

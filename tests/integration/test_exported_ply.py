@@ -17,7 +17,7 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.authoring.matrix.combinations import NEEDED
-from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 
 OURS = sorted(e.name for e in offers("backbones") if e.distribution == "crossgrad")
 NORMALS = ["nx", "ny", "nz"]

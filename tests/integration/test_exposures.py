@@ -11,7 +11,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run import app
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.results.reading import read_run
 
 MODELS = ("gain", "channel", "affine")

@@ -19,7 +19,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import AggregateResult, Observer, Operator, ViewCounts, hookimpl
 from crossgrad_core.registry.entries import load as load_plugin
 from crossgrad_core.run import app, assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.testing.checking import checks_of
 from crossgrad_core.training.state import PHASES
 from crossgrad_core.training.views import RenderCallback

@@ -5,7 +5,7 @@ from support.same_bits import bits
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.run import app, finish
-from crossgrad_core.scene import photos
+from crossgrad_core.scene.photos import photos
 
 
 @pytest.fixture(scope="module")

@@ -22,14 +22,14 @@ UNUSED = (
         f"readers.{name}"
         for name in (
             *("blender", "matrixcity", "metashape", "nerfstudio", "opensfm", "photos_alone"),
-            *("realitycapture", "uc_gs", "_geo_list", "_lenses", "_points", "_poses", "_priors"),
+            *("realitycapture", "uc_gs", "_cameras", "_raw", "place.files"),
             *("_transforms", "_xml"),
         )
     ),
     *("rasterizers.gpu", "rasterizers.gsplat_cuda", "rasterizers.gswarp_cuda"),
     *("rasterizers.torch_reference", "rasterizers.reference"),
-    *("metrics.perceptual.distance", "metrics.perceptual.weights"),
-    *(f"georeference.{name}" for name in ("ellipsoid", "fit", "frames", "on_earth", "projection")),
+    "metrics.lpips_distance",
+    *(f"georeference.{name}" for name in ("ellipsoid", "frames", "on_earth", "projection")),
     *("prepare", "compare", "sweep", "diagnostics", "authoring"),
 )
 

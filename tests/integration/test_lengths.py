@@ -7,12 +7,12 @@ import torch
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.markers import hookimpl
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run import app
 from crossgrad_core.run.app import BUNDLED_SECONDS
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.settings import merged, parsed

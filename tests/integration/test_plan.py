@@ -180,7 +180,7 @@ finally:
 """
 #: Modules that a run of one mode and even exposure does not need.
 LEFT_OUT = (
-    *("samplers.near_far", "groupings.radial", "groupings.footprint"),
+    *("samplers.balanced", "groupings.distance", "groupings.footprint"),
     *("exposures.gain", "exposures.per_photo", "diagnostics", "planner.probe"),
 )
 

@@ -15,7 +15,7 @@ from crossgrad_core.run import app, load_run
 from crossgrad_core.run.postprocess import evaluate, export, render
 from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.lock import locked
-from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_plugins.exporters.ply_file import read_ply
 
 STEPS = 4
 

@@ -13,7 +13,7 @@ from crossgrad_core.plugin import Observer, Schedule, hookimpl
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run import app
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config
 from crossgrad_core.run.results.metrics_csv import read_metrics
 from crossgrad_core.testing.fixtures import sample_scene

@@ -10,12 +10,12 @@ from support.pace import each_step_takes
 from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.blocks import NO_EDIT, Edit, Rows
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import AggregateResult, DensifyResult, RegularizeResult
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.run import app
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 from crossgrad_core.run.results.config_file import read_config
-from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_plugins.exporters.ply_file import read_ply
 
 #: Density control within a few dozen steps; by default a run has to be longer.
 GROWTH = {"schedule_unit": "steps", "densify_from": 10, "densify_until": 50, "densify_every": 10}

@@ -14,7 +14,7 @@ from crossgrad_core.run.postprocess import evaluate, export, render
 from crossgrad_core.run.postprocess.open_options import How
 from crossgrad_core.run.results.scene_file import FILE
 from crossgrad_plugins.diagnostics import app as diagnostics
-from crossgrad_plugins.diagnostics.command import Options
+from crossgrad_plugins.diagnostics.app import Options
 
 NAMES = [f"{index:04}.png" for index in range(6)]
 

@@ -15,7 +15,12 @@ from support.refusals import every_combination, from_lines, refused
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import load
-from crossgrad_core.testing.short_runs import require_repeated, require_sound, setup_of, train
+from crossgrad_core.testing.support.short_runs import (
+    require_repeated,
+    require_sound,
+    setup_of,
+    train,
+)
 from crossgrad_plugins.authoring.matrix.combinations import SLOTS, STEPS, as_lines, config_of
 
 #: What operators count; everything else that a step counts is density control.

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Parameters
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
 
 #: A tensor's gradient shorter than this share of the longest one is the rounding noise of a zero.

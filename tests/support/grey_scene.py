@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.exposures import srgb
 
 SIZE = 64

@@ -19,9 +19,9 @@ from crossgrad_fuzz.limits import memory_limit
 from PIL import Image
 
 from crossgrad_core.run.camera_path import _read as read_camera_path
-from crossgrad_core.run.checkpoint.checkpoint import read_tensors
-from crossgrad_core.scene.decode import decode_photo
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.run.checkpoint import read_tensors
+from crossgrad_core.scene.photos.decode import decode_photo
+from crossgrad_core.scene.photos.headers import read_header
 from crossgrad_core.scene.split import _read_list as read_list
 from crossgrad_core.system import input_files
 from crossgrad_core.system.ply_table import read_vertices

@@ -21,7 +21,7 @@ from support.scenes import write_tiny_scene
 
 import crossgrad_core as cg
 from crossgrad_core.run.app import bundled_scene
-from crossgrad_core.run.checkpoint.checkpoint import latest, load
+from crossgrad_core.run.checkpoint import latest, load
 
 PATH = Path(__file__).parents[1] / "integration" / "data" / "bits.json"
 #: Versions that decide about the order of sums, about instructions, or about decoded photos.

@@ -8,15 +8,14 @@ import torch
 from torch import Tensor
 
 from crossgrad_backbones.vanilla import Vanilla
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import Parameters
 from crossgrad_core.contract.contexts import DensifyContext, ViewRecord
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.contract.schedule import Phase, Schedule
+from crossgrad_core.contract.slots.backbone import Backbone
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
-from crossgrad_core.testing.records import view_record
-from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.testing.support.renders import renders_of, view_record
 
 TRAIN = sample_scene().train_views
 VIEWS = len(TRAIN)

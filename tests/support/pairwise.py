@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.authoring.matrix.pairwise import Row
+from crossgrad_plugins.authoring.matrix.combinations import Row
 
 #: (first factor, second factor, value of the first, value of the second).
 Pair: TypeAlias = tuple[int, int, str, str]

@@ -11,7 +11,7 @@ import sys
 from functools import cache
 
 from crossgrad_core.registry.entries import load, offers
-from crossgrad_core.testing.short_runs import reasons_to_refuse
+from crossgrad_core.testing.support.short_runs import reasons_to_refuse
 from crossgrad_plugins.authoring.matrix.combinations import SLOTS, as_lines, config_of, every_row
 
 

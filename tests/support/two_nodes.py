@@ -15,10 +15,8 @@ from ray.cluster_utils import Cluster
 
 from crossgrad_plugins.sweep.app import Request, Sweep
 from crossgrad_plugins.sweep.engines import Work, engine
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.run_status import standings
+from crossgrad_plugins.sweep.job import Job, Layout
+from crossgrad_plugins.sweep.run_status import read_records, standings
 
 #: A node that is gone is missed within a second or two, not in the fifteen of Ray's defaults.
 SOON = {

@@ -8,11 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from crossgrad_backbones.anchors.activation import Seen
-from crossgrad_backbones.anchors.heads import COVARIANCE, Heads
+from crossgrad_backbones.anchors.heads import COVARIANCE, Heads, Seen
 from crossgrad_core.numerics.elementwise import sigmoid
-from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
-from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, SH_C0
 from crossgrad_core.plugin import Camera, Gaussians
 
 #: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).

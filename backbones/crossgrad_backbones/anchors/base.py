@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_backbones.anchors import appearance
-from crossgrad_backbones.anchors.activation import Seen
+from crossgrad_backbones.anchors import options
 from crossgrad_backbones.anchors.baking import BAKED_CAMERAS, baked, evenly
 from crossgrad_backbones.anchors.decode import decoded
+from crossgrad_backbones.anchors.heads import Seen
 from crossgrad_backbones.anchors.options import AnchorOptions
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.plugin import (
@@ -172,7 +172,7 @@ class AnchorBackbone(AnchorOptions):
             tensors |= network.created(rng)
         if self.appearance:
             codes = rng.standard_normal((len(scene.train), self.appearance)).astype(np.float32)
-            tensors |= appearance.created_codes(scene, torch.from_numpy(codes))
+            tensors |= options.created_codes(scene, torch.from_numpy(codes))
         trained = {name for block in self.trained_blocks() for name in block.tensors}
         return {name: tensor.requires_grad_(name in trained) for name, tensor in tensors.items()}
 
@@ -226,8 +226,8 @@ class AnchorBackbone(AnchorOptions):
     ) -> Tensor | None:
         if not self.appearance:
             return None
-        codes, poses = parameters[appearance.CODES], parameters[appearance.POSES]
-        return appearance.code_of(codes, poses, camera, training=training)
+        codes, poses = parameters[options.CODES], parameters[options.POSES]
+        return options.code_of(codes, poses, camera, training=training)
 
     @override
     def bake(

@@ -10,12 +10,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_backbones.anchors.activation import Seen, activated
-from crossgrad_backbones.anchors.fused_decode.data import Inputs, Kept, Layer, View
-from crossgrad_backbones.anchors.fused_decode.forward import STRETCH, array, forward, stretches
-from crossgrad_backbones.anchors.heads import Heads
-from crossgrad_backbones.anchors.numba_kernels import activation, layers
-from crossgrad_backbones.anchors.panels import product
+from crossgrad_backbones.anchors.fused_decode import (
+    STRETCH,
+    Inputs,
+    Kept,
+    Layer,
+    View,
+    array,
+    forward,
+    stretches,
+)
+from crossgrad_backbones.anchors.heads import Heads, Seen, activated, product
+from crossgrad_backbones.anchors.numba_kernels import networks
+from crossgrad_backbones.anchors.numba_kernels import networks as layers
 from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
@@ -120,13 +127,13 @@ def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
     shared = (rows, kept.starts, kept.slot, kept.spreads, kept.shares, scales)
     arrays = (*shared, array(by_log_scales), array(back.raw))
     if by_offsets is None:
-        fill = partial(_call, activation.scatter_scales, arrays)
+        fill = partial(_call, networks.scatter_scales, arrays)
     else:
         factor = inputs.view.factor
         factors = torch.ones(len(rows)) if factor is None else factor
         read = (array(kept.tanhs), array(factors), array(inputs.offsets), kept.colors)
         more = (*read, means, quats, opacities, colors, array(by_offsets))
-        fill = partial(_call, activation.scatter, (*arrays, *more))
+        fill = partial(_call, networks.scatter, (*arrays, *more))
     back.sweep(inputs, kept, fill)
     return (back.features, by_offsets, by_log_scales, *back.first, *back.by_second(inputs))
 

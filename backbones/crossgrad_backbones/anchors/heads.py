@@ -1,21 +1,33 @@
-"""The networks that give the Gaussians of the anchors that a camera sees."""
+"""The networks that give the Gaussians of the anchors that a camera sees, in plain torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
 from torch.nn.functional import linear, pad
+from typing_extensions import override
 
-from crossgrad_backbones.anchors import panels
-from crossgrad_core.plugin import Block, BlockKind, LearningRate, Parameters
+from crossgrad_core.numerics.elementwise import sigmoid
+from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Parameters
 
 #: Width of the direction from the camera to the anchor.
 DIRECTION = 3
 #: Places of the two linear layers; the ReLU between them is number 1.
 LAYERS = (0, 2)
+#: Strides at which the feature bank reads the feature, from coarse to fine.
+BANK_STRIDES = (4, 2, 1)
+#: Numbers of a Gaussian's covariance: 3 scales and a quaternion wxyz.
+COVARIANCE = 7
+_CHANNELS = 3
+#: Rows that are summed in one go.
+PANEL = 256
 
 
 @dataclass(frozen=True)
@@ -59,13 +71,6 @@ class Network:
         """Weight and bias of the first layer, then of the second."""
         first, first_bias, second, second_bias = (parameters[name] for name in self.tensors)
         return first, first_bias, second, second_bias
-
-
-#: Strides at which the feature bank reads the feature, from coarse to fine.
-BANK_STRIDES = (4, 2, 1)
-#: Numbers of a Gaussian's covariance: 3 scales and a quaternion wxyz.
-COVARIANCE = 7
-_CHANNELS = 3
 
 
 @dataclass(frozen=True)
@@ -129,8 +134,8 @@ class Heads:
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
         """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
-        hidden = panels.linear(views, first, first_bias).relu()
-        shares = torch.softmax(panels.linear(hidden, second, second_bias), 1)
+        hidden = linear(views, first, first_bias).relu()
+        shares = torch.softmax(linear(hidden, second, second_bias), 1)
         width = features.shape[1]
         read = [features[:, ::stride].repeat(1, stride)[:, :width] for stride in BANK_STRIDES]
         return shares[:, :1] * read[0] + shares[:, 1:2] * read[1] + shares[:, 2:] * read[2]
@@ -185,3 +190,90 @@ class Heads:
         parts = torch.split(hidden, self.feature, 1)
         layers = self.second_layers(parameters)
         return Raw(*(linear(part, *layer) for part, layer in zip(parts, layers, strict=True)))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The anchors that a view decodes.
+
+    Attributes:
+        rows: [A] int64, their rows, each once.
+        factor: [A] in [0, 1], what multiplies the opacities of each; None: 1.
+    """
+
+    rows: Tensor
+    factor: Tensor | None = None
+
+
+def activated(
+    raw: Raw, positions: Tensor, offsets: Tensor, log_scales: Tensor, seen: Seen
+) -> Gaussians:
+    """The Gaussians whose opacity is positive, anchor by anchor, slot by slot.
+
+    Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a), the opacity tanh(raw), the scales
+    exp(l2_a) sigmoid(raw) and the colour sigmoid(raw). Quaternions keep their length, which no
+    rasterizer depends on.
+
+    Args:
+        raw: Outputs for A anchors of k Gaussians.
+        positions: [P, 3] of all anchors.
+        offsets: [P, k, 3] of all anchors.
+        log_scales: [P, 6] of all anchors: l1, then l2.
+        seen: Which anchors the outputs are for.
+
+    Returns:
+        Gaussians with `colors`, `origin` and `slot`.
+
+    Source: Scaffold-GS, section 3.2; methods of section 2.2.
+    """
+    opacities = torch.tanh(raw.opacities)  # [A, k]
+    if seen.factor is not None:
+        opacities = opacities * seen.factor[:, None]
+    anchor, slot = (opacities.detach() > 0).nonzero().unbind(1)
+    origin = seen.rows[anchor]
+    stretch, size = torch.split(torch.exp(log_scales[origin]), 3, 1)
+    slots = opacities.shape[1]
+    covariances = raw.covariances.view(-1, slots, COVARIANCE)[anchor, slot]
+    colors = raw.colors.view(-1, slots, 3)[anchor, slot]
+    return Gaussians(
+        means=positions[origin] + offsets[origin, slot] * stretch,
+        quats=covariances[:, 3:],
+        scales=size * sigmoid(covariances[:, :3]),
+        opacities=opacities[anchor, slot],
+        colors=sigmoid(colors),
+        origin=origin,
+        slot=slot,
+    )
+
+
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """[a, b] left [n, a] transposed times right [n, b], n a multiple of `PANEL`.
+
+    Panel by panel: the libraries split one long sum over as many threads as there are, which would
+    let the bits depend on their number.
+    """
+    first, second = (torch.unflatten(each, 0, (-1, PANEL)) for each in (left, right))
+    return torch.bmm(first.transpose(1, 2), second).sum(0)
+
+
+def panel_linear(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """[n, b] inputs [n, a] times weight [b, a] transposed, plus bias [b]; differentiable once."""
+    outputs: Tensor = _Linear.apply(inputs, weight, bias)  # type: ignore[no-untyped-call]
+    return outputs
+
+
+class _Linear(Function):
+    @staticmethod
+    @override
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(inputs, weight)
+        return functional.linear(inputs, weight, bias)
+
+    @staticmethod
+    @override
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        inputs, weight = ctx.saved_tensors
+        padding = (0, 0, 0, -len(inputs) % PANEL)
+        padded = (functional.pad(each, padding) for each in (given, inputs))
+        return given @ weight, product(*padded), given.sum(0)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from crossgrad_core.contract.exporter import Exporter
+from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import evaluate as measured

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.contract.exporter import Exporter
 from crossgrad_core.contract.scene import INPUT, check_coordinates
+from crossgrad_core.contract.slots.exporter import Exporter
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, find
 from crossgrad_core.run.export import Exported, described, export_scene, georef_of

@@ -6,8 +6,8 @@ from typing import Any, Final, cast
 
 from crossgrad_core.config import CHANGEABLE
 from crossgrad_core.contract.blocks import Json
-from crossgrad_core.run.config_version import NOTES
 from crossgrad_core.run.results.config_file import FILE as CONFIG
+from crossgrad_core.run.results.config_file import NOTES
 from crossgrad_core.run.results.metrics_csv import FILE as METRICS
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file

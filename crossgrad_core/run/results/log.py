@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import EvaluationReport, RunInfo, StepRecord
-from crossgrad_core.contract.markers import hookimpl
-from crossgrad_core.recipe.lines import full_lines
+from crossgrad_core.recipe.table import full_lines
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
 

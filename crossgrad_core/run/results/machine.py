@@ -11,8 +11,8 @@ from time import perf_counter, thread_time
 import numpy as np
 
 from crossgrad_core.contract.blocks import Json
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import StepRecord
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.system.version import VERSION
 
 #: Seconds between two looks at the load.

@@ -10,8 +10,7 @@ from crossgrad_core.contract.figure import Figure
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics
 from crossgrad_core.system.files import disk_errors, write_atomically
-from crossgrad_core.system.tables import as_cell, csv_bytes
-from crossgrad_core.system.text_files import parse_number, read_rows
+from crossgrad_core.system.text_files import as_cell, csv_bytes, parse_number, read_rows
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from pydantic import ValidationError
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.results.reading import SCENE as FILE
-from crossgrad_core.scene.differences import Weight, differences
-from crossgrad_core.scene.fingerprint import Fingerprint
+from crossgrad_core.scene.fingerprint import Fingerprint, Weight, differences
 from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file

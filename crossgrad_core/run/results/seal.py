@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from crossgrad_core.run.checkpoint.checkpoint import CHECKPOINTS
+from crossgrad_core.run.checkpoint import CHECKPOINTS
 from crossgrad_core.run.results.lock import FILE as LOCK
 from crossgrad_core.run.results.log import FILE as LOG
 from crossgrad_core.run.results.sources import FILE as SOURCES

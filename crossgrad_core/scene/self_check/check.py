@@ -16,9 +16,8 @@ from crossgrad_core.contract.blocks import Json
 from crossgrad_core.contract.scene import Scene
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.frame import camera_centers
-from crossgrad_core.scene.photo_check import fits
-from crossgrad_core.scene.self_check.evidence import Pixels, pixels_of
-from crossgrad_core.scene.self_check.rig import Floats, Integers
+from crossgrad_core.scene.photos.photos_ahead import fits
+from crossgrad_core.scene.self_check.evidence import Floats, Integers, Pixels, pixels_of
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 

@@ -1,20 +1,19 @@
-"""The cause of a disagreement, found by trial."""
+"""The cause of a disagreement: the change that repairs the scene when it is tried."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from itertools import permutations, product
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from crossgrad_core.scene.self_check.evidence import FEWEST, Agreement, Evidence
-from crossgrad_core.scene.self_check.rig import Floats, Integers, Rig
-from crossgrad_core.scene.self_check.trials import (
-    Search,
-    Trial,
-    likely,
-    other_axes,
-    probes,
-    searches,
+from crossgrad_core.scene.self_check.evidence import (
+    FEWEST,
+    Agreement,
+    Evidence,
+    Floats,
+    Integers,
+    Rig,
 )
 
 #: Cameras that trials are made with.
@@ -30,6 +29,40 @@ _ROUNDS: Final = 4
 #: How well the photos of a scene agree at least, and what a change that repairs a scene gains.
 LEAST: Final = 0.35
 GAINED: Final = 0.25
+Change: TypeAlias = Callable[[Rig], Rig]
+_POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down, z forward)"
+_PHOTOS: Final = "put the photos back as they were when the poses were estimated"
+_FLIP: Final = np.diag([1.0, -1.0, -1.0])
+_AXES: Final = "xyz"
+#: Steps of a factor's logarithm; steps and reach of the principal point, shares of the photo.
+_FACTOR: Final = 0.04
+_OFF: Final = 0.05
+_MOST_OFF: Final = 0.5
+#: Turns and mirrorings of a photo around its middle.
+_TURNS: Final = (
+    ("the photos are mirrored left to right", [[-1.0, 0.0], [0.0, 1.0]]),
+    ("the photos are mirrored top to bottom", [[1.0, 0.0], [0.0, -1.0]]),
+    ("the photos are rotated by 180 degrees", [[-1.0, 0.0], [0.0, -1.0]]),
+    ("the photos are rotated by 90 degrees", [[0.0, -1.0], [1.0, 0.0]]),
+    ("the photos are rotated by 270 degrees", [[0.0, 1.0], [-1.0, 0.0]]),
+    ("rows and columns of the photos are exchanged", [[0.0, 1.0], [1.0, 0.0]]),
+    ("the photos are rotated by 90 degrees and mirrored", [[0.0, -1.0], [-1.0, 0.0]]),
+)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A change of a rig.
+
+    Attributes:
+        cause: What is wrong with the scene if the change repairs it.
+        todo: What the user can do about it.
+        change: The change.
+    """
+
+    cause: str
+    todo: str
+    change: Change
 
 
 @dataclass(frozen=True)
@@ -64,6 +97,21 @@ def some(cameras: Integers, most: int = MOST_CAMERAS) -> Integers:
     """At most so many cameras, evenly spread."""
     every = np.linspace(0, len(cameras) - 1, min(len(cameras), most))
     return cameras[every.round().astype(np.int64)]
+
+
+@dataclass(frozen=True)
+class Search:
+    """A change with one number or two that are looked for.
+
+    Attributes:
+        values: [N, D] the numbers that are tried first.
+        step: Their distance from each other.
+        trial: The trial of D numbers.
+    """
+
+    values: Floats
+    step: float
+    trial: Callable[[Floats], Trial]
 
 
 class Bench:
@@ -121,3 +169,214 @@ class Bench:
 
 def _better(found: Diagnosis, score: float, trial: Trial) -> Diagnosis:
     return Diagnosis(found.before, score, trial) if score > found.after + _CLEARLY else found
+
+
+def turns() -> Iterator[Trial]:
+    """Photos that are mirrored or rotated."""
+    for cause, matrix in _TURNS:
+        yield Trial(cause, _PHOTOS, _turned(np.array(matrix)))
+
+
+def likely() -> Iterator[Trial]:
+    """Common mistakes."""
+    yield Trial(
+        "the poses have OpenGL axes (y up, z backward)",
+        f"{_POSES}: negate the second and third row of each world-to-camera matrix",
+        _with_axes(_FLIP),
+    )
+    yield from _inverted()
+    yield from turns()
+    yield Trial(
+        "the principal point is not where the model puts it; the middle of the photos fits",
+        "set the principal point (cx, cy) of the cameras to half of their width and height",
+        lambda rig: replace(rig, principal=rig.sizes / 2.0),
+    )
+    yield Trial(
+        "the coordinates of the principal point are exchanged",
+        "exchange cx and cy of the cameras",
+        lambda rig: replace(rig, principal=rig.principal[:, ::-1]),
+    )
+    yield Trial(
+        "the focal lengths fx and fy are exchanged",
+        "exchange fx and fy of the cameras",
+        lambda rig: replace(rig, focal=rig.focal[:, ::-1]),
+    )
+    yield from _shifted()
+
+
+def other_axes() -> Iterator[Trial]:
+    """All other axes of points and of cameras."""
+    for matrix, text in _signed_axes():
+        yield Trial(
+            f"the points have other axes than the poses: ({text}) of the points fit",
+            "write points and poses in the same axes: export both from one program again",
+            _with_points(matrix),
+        )
+    for matrix, text in _signed_axes():
+        yield Trial(
+            f"the cameras have other axes: ({text}) of each camera fit", _POSES, _with_axes(matrix)
+        )
+
+
+def searches() -> Iterator[Search]:
+    """All changes with numbers: factors by their logarithm, then shares of width and height."""
+    for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
+        steps = np.arange(-np.log(most), np.log(most), _FACTOR)
+        yield Search(steps[:, None], _FACTOR, _by_logarithm(make))
+    shares = np.arange(-_MOST_OFF, _MOST_OFF + _OFF, _OFF)
+    places = np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
+    yield Search(places, _OFF, lambda value: _offset(value[0], value[1]))
+
+
+def probes() -> Iterator[Trial]:
+    """Small changes of what is known as numbers: a right scene agrees best as it is."""
+    for make in (_focal, _scaled):
+        yield from (make(value) for value in (0.93, 1.07))
+    for value in (-0.04, 0.04):
+        yield _offset(value, 0.0)
+        yield _offset(0.0, value)
+
+
+def _by_logarithm(make: Callable[[float], Trial]) -> Callable[[Floats], Trial]:
+    return lambda value: make(float(np.exp(value[0])))
+
+
+def _turned(matrix: Floats) -> Change:
+    return lambda rig: replace(rig, turn=matrix)
+
+
+def _with_axes(matrix: Floats) -> Change:
+    return lambda rig: replace(
+        rig, rotations=matrix @ rig.rotations, translations=rig.translations @ matrix.T
+    )
+
+
+def _with_points(matrix: Floats) -> Change:
+    return lambda rig: replace(rig, points=rig.points @ matrix.T)
+
+
+def _signed_axes() -> Iterator[tuple[Floats, str]]:
+    """All ways to exchange and to negate axes but that which leaves them, with a name."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            names = (f"{'-' if s < 0 else ''}{_AXES[i]}" for i, s in zip(order, signs, strict=True))
+            if not np.array_equal(matrix, np.eye(3)):
+                yield matrix, ", ".join(names)
+
+
+def _inverted() -> Iterator[Trial]:
+    """Poses that are inverse, or of which a part is."""
+    cause = "the poses are camera-to-world where world-to-camera is expected"
+    todo = "invert the 4 x 4 matrix of each pose in the model"
+    for own, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
+        for world in (np.eye(3), _FLIP):
+            yield Trial(f"{cause}{text}", todo, _inverse(own, world))
+    yield Trial(
+        "the rotations of the poses are camera-to-world where world-to-camera is expected",
+        "transpose the rotation of each pose in the model",
+        lambda rig: replace(rig, rotations=rig.rotations.transpose(0, 2, 1)),
+    )
+    yield Trial(
+        "the rotations of the poses are inverse, their camera centres are right",
+        "transpose the rotation of each pose in the model and keep the camera centre",
+        lambda rig: _placed(rig, rig.rotations.transpose(0, 2, 1), rig.centers),
+    )
+    yield Trial(
+        "the positions of the poses are camera centres where translations are expected",
+        "write the translation -R C of each pose instead of its centre C",
+        lambda rig: _placed(rig, rig.rotations, rig.translations),
+    )
+    yield Trial(
+        "the positions of the poses are translations where camera centres are expected",
+        "write the centre C = -R^T t of each pose instead of its translation t",
+        lambda rig: replace(rig, translations=rig.centers),
+    )
+    for order, text in (((3, 0, 1, 2), "(x, y, z, w)"), ((1, 2, 3, 0), "(w, x, y, z)")):
+        yield Trial(
+            f"the quaternions of the poses are in another order: {text} fits",
+            "write the quaternions of the poses in the order that the format asks for",
+            _reordered(order),
+        )
+
+
+def _inverse(own: Floats, world: Floats) -> Change:
+    def change(rig: Rig) -> Rig:
+        rotations = (own @ rig.rotations).transpose(0, 2, 1)
+        translations = -np.einsum("vij,vj->vi", rotations, rig.translations @ own.T)
+        rig = replace(rig, rotations=rotations, translations=translations)
+        return _with_axes(world)(rig)
+
+    return change
+
+
+def _placed(rig: Rig, rotations: Floats, centers: Floats) -> Rig:
+    translations = -np.einsum("vij,vj->vi", rotations, centers)
+    return replace(rig, rotations=rotations, translations=translations)
+
+
+def _reordered(order: tuple[int, ...]) -> Change:
+    """The rotations of the quaternions (w, x, y, z) whose numbers are taken in another order."""
+
+    def change(rig: Rig) -> Rig:
+        from scipy.spatial.transform import Rotation
+
+        quaternions = Rotation.from_matrix(rig.rotations).as_quat()[:, [3, 0, 1, 2]]
+        w, x, y, z = quaternions[:, list(order)].T
+        rotations = Rotation.from_quat(np.column_stack([x, y, z, w])).as_matrix()
+        return replace(rig, rotations=rotations)
+
+    return change
+
+
+def _shifted() -> Iterator[Trial]:
+    for shift in (1, -1, 2, -2):
+        yield Trial(
+            f"the photos are shifted by {abs(shift)} against the poses: each photo fits the pose "
+            f"of the photo {abs(shift)} place{'s' * (abs(shift) > 1)} "
+            f"{'before' if shift > 0 else 'after'} it",
+            "name the photos as the model does: one may be missing, or counting starts at 1 "
+            "instead of 0",
+            _next(shift),
+        )
+
+
+def _next(shift: int) -> Change:
+    return lambda rig: replace(rig, photos=(rig.photos + shift) % rig.count)
+
+
+def _focal(factor: float) -> Trial:
+    return Trial(
+        f"the focal length is wrong: {factor:.3g} times the given one fits",
+        "correct the focal length of the cameras; it is in pixels of the photos that the model "
+        "was made from",
+        lambda rig: replace(rig, focal=rig.focal * factor),
+    )
+
+
+def _scaled(factor: float) -> Trial:
+    return Trial(
+        f"points and poses have different units: {factor:.3g} times the points fit",
+        "write points and camera positions in the same units",
+        # The same picture as of scaled points, and each camera may have its own factor.
+        lambda rig: replace(rig, translations=rig.translations / factor),
+    )
+
+
+def _resized(factor: float) -> Trial:
+    return Trial(
+        f"the calibration is of photos of another size: {factor:.3g} times its focal length and "
+        "principal point fit",
+        "correct width, height, focal length and principal point of the cameras together",
+        lambda rig: replace(rig, focal=rig.focal * factor, principal=rig.principal * factor),
+    )
+
+
+def _offset(across: float, down: float) -> Trial:
+    return Trial(
+        f"the principal point is wrong: {across:+.1%} of the photos' width and {down:+.1%} of "
+        "their height away fits",
+        "correct the principal point of the cameras; if the photos were cropped, move it with them",
+        lambda rig: replace(rig, principal=rig.principal + rig.sizes * [across, down]),
+    )

@@ -8,18 +8,27 @@ from typing import Final
 import numpy as np
 
 from crossgrad_core.contract.scene import Scene
-from crossgrad_core.scene.self_check.diagnosis import LEAST, Bench, Diagnosis, scores, some
+from crossgrad_core.scene.self_check.diagnosis import (
+    LEAST,
+    Bench,
+    Diagnosis,
+    Trial,
+    likely,
+    scores,
+    some,
+    turns,
+)
 from crossgrad_core.scene.self_check.evidence import (
     FEWEST,
     Agreement,
     Booleans,
     Evidence,
+    Floats,
+    Integers,
     Pixels,
     observed,
     tested,
 )
-from crossgrad_core.scene.self_check.rig import Floats, Integers
-from crossgrad_core.scene.self_check.trials import Trial, likely, turns
 
 #: The scene disagrees as a whole if more of its photos disagree.
 _MOST_BAD: Final = 0.6

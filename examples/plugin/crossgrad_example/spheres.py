@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.raster_constants import SH_C0
 from crossgrad_core.plugin import (
     Backbone,
     Block,

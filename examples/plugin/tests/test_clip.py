@@ -7,7 +7,7 @@ from crossgrad_example.equal_length import EqualLength
 
 from crossgrad_core.contract.contexts import AggregateResult
 from crossgrad_core.registry.manager import call_first_result, make_manager
-from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
+from crossgrad_core.testing.support.aggregation import aggregate_context, sample_gradients
 
 
 def answered(max_norm: float) -> AggregateResult:

@@ -171,7 +171,7 @@ def _rows(names: Sequence[str], dtypes: Types, rows: str, csv: Path | None) -> b
 
 
 def _table(cells: "list[Cell]", csv: Path | None) -> bool:
-    from crossgrad_operators.stress.table import as_text, failed, write_csv
+    from crossgrad_operators.stress.suite import as_text, failed, write_csv
 
     typer.echo(as_text(cells))
     if csv is not None:

@@ -1,4 +1,7 @@
-"""Exact Gramians and norms as 50-digit numbers (mpmath, a test dependency)."""
+"""Exact Gramians and norms as 50-digit numbers, and small linear algebra on them.
+
+The numbers are those of mpmath, a test dependency.
+"""
 
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -6,16 +9,19 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from crossgrad_core.plugin import UserError
-from crossgrad_operators.stress.case import Case, Rows
+from crossgrad_operators.stress.cases import Case, Rows
 
 #: A 50-digit number; mpmath carries no types.
 Number: TypeAlias = Any
 Matrix: TypeAlias = list[list[Number]]
-
 DIGITS = 50
-
 #: Binary digits that products of float64 numbers span: a sum of that precision is exact.
 _RANGE = 4300
+Vector = list[Number]
+#: Relative size of a pivot that counts as zero; exact singularity shows at about 1e-50.
+SINGULAR = "1e-35"
+#: A multiple of a direction that is not reached before some entry meets zero.
+FAR = 10**30
 
 
 def require_mpmath() -> Any:  # noqa: ANN401 - untyped
@@ -76,3 +82,116 @@ def _dot(a: Rows, b: Rows) -> Number:
     with mp.workprec(_RANGE):
         total = mp.fdot(zip(a.tolist(), b.tolist(), strict=True))
     return +total
+
+
+def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
+    """a.b."""
+    return require_mpmath().mp.fdot(zip(a, b, strict=True))
+
+
+def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
+    """M x."""
+    return [dot(row, x) for row in matrix]
+
+
+def form(matrix: Matrix, x: Sequence[Number]) -> Number:
+    """The quadratic form x^T M x."""
+    return dot(x, apply(matrix, x))
+
+
+def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
+    """Solution x of (M x)_S = right_S, zero outside the support S; None where M_SS is singular.
+
+    M is positive semi-definite. The solution is that of Cholesky's method, L D L^T = M_SS.
+    """
+    mp = require_mpmath().mp
+    # In units of the diagonal, so that no ratio of norms looks singular.
+    unit = [mp.sqrt(matrix[i][i]) for i in support]
+    lower: list[Vector] = []
+    diagonal: Vector = []
+    y: Vector = []
+    for i, row in enumerate(support):
+        scaled: Vector = []
+        for j in range(i):
+            entry = matrix[row][support[j]] / unit[i] / unit[j]
+            scaled.append(entry - dot(scaled, lower[j]))
+        lower.append([value / pivot for value, pivot in zip(scaled, diagonal, strict=True)])
+        pivot = 1 - dot(scaled, lower[i])
+        if pivot <= mp.mpf(SINGULAR):
+            return None
+        diagonal.append(pivot)
+        y.append(right[row] / unit[i] - dot(lower[i], y))
+    x = [mp.mpf(0)] * len(matrix)
+    solved: Vector = []
+    for i in reversed(range(len(support))):
+        later = [lower[k][i] for k in range(len(support) - 1, i, -1)]
+        solved.append(y[i] / diagonal[i] - dot(later, solved))
+        x[support[i]] = solved[-1] / unit[i]
+    return x
+
+
+def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
+    """Solution x >= 0 with s = M x + offset >= 0 and x.s = 0: the optimality conditions of a QP.
+
+    Lawson and Hanson's algorithm, whose every result is checked: of the constraints that are not
+    met the worst becomes active, which it can do only if its column does not depend on the active
+    ones, or else one of them leaves; so M may be singular. None where there is no solution.
+    """
+    mp = require_mpmath().mp
+    x = [mp.mpf(0)] * len(matrix)
+    active: set[int] = set()
+    for _ in range(10 * len(matrix)):
+        slack = [m + o for m, o in zip(apply(matrix, x), offset, strict=True)]
+        tolerance = mp.mpf(SINGULAR) * max(1, *x)
+        waiting = [i for i in range(len(matrix)) if i not in active]
+        worst = min(waiting, key=lambda i: slack[i], default=None)
+        if worst is None or slack[worst] >= -tolerance:
+            met = all(abs(slack[i]) <= tolerance for i in active)
+            return x if met else None
+        active.add(worst)
+        if not _settle(matrix, offset, x, active, worst):
+            return None
+    return None
+
+
+def _settle(
+    matrix: Matrix, offset: Sequence[Number], x: list[Number], active: set[int], entered: int
+) -> bool:
+    """Solves for the active entries of x; those that meet zero on the way are let go."""
+    least = require_mpmath().mp.mpf("1e-300")
+    while active:
+        target = solve(matrix, sorted(active), [-o for o in offset])
+        if target is None:
+            # The new column depends on the others: along that dependence nothing but x changes.
+            rest = sorted(active - {entered})
+            along = solve(matrix, rest, [-row[entered] for row in matrix])
+            if along is None or all(v >= 0 for v in along):
+                return False
+            target = [x[i] + FAR * along[i] for i in range(len(x))]
+            target[entered] = x[entered] + FAR
+            target = [v if i in active else x[i] for i, v in enumerate(target)]
+        falling = {i: x[i] / max(x[i] - target[i], least) for i in active if target[i] <= 0}
+        share = min(falling.values(), default=1)
+        for i in active:
+            x[i] += share * (target[i] - x[i])
+        for i in [i for i, part in falling.items() if part == share]:
+            x[i] *= 0
+            active.remove(i)
+        if not falling:
+            return True
+    return True
+
+
+def pivots(matrix: Matrix) -> Vector:
+    """Pivots of the Cholesky factor of a positive semi-definite matrix, the largest first."""
+    left = [list(row) for row in matrix]
+    found = []
+    while left:
+        k = max(range(len(left)), key=lambda i: left[i][i])
+        pivot, column = left[k][k], left[k]
+        if pivot <= 0:
+            break
+        found.append(pivot)
+        kept = [i for i in range(len(left)) if i != k]
+        left = [[left[i][j] - column[i] * column[j] / pivot for j in kept] for i in kept]
+    return found

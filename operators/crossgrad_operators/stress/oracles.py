@@ -11,8 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from crossgrad_operators.stress.algebra import Vector, dot, form
-from crossgrad_operators.stress.exact import Matrix, Number, number, require_mpmath
+from crossgrad_operators.stress.exact import (
+    Matrix,
+    Number,
+    Vector,
+    dot,
+    form,
+    number,
+    require_mpmath,
+)
 
 #: 1 + cos up to which two directions are exactly opposite.
 OPPOSITE = "1e-12"

@@ -14,9 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_operators.stress.algebra import form, pivots
-from crossgrad_operators.stress.exact import Matrix, number
-from crossgrad_operators.stress.polyhedra import shortest
+from crossgrad_operators.stress.exact import Matrix, form, number, pivots
+from crossgrad_operators.stress.solvers import shortest
 
 #: Relative error that is promised inside the set, in units of u kappa.
 PROMISED: Final = 8.0

@@ -6,9 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from crossgrad_operators.stress import oracles, polyhedra, solvers
-from crossgrad_operators.stress.algebra import apply
-from crossgrad_operators.stress.exact import Matrix, Number, number, require_mpmath
+from crossgrad_operators.stress import oracles, solvers
+from crossgrad_operators.stress.exact import Matrix, Number, apply, number, require_mpmath
 from crossgrad_operators.stress.oracles import Oracle, Question, column_sums
 
 #: Operator name -> its oracle. Operators of other names are checked without one.
@@ -18,14 +17,14 @@ ORACLES: Final[Mapping[str, Oracle]] = {
     "symmetric": oracles.symmetric,
     "pcgrad": oracles.pcgrad,
     "gradvac": oracles.gradvac,
-    "cagrad": polyhedra.cagrad,
-    "mgda": polyhedra.mgda,
+    "cagrad": solvers.cagrad,
+    "mgda": solvers.mgda,
     "gradnorm": oracles.gradnorm,
     "imtl-g": solvers.imtl_g,
     "nash": solvers.nash,
     "aligned": solvers.aligned,
-    "upgrad": polyhedra.upgrad,
-    "dualproj": polyhedra.dualproj,
+    "upgrad": solvers.upgrad,
+    "dualproj": solvers.dualproj,
     "preconditioner": oracles.preconditioned,
     "confgate": oracles.confgate,
     "anchors": oracles.anchors,

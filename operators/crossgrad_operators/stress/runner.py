@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
     Operator,
     PluginState,
 )
-from crossgrad_operators.stress.case import Case
+from crossgrad_operators.stress.cases import Case
 from crossgrad_operators.stress.oracles import Oracle
 from crossgrad_operators.stress.promises import ALL, Promise
 from crossgrad_operators.stress.reference import Answer, Views, answer, usual_views

@@ -1,17 +1,19 @@
-"""The whole suite: every operator on every case, and every law."""
+"""The whole suite: every operator on every case, every law, and the results as text."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite, isnan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_core.commands import build
+from crossgrad_core.commands import build, write_table
 from crossgrad_core.commands import names as installed_names
 from crossgrad_core.plugin import EMPTY_STATE, Block, LearningRate, MatrixOperator, Operator
-from crossgrad_operators.stress.case import Case, short
+from crossgrad_operators.stress.cases import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.promises import PROMISED, Promise, promise_of
 from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chained, usual_views
@@ -21,6 +23,16 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 #: A law returns its error in units of u times the largest norm, or None where it does not apply.
 Law = Callable[[Operator], float | None]
 _UNIT = 2.0**-24
+#: Operators side by side in one part of the table.
+COLUMNS = 5
+_NAME, _CELL = 24, 16
+LEGEND = (
+    "Each cell: relative error in units of u kappa (8 is promised) and microseconds.\n"
+    "u: unit roundoff of the gradients' type; kappa = max |w_k| |g_k| / |u|, at least 1.\n"
+    "~ kappa u > 0.1, finite is all that is promised; * outside the operator's set\n"
+    "(docs/operators.md): finite and not too long; - K is refused; FAIL see below.\n"
+    "Without an error: no reference; finite, and the laws at the end hold."
+)
 
 
 def _rows(views: int) -> Case:
@@ -223,3 +235,76 @@ def reference_of(name: str, operator: Operator) -> Reference:
         return Reference(None, options, one_sign, promise_of(name))
     oracle = chained if name == "chain" else ORACLES.get(name)
     return Reference(oracle, options, promise=promise_of(name))
+
+
+def as_text(cells: Sequence[Cell]) -> str:
+    """The whole table, a line per operator, and what failed."""
+    names = list(dict.fromkeys(cell.operator for cell in cells))
+    parts = [
+        _part(cells, names[start : start + COLUMNS]) for start in range(0, len(names), COLUMNS)
+    ]
+    return "\n\n".join([*parts, LEGEND, _summary(cells, names), *_failures(cells)])
+
+
+def failed(cells: Sequence[Cell]) -> list[Cell]:
+    """The cells that break a promise."""
+    return [cell for cell in cells if cell.finding.verdict == "failed"]
+
+
+def write_csv(cells: Sequence[Cell], path: Path) -> None:
+    """One row per cell."""
+    rows: list[dict[str, str | int | float]] = [
+        {
+            "operator": cell.operator,
+            "case": cell.case,
+            "verdict": cell.finding.verdict,
+            "error_u_kappa": cell.finding.error,
+            "microseconds": cell.microseconds,
+            "reason": cell.finding.reason,
+        }
+        for cell in cells
+    ]
+    write_table(path, rows)
+
+
+def _part(cells: Sequence[Cell], names: Sequence[str]) -> str:
+    by_place = {(cell.case, cell.operator): cell for cell in cells}
+    lines = [" " * _NAME + "".join(f"{name:>{_CELL}}" for name in names)]
+    for case in dict.fromkeys(cell.case for cell in cells):
+        row = "".join(f"{_shown(by_place[case, name]):>{_CELL}}" for name in names)
+        lines.append(f"{case:<{_NAME}}{row}")
+    return "\n".join(lines)
+
+
+def _shown(cell: Cell) -> str:
+    time = "" if isnan(cell.microseconds) else f"{cell.microseconds:8.0f}"
+    if cell.finding.verdict == "refused":
+        return "-" + " " * 8
+    if cell.finding.verdict == "failed":
+        return "FAIL" + (time or " " * 8)
+    mark = {"undetermined": "~", "outside": "*"}.get(cell.finding.verdict, "")
+    error = f"{cell.finding.error:.2f}" if isfinite(cell.finding.error) else ""
+    return f"{mark}{error}{time or ' ' * 8}"
+
+
+def _summary(cells: Sequence[Cell], names: Sequence[str]) -> str:
+    lines = [f"{'operator':<{_NAME}}{'worst error':>12}  of {PROMISED:g}   in case"]
+    for name in names:
+        judged = [c for c in cells if c.operator == name and c.finding.verdict == "ok"]
+        worst = max(
+            (c for c in judged if isfinite(c.finding.error)),
+            key=lambda c: c.finding.error,
+            default=None,
+        )
+        if worst is not None:
+            lines.append(f"{name:<{_NAME}}{worst.finding.error:>12.3f}         {worst.case}")
+    return "\n".join(lines)
+
+
+def _failures(cells: Sequence[Cell]) -> list[str]:
+    wrong = failed(cells)
+    total = sum(cell.finding.verdict != "refused" for cell in cells)
+    if not wrong:
+        return [f"all {total} checks hold"]
+    lines = [f"{cell.operator}, {cell.case}: {cell.finding.reason}" for cell in wrong]
+    return ["\n".join([f"{len(wrong)} of {total} checks fail:", *lines])]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from crossgrad_operators.stress.case import Case, Rows
+from crossgrad_operators.stress.cases import Case, Rows
 from crossgrad_operators.stress.exact import (
     Matrix,
     exact_gramian,

@@ -97,7 +97,7 @@ class Combination(pytest.Item):
     @override
     def runtest(self) -> None:
         """Trains it."""
-        from crossgrad_core.testing.short_runs import try_out
+        from crossgrad_core.testing.support.short_runs import try_out
         from crossgrad_plugins.authoring.matrix.combinations import STEPS
 
         if self.make is None:

@@ -20,25 +20,24 @@ from crossgrad_core.commands import (
 from crossgrad_plugins.compare import narrative, tables
 from crossgrad_plugins.compare.comparison import Comparison, compared
 from crossgrad_plugins.compare.contrasts import Runs
-from crossgrad_plugins.compare.cost import COSTS
 from crossgrad_plugins.compare.figures.curves import (
     draw_curves,
     draw_frontier,
     draw_primitives,
+    draw_profile,
     draw_regimes,
 )
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases
-from crossgrad_plugins.compare.figures.profile import draw_profile
 from crossgrad_plugins.compare.figures.style import Drawn, looks, variables
 from crossgrad_plugins.compare.load_runs import check_places, read_runs
 from crossgrad_plugins.compare.narrative import where_text
 from crossgrad_plugins.compare.options import Options
 from crossgrad_plugins.compare.output import FIGURES, MARK, PAGE, check_free, write_files
 from crossgrad_plugins.compare.pictures import WorstView, with_pictures, worst_views
+from crossgrad_plugins.compare.quantity import COSTS
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.statistics.estimate import BOOTSTRAP_FROM
-from crossgrad_plugins.compare.statistics.verdict import UNCORRECTED
+from crossgrad_plugins.compare.statistics import BOOTSTRAP_FROM, UNCORRECTED
 from crossgrad_plugins.compare.tables import (
     TABLES,
     Table,

@@ -7,19 +7,20 @@ from functools import cached_property
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare import contrasts as pairwise
 from crossgrad_plugins.compare import frontier, ranking, targets
-from crossgrad_plugins.compare.arms import Arm, arms_of, renamed
-from crossgrad_plugins.compare.cells import Cells
-from crossgrad_plugins.compare.checks.machines import comparable_costs
-from crossgrad_plugins.compare.checks.metrics import quantities_of
-from crossgrad_plugins.compare.checks.scenes import check_scenes, differing_regimes
+from crossgrad_plugins.compare.arms import Arm, Cells, arms_of, renamed
+from crossgrad_plugins.compare.checks import (
+    check_scenes,
+    comparable_costs,
+    differing_regimes,
+    quantities_of,
+)
 from crossgrad_plugins.compare.contrasts import Contrast, Runs
-from crossgrad_plugins.compare.cost import Cost
-from crossgrad_plugins.compare.interpolate import is_inside, shared_amount, value_at
 from crossgrad_plugins.compare.load_runs import RunRecord
 from crossgrad_plugins.compare.options import Options
-from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.quantity import Cost, Quantity
 from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
+from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
 #: Where a contrast of the main table is taken.
 END = "at the end"

@@ -4,11 +4,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from crossgrad_plugins.compare.cells import Problem
+from crossgrad_plugins.compare.arms import Problem
 from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.statistics.estimate import Estimate, SceneEstimate, estimate
-from crossgrad_plugins.compare.statistics.verdict import Verdict, opposed, verdicts
+from crossgrad_plugins.compare.statistics import (
+    Estimate,
+    SceneEstimate,
+    Verdict,
+    estimate,
+    opposed,
+    verdicts,
+)
 
 #: A run -> its value; None where it has none.
 Reading: TypeAlias = Callable[[Run], float | None]

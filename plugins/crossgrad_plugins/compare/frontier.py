@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from crossgrad_plugins.compare.cells import Cells, Length
+from crossgrad_plugins.compare.arms import Cells, Length
 from crossgrad_plugins.compare.contrasts import Contrast, contrast, judged
-from crossgrad_plugins.compare.cost import Cost
-from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.quantity import Cost, Quantity
 from crossgrad_plugins.compare.ranking import standings
 
 

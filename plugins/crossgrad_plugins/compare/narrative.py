@@ -7,8 +7,8 @@ from math import inf, isinf, isnan
 from crossgrad_core.commands import count
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
-from crossgrad_plugins.compare.cost import COSTS
-from crossgrad_plugins.compare.statistics.verdict import Verdict
+from crossgrad_plugins.compare.quantity import COSTS
+from crossgrad_plugins.compare.statistics import Verdict
 
 _TITLES = {cost.name: cost.title for cost in COSTS}
 #: Of many arms, so many are named in one sentence.

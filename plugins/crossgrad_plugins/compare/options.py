@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crossgrad_core.commands import argument, option
-from crossgrad_plugins.compare.cost import ClockChoice
+from crossgrad_plugins.compare.quantity import ClockChoice
 
 _WHAT = "What is compared"
 _ARMS = "Arms"

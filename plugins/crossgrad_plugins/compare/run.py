@@ -1,21 +1,35 @@
-"""A finished run as the comparison sees it."""
+"""A finished run as the comparison sees it, and its settings that tell arms apart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.compare.cost import Cost
-from crossgrad_plugins.compare.settings import Settings, settings_of
+from crossgrad_plugins.compare.quantity import Cost
 
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunResults
 
+
 Array: TypeAlias = NDArray[np.float64]
+#: A value of a setting as text, such as `0.4`, `scaffold` or `pcgrad+soft`.
+Settings: TypeAlias = dict[str, str]
+#: The value of a setting that is not set.
+ABSENT: Final = "-"
+#: Where a run lies, how long it is, and what only watches it.
+_NO_ARM: Final = frozenset(
+    {
+        *("crossgrad", "scene", "seed", "out"),
+        *("steps", "max_views", "seconds", "revisions", "planned_seconds", "stop_after", "clock"),
+        *("eval_every", "eval_from", "save_every", "threads", "max_nonfinite_blocks"),
+        *("observers", "metrics", "exporter"),
+        *("data.cache_mib", "data.disk_mib", "data.masks"),
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +119,43 @@ class Run:
 def text_of(length: tuple[str, float]) -> str:
     """A length as text, such as `70 s`."""
     return f"{length[1]:,g} {length[0]}"
+
+
+def settings_of(config: Mapping[str, Any]) -> Settings:
+    """Setting -> value, of those that can make an arm.
+
+    A setting that is null is not set: its value is `-`. A component is `backbone` and its options
+    `backbone.sh_degree`; a chain of operators is `operator` with the names joined by `+`, and its
+    options `operator.1.c`.
+    """
+    return {
+        name: _text(value)
+        for name, value in _flat("", config)
+        if not _NO_ARM & {name, name.partition(".")[0]}
+    }
+
+
+def _flat(name: str, value: object) -> Iterator[tuple[str, object]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _flat(name if key == "name" and name else f"{name}.{key}".strip("."), inner)
+    elif isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
+        links = [each for each in value if isinstance(each, Mapping)]
+        yield name, "+".join(str(link.get("name")) for link in links)
+        for number, link in enumerate(links):
+            options = {key: inner for key, inner in link.items() if key != "name"}
+            yield from _flat(f"{name}.{number}", options)
+    else:
+        yield name, value
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ABSENT
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, list):
+        return ",".join(_text(each) for each in value)
+    return str(value)

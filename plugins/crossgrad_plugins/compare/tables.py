@@ -12,14 +12,13 @@ from crossgrad_core.commands import count
 from crossgrad_plugins.compare import narrative
 from crossgrad_plugins.compare.comparison import Comparison
 from crossgrad_plugins.compare.contrasts import Contrast
-from crossgrad_plugins.compare.cost import COSTS, Cost
 from crossgrad_plugins.compare.figures.panels import band
 from crossgrad_plugins.compare.figures.phases import phases_of
 from crossgrad_plugins.compare.narrative import interval_text, where_text
 from crossgrad_plugins.compare.pictures import WorstView
+from crossgrad_plugins.compare.quantity import COSTS, Cost
 from crossgrad_plugins.compare.run import Run
-from crossgrad_plugins.compare.statistics.estimate import Estimate
-from crossgrad_plugins.compare.statistics.verdict import UNCORRECTED, Verdict
+from crossgrad_plugins.compare.statistics import UNCORRECTED, Estimate, Verdict
 from crossgrad_plugins.compare.targets import Reached
 
 Row = dict[str, str | int | float]

@@ -6,8 +6,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, screen_statistics
-from crossgrad_plugins.densifiers.clone_split import Growth
-from crossgrad_plugins.densifiers.long_axis_split import AxisSplit
+from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
 
 class AdaptiveDensityControl(AxisSplit):

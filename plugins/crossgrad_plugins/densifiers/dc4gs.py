@@ -8,8 +8,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
-from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan
-from crossgrad_plugins.densifiers.long_axis_split import child_on_axis
+from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan, child_on_axis
 
 #: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5

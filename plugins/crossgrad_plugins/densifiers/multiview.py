@@ -23,9 +23,8 @@ from crossgrad_core.plugin import (
     screen_statistics,
 )
 from crossgrad_plugins.densifiers.absgrad import gradient_sums
-from crossgrad_plugins.densifiers.clone_split import Growth, Plan, edited_parameters
+from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth, Plan, edited_parameters
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
-from crossgrad_plugins.densifiers.long_axis_split import AxisSplit
 
 #: Shortest interval of edits, in views (the published one of the larger variant).
 SHORTEST_INTERVAL = 100

@@ -95,7 +95,7 @@ def diagnose(given: Given) -> None:
     announce()
     from crossgrad_core.commands import ComponentChoice
     from crossgrad_plugins.diagnostics import app
-    from crossgrad_plugins.diagnostics.command import Options
+    from crossgrad_plugins.diagnostics.app import Options
 
     options = Options(
         grouping=None if given.grouping is None else ComponentChoice(name=given.grouping),

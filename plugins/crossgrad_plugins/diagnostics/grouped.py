@@ -1,4 +1,4 @@
-"""A Gramian of gradients from two groups of cameras."""
+"""Two groups of cameras: Gramian, variance within and between, ratio of gradients."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,3 +112,85 @@ class GroupedGramian:
             near_along=along[:n],
             far_along=along[n:],
         )
+
+
+@dataclass(frozen=True)
+class GradientRatio:
+    """Ratio of gradient lengths, near over far; NaN where the far gradients are zero.
+
+    Attributes:
+        of_means: Mean length over near views / mean length over far views (the paper's R).
+        median: Median over pairs of one near and one far view of the ratio of their lengths, pairs
+            with a zero gradient left out.
+    """
+
+    of_means: float
+    median: float
+
+
+def gradient_ratio(squared: NDArray[np.float64], near: NDArray[np.bool_]) -> GradientRatio:
+    """The ratio of one block.
+
+    Args:
+        squared: [V] squared gradient lengths: the diagonal of the block's Gramian, or the sum of
+            the diagonals of several blocks for their concatenation.
+        near: [V], the views of the near group; the others are far.
+    """
+    lengths = np.sqrt(np.maximum(squared, 0.0))
+    far_mean = float(lengths[~near].mean())
+    of_means = float(lengths[near].mean()) / far_mean if far_mean > 0.0 else float("nan")
+    logs = np.log(lengths[near & (lengths > 0.0)])[:, None]
+    others = np.log(lengths[~near & (lengths > 0.0)])[None, :]
+    pairs = logs - others
+    median = float(np.exp(np.median(pairs))) if pairs.size else float("nan")
+    return GradientRatio(of_means, median)
+
+
+def geometric_mean(ratios: tuple[float, ...]) -> float:
+    """Geometric mean of positive ratios, for blocks whose units differ; NaN where one is not."""
+    if not all(ratio > 0.0 for ratio in ratios):
+        return float("nan")
+    return float(np.exp(np.mean(np.log(ratios))))
+
+
+@dataclass(frozen=True)
+class VarianceSplit:
+    """Unbiased estimates of the paper's variances; `between` may come out negative.
+
+    Attributes:
+        within: sigma_w^2, weighted mean over groups of E||g - group mean||^2.
+        between: sigma_b^2, product of the shares times ||near mean - far mean||^2.
+    """
+
+    within: float
+    between: float
+
+    @property
+    def ratio(self) -> float:
+        """sigma_b^2 / sigma_w^2; NaN where there is no variance within groups."""
+        return self.between / self.within if self.within > 0.0 else float("nan")
+
+
+def variance_split(gramian: NDArray[np.float64], groups: Groups) -> VarianceSplit:
+    """sigma_w^2 and sigma_b^2 from the Gramian [V, V] of one block.
+
+    The plain ||difference of means||^2 overestimates sigma_b^2 by the means' own noise, which is
+    taken off here; with one view per group nothing would be left but noise. Both figures are linear
+    in the Gramian: those of a sum over probes of the same views are the sums.
+
+    Source: the paper, Proposition 2; unbiased estimators of the variance of a mean, with the finite
+    population's correction where the views were drawn without replacement.
+    """
+    parts = GroupedGramian.of(gramian, groups)
+    within, between = split_of(parts, groups)
+    return VarianceSplit(parts.scale * within, parts.scale * between)
+
+
+def split_of(parts: GroupedGramian, groups: Groups) -> tuple[float, float]:
+    """(sigma_w^2, sigma_b^2) in units of `parts.scale`."""
+    (n, m), (p, q) = groups.sizes, groups.shares
+    spread_near = float(np.trace(parts.near)) / (n - 1)
+    spread_far = float(np.trace(parts.far)) / (m - 1)
+    within = p * spread_near * groups.divisors[0] + q * spread_far * groups.divisors[1]
+    noise = spread_near * groups.unseen[0] / n + spread_far * groups.unseen[1] / m
+    return within, p * q * (parts.gap - noise)

@@ -65,7 +65,7 @@ class Report:
             self._write_exposure(folder, self.exposure)
 
     def _write_exposure(self, folder: Path, exposure: SceneExposure) -> None:
-        from crossgrad_plugins.diagnostics.exposure_figure import draw_exposure
+        from crossgrad_plugins.diagnostics.figure import draw_exposure
 
         write_table(folder / EXPOSURE, exposure.rows)
         write_atomically(folder / EXPOSURE_PICTURE, draw_exposure(self.scene, exposure))

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from scipy.stats import t
 
 from crossgrad_plugins.diagnostics.distances import conflict_by_distance
-from crossgrad_plugins.diagnostics.grouped import Groups
-from crossgrad_plugins.diagnostics.intervals.interval import UNKNOWN, Interval
-from crossgrad_plugins.diagnostics.intervals.intervals import split_intervals
+from crossgrad_plugins.diagnostics.grouped import (
+    Groups,
+    geometric_mean,
+    gradient_ratio,
+    variance_split,
+)
+from crossgrad_plugins.diagnostics.intervals import UNKNOWN, Interval, split_intervals
 from crossgrad_plugins.diagnostics.plan import ProbePlan
 from crossgrad_plugins.diagnostics.probe import Measurement
-from crossgrad_plugins.diagnostics.ratios import geometric_mean, gradient_ratio
-from crossgrad_plugins.diagnostics.variance import variance_split
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,13 +18,16 @@ from crossgrad_core.plugin import (
     radial_distances,
 )
 from crossgrad_plugins.diagnostics.distances import relative_variance
-from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP, Groups
+from crossgrad_plugins.diagnostics.grouped import (
+    SMALLEST_GROUP,
+    Groups,
+    gradient_ratio,
+    variance_split,
+)
 from crossgrad_plugins.diagnostics.plan import ProbePlan, labelled, plan_probe
 from crossgrad_plugins.diagnostics.probe import Measurement, measure
-from crossgrad_plugins.diagnostics.ratios import gradient_ratio
 from crossgrad_plugins.diagnostics.report import Report
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
-from crossgrad_plugins.diagnostics.variance import variance_split
 from crossgrad_plugins.groupings.heights import altitudes, upward
 
 #: Groupings that the one probe is also read by (the paper's prediction P4).

@@ -7,8 +7,8 @@ from typing import ClassVar
 from typing_extensions import override
 
 from crossgrad_core.plugin import Exporter, Gaussians, Rounding, Similarity
-from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_format.file import (
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_file import (
     position_rounding,
     read_ply,
     sh_degree_of,

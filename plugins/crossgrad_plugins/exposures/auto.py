@@ -1,4 +1,4 @@
-"""A gain per photo where SfM tracks say that photos differ in exposure."""
+"""A gain per photo where SfM tracks say that photos differ in exposure, and no exposure."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,6 @@ from torch import Tensor
 from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, Fitted, Scene
-from crossgrad_plugins.exposures.none import NoExposure
 from crossgrad_plugins.exposures.tracks.gains import (
     LEAST_RATIO,
     LEAST_REDUCTION,
@@ -42,3 +41,26 @@ class Auto(Exposure):
     @override
     def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         return image
+
+
+class NoExposure(Exposure):
+    """Compares renders with photos as they are: all are taken to have the same exposure."""
+
+    @override
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return image
+
+    @override
+    def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
+        """Names the option that helps where SfM tracks say that photos differ in exposure."""
+        if not any(len(view.seen) for view in scene.train_views):
+            return ()
+        from crossgrad_plugins.exposures.tracks.gains import deciding_gains
+
+        try:
+            gains = deciding_gains(scene)
+        except Exception:
+            return ()
+        if not gains.differ:
+            return ()
+        return (f"the photos differ in exposure, which --exposure gain models: {gains.evidence}",)

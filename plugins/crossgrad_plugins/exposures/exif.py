@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 from crossgrad_core.plugin import Scene, UserError, View
-from crossgrad_core.scene.photos import FilePhoto
-from crossgrad_core.scene.pillow import opened
+from crossgrad_core.scene.photos.photos import FilePhoto
+from crossgrad_core.scene.photos.pillow import opened
 
 if TYPE_CHECKING:
     from PIL.Image import Image

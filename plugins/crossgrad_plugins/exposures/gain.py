@@ -1,4 +1,4 @@
-"""One gain per photo, in linear light."""
+"""Gains in linear light: one per photo, or one per photo and channel."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -39,3 +39,29 @@ class Gain(ExposurePerPhoto):
     @override
     def neutral(self) -> Tensor:
         return torch.zeros(())
+
+
+class ChannelGain(ExposurePerPhoto):
+    """As `gain`, with stops of its own for red, green and blue: exposure and white balance."""
+
+    parameter: ClassVar[str] = "stops"
+
+    @override
+    def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return with_gain(image, values[self.parameter])
+
+    @override
+    def of_stops(self, stops: Tensor) -> Tensor:
+        return stops[..., None].expand(*stops.shape, 3)
+
+    @override
+    def in_stops(self, values: Tensor) -> Tensor:
+        return values
+
+    @override
+    def beside(self, values: Tensor, stops: Tensor) -> Tensor:
+        return values + stops[:, None]
+
+    @override
+    def neutral(self) -> Tensor:
+        return torch.zeros(3)

@@ -11,8 +11,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Exposure, LearningRate, PerPhoto, Scene, Selection, View
 from crossgrad_plugins.exposures.exif import exposure_values
-from crossgrad_plugins.exposures.initial_values import Start, outliers, starts_of
-from crossgrad_plugins.exposures.neighbours import neighbours_of
+from crossgrad_plugins.exposures.initial_values import Start, neighbours_of, outliers, starts_of
 
 
 class ExposurePerPhoto(Exposure):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from crossgrad_core.numerics.spherical import COEFFICIENTS
+from crossgrad_core.numerics.raster_constants import COEFFICIENTS
 from crossgrad_core.plugin import INPUT, LOCAL, Gaussians, Json, Placed, Similarity
 from crossgrad_plugins.georeference.ellipsoid import Place
 from crossgrad_plugins.georeference.frames import SAME, Frame3D

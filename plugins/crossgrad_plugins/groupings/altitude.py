@@ -20,11 +20,12 @@ from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,
+    gap_threshold,
     halves,
+    otsu_threshold,
     require_groups,
     require_training_views,
 )
-from crossgrad_plugins.groupings.thresholds import gap_threshold, otsu_threshold
 
 
 class Altitude(Grouping):

@@ -20,7 +20,7 @@ from crossgrad_core.plugin import (
     centers_of,
     radial_distances,
 )
-from crossgrad_plugins.groupings.radial import Radial
+from crossgrad_plugins.groupings.distance import Radial
 from crossgrad_plugins.groupings.split import (
     FAR,
     NEAR,

@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
     View,
     radial_distances,
 )
-from crossgrad_plugins.groupings.radial import Radial
+from crossgrad_plugins.groupings.distance import Radial
 from crossgrad_plugins.groupings.split import FAR, NEAR, log_distances, require_training_views
 
 _VARIANCE_FLOOR = 1e-6

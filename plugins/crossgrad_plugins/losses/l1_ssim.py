@@ -9,8 +9,7 @@ from torch.autograd.function import once_differentiable
 from typing_extensions import override
 
 from crossgrad_core.plugin import Loss
-from crossgrad_plugins.losses.photometric.on_device import loss_and_gradient
-from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
+from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss, loss_and_gradient
 
 
 def photometric_loss(

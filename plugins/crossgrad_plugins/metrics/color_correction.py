@@ -1,11 +1,15 @@
-"""The render with its colours fitted to the photo: what is left once colour alone is forgiven."""
+"""PSNR and SSIM of the render after its colours were fitted to the photo."""
+
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import override
 
-from crossgrad_core.plugin import Compared
+from crossgrad_core.plugin import Compared, Figure, Metric, psnr
+from crossgrad_plugins.metrics.ssim import ssim
 
 #: What stands in summary.json with every colour-corrected figure.
 DEFINITION = (
@@ -13,16 +17,42 @@ DEFINITION = (
     "to the photo of the view by least squares over the pixels that count; "
     "clamped and rounded to 8 bits again"
 )
-
 #: Directions of colour in which a render varies less than this, relative to the widest, are fitted
 #: as if it did not vary in them: a grey render has two such directions, but for rounding.
 _FLAT = 1e-10
-
 #: Pixels that are worked on at once: what is made of them stays in the cache.
 _AT_ONCE = 2**15
-
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
+
+
+class ColorCorrectedPSNR(Metric):
+    """PSNR of the render whose colours are fitted to the photo, which it therefore looks at.
+
+    Beside `psnr` it tells errors of brightness and white balance from errors of the scene.
+    """
+
+    figure: ClassVar[Figure] = Figure(
+        name="psnr_cc", label="PSNR (cc)", form=".2f", definition=f"dB; PSNR {DEFINITION}"
+    )
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        corrected = color_corrected(compared)
+        return None if corrected is None else psnr(corrected, compared.photo, compared.mask)
+
+
+class ColorCorrectedSSIM(Metric):
+    """SSIM (3DGS form) of the render whose colours are fitted to the photo."""
+
+    figure: ClassVar[Figure] = Figure(
+        name="ssim_cc", label="SSIM (cc)", definition=f"SSIM (3DGS form) {DEFINITION}"
+    )
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        corrected = color_corrected(compared)
+        return None if corrected is None else ssim(corrected, compared.photo, compared.mask)
 
 
 def color_corrected(compared: Compared) -> Tensor | None:

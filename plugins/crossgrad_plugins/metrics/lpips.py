@@ -1,13 +1,108 @@
-"""LPIPS with AlexNet."""
+"""LPIPS with AlexNet and with VGG-16."""
 
-from typing import ClassVar
+from abc import abstractmethod
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Final
 
+import torch
+from pydantic import field_validator
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import Figure
-from crossgrad_plugins.metrics.perceptual.metric import IN_FULL_RANGE, Perceptual, figure_of
-from crossgrad_plugins.metrics.perceptual.trunks import ALEXNET, Trunk
+from crossgrad_core.plugin import Compared, Field, Figure, Metric, Selection, hookimpl, masked
+from crossgrad_plugins.metrics.lpips_trunks import ALEXNET, VGG16, Trunk
+
+if TYPE_CHECKING:
+    from crossgrad_plugins.metrics.lpips_distance import Weights
+
+
+#: How images enter the network, for summary.json.
+IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
+IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
+
+
+def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Figure:
+    """The figure of a metric without weights; `described` adds which weights it has."""
+    return Figure(
+        name=name,
+        label=label,
+        definition=f"LPIPS 0.1 with {net.name}, {scaling}; masked pixels are black in both images",
+        undefined=f"LPIPS needs the pretrained {net.name}, which no Python package ships: "
+        f"--set metrics.{entry}.trunk=FILE names it, for example {net.published} of torchvision",
+        falls=True,
+    )
+
+
+class Perceptual(Metric):
+    """Learned perceptual similarity (LPIPS 0.1) with the weights that the user names.
+
+    Null without a trunk, which no package ships; nothing is ever downloaded.
+
+    Attributes:
+        net: The network.
+        entry: The name of the metric, for messages.
+    """
+
+    net: ClassVar[Trunk]
+    entry: ClassVar[str]
+
+    trunk: Path | None = Field(
+        None,
+        description="file with the network's weights as torchvision publishes them "
+        "(.pth or .safetensors); null without",
+    )
+    heads: Path | None = Field(
+        None,
+        description="file with the linear heads of LPIPS 0.1; those of an installed torchmetrics "
+        "or lpips package by default",
+    )
+
+    @field_validator("trunk", "heads")
+    @classmethod
+    def _from_anywhere(cls, path: Path | None) -> Path | None:
+        """config.yaml repeats the run from any folder."""
+        return None if path is None else path.expanduser().absolute()
+
+    @hookimpl
+    def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
+        """Reads the weights before anything is trained."""
+        if self.trunk is not None:
+            self._weights(self.trunk)
+        elif self.heads is not None:
+            place = f"metrics.{self.entry}"
+            return [f"{place}.heads does nothing without a network: --set {place}.trunk=FILE"]
+        return []
+
+    @override
+    def described(self) -> Figure:
+        if self.trunk is None:
+            return self.figure
+        least = f"{self.net.name} needs images of at least {self.net.smallest} pixels a side"
+        definition = f"{self.figure.definition}; {self._weights(self.trunk).source}"
+        return replace(self.figure, definition=definition, undefined=least)
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        mask = compared.mask
+        small = min(compared.render.shape[:2]) < self.net.smallest
+        if self.trunk is None or small or (mask is not None and not bool(mask.any())):
+            return None
+        from crossgrad_plugins.metrics.lpips_distance import distance
+
+        render, photo = (
+            self.entering(masked(image.to(torch.float32) / 255, mask))
+            for image in (compared.render, compared.photo)
+        )
+        return distance(self.net, self._weights(self.trunk), render, photo)
+
+    @abstractmethod
+    def entering(self, image: Tensor) -> Tensor:
+        """An image [H, W, 3] in [0, 1] as it enters the network."""
+
+    def _weights(self, trunk: Path) -> "Weights":
+        return _kept(self.net, trunk, self.heads, f"metrics.{self.entry}")
 
 
 class LPIPS(Perceptual):
@@ -20,3 +115,40 @@ class LPIPS(Perceptual):
     @override
     def entering(self, image: Tensor) -> Tensor:
         return 2 * image - 1
+
+
+class LPIPSOfVGG(Perceptual):
+    """Learned perceptual similarity with VGG-16, images in [-1, 1]; lower is better."""
+
+    net: ClassVar[Trunk] = VGG16
+    entry: ClassVar[str] = "lpips-vgg"
+    figure: ClassVar[Figure] = figure_of("lpips_vgg", "LPIPS (VGG)", VGG16, entry, IN_FULL_RANGE)
+
+    @override
+    def entering(self, image: Tensor) -> Tensor:
+        return 2 * image - 1
+
+
+class LPIPSOfVGGAs3DGS(Perceptual):
+    """Learned perceptual similarity with VGG-16, images in [0, 1] as 3DGS feeds them.
+
+    Made for images in [-1, 1], the network sees low contrast; the figure compares with those that
+    papers of the 3DGS family give, and with no other LPIPS.
+    """
+
+    net: ClassVar[Trunk] = VGG16
+    entry: ClassVar[str] = "lpips-vgg-3dgs"
+    figure: ClassVar[Figure] = figure_of(
+        "lpips_vgg_3dgs", "LPIPS (VGG, 3DGS)", VGG16, entry, IN_UNIT_RANGE
+    )
+
+    @override
+    def entering(self, image: Tensor) -> Tensor:
+        return image
+
+
+@lru_cache(maxsize=4)
+def _kept(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> "Weights":
+    from crossgrad_plugins.metrics.lpips_distance import read_weights
+
+    return read_weights(net, trunk, heads, setting)

@@ -11,7 +11,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import Compared, Figure, Metric, psnr
 from crossgrad_plugins.exposures.srgb import encoded, with_gain
 from crossgrad_plugins.exposures.tracks.gains import LEAST
-from crossgrad_plugins.exposures.tracks.light import light_at
+from crossgrad_plugins.exposures.tracks.observations import light_at
 
 #: Gains that are tried around the first guess, in stops, from coarse to fine.
 _STEPS = (0.1, 0.01)

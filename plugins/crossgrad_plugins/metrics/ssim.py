@@ -1,11 +1,27 @@
-"""Structural similarity as the 3DGS family computes it."""
+"""Structural similarity, as the 3DGS family and as scikit-image compute it.
 
+Both clamp the images to [0, 1] and round them to 8 bits first, as if the render had been written to
+a file and read back. With a mask only kept pixels count; a masked-out pixel is 0 in both images.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
 from typing import ClassVar
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_core.plugin import Compared, Figure, Metric
-from crossgrad_plugins.metrics.similarity import ssim
+from crossgrad_core.plugin import Compared, Figure, Metric, masked, to_uint8
+from crossgrad_plugins.losses.photometric.reference import RADIUS, SIGMA, WINDOW
+
+SSIM_SKIMAGE_TOO_SMALL = (
+    f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
+    f"in an image of {WINDOW} x {WINDOW} or more"
+)
+#: Rows that a thread works on at once, so that what it makes of them stays in its cache.
+_ROWS = 128
 
 
 class SSIM(Metric):
@@ -21,3 +37,88 @@ class SSIM(Metric):
     @override
     def measure(self, compared: Compared) -> float | None:
         return ssim(compared.render, compared.photo, compared.mask)
+
+
+class SSIMOfSkimage(Metric):
+    """Structural similarity of scikit-image: Gaussian weights, sigma 1.5, no sample covariance."""
+
+    figure: ClassVar[Figure] = Figure(
+        name="ssim_skimage",
+        label="SSIM (skimage)",
+        definition="scikit-image: gaussian_weights, sigma 1.5, use_sample_covariance off",
+        undefined=SSIM_SKIMAGE_TOO_SMALL,
+    )
+
+    @override
+    def measure(self, compared: Compared) -> float | None:
+        return ssim_skimage(compared.render, compared.photo, compared.mask)
+
+
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """SSIM as the loss has it: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
+
+    Arguments as for `psnr`. The mean over kept pixels; None if no pixel is kept.
+    """
+    from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
+
+    if _keeps_nothing(image, mask):
+        return None
+    rendered = (to_uint8(image).to(torch.float32) / 255).contiguous().numpy()
+    photo = to_uint8(target).contiguous().numpy()
+    kept = None if mask is None else mask.cpu().contiguous().numpy()
+    return 1 - loss_terms(rendered, photo, kept)[1]
+
+
+def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """SSIM of scikit-image with Gaussian weights, sigma 1.5, and without sample covariance.
+
+    As in scikit-image, the mean leaves out a border of 5 pixels, where windows leave the image.
+
+    Arguments as for `psnr`. None, with `SSIM_SKIMAGE_TOO_SMALL` as the reason, if nothing is left.
+    """
+    height, width = image.shape[:2]
+    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside[RADIUS : height - RADIUS, RADIUS : width - RADIUS] = True
+    if mask is not None:
+        inside &= mask.cpu()
+    if min(height, width) < WINDOW or not bool(inside.any()):
+        return None
+    return float(_skimage_map(image, target, mask)[inside.numpy()].mean())
+
+
+def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[np.float64]:
+    """SSIM per pixel and channel, [H, W, 3], but for a border of RADIUS pixels, which is anything.
+
+    A value depends on the pixels within RADIUS alone, so that strips have the bits of the whole.
+    """
+    from skimage.metrics import structural_similarity
+
+    mask = None if mask is None else mask.cpu()
+    rendered, photo = (masked(to_uint8(each), mask).numpy() for each in (image, target))
+    height = len(rendered)
+    found = np.empty(rendered.shape)
+
+    def work(start: int) -> None:
+        stop = min(start + _ROWS, height)
+        # Of the last rows a few may be too few for a window.
+        first = max(min(start - RADIUS, height - WINDOW), 0)
+        last = min(stop + RADIUS, height)
+        _, full = structural_similarity(
+            rendered[first:last] / 255,
+            photo[first:last] / 255,
+            gaussian_weights=True,
+            sigma=SIGMA,
+            use_sample_covariance=False,
+            data_range=1.0,
+            channel_axis=-1,
+            full=True,
+        )
+        found[start:stop] = full[start - first : stop - first]
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(work, range(0, height, _ROWS)))
+    return found
+
+
+def _keeps_nothing(image: Tensor, mask: Tensor | None) -> bool:
+    return image.numel() == 0 if mask is None else not bool(mask.any())

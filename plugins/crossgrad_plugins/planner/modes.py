@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from crossgrad_core.commands import ComponentChoice
 from crossgrad_core.plugin import Scene, bimodality, footprint_of
 from crossgrad_plugins.groupings.heights import altitudes, upward
-from crossgrad_plugins.groupings.split import log_distances
-from crossgrad_plugins.groupings.thresholds import otsu_separability, otsu_threshold
+from crossgrad_plugins.groupings.split import log_distances, otsu_separability, otsu_threshold
 
 #: Two modes that lie closer than this show the scene at much the same size.
 LEAST_RATIO: Final = 1.5

@@ -11,7 +11,7 @@ from crossgrad_core.commands import (
     TrainingFailedError,
     UserError,
 )
-from crossgrad_plugins.diagnostics.command import Options, diagnose_scene
+from crossgrad_plugins.diagnostics.app import Options, diagnose_scene
 from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
 #: The optimizer sees gradients in Adam's metric.

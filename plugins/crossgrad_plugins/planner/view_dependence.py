@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Scene
-from crossgrad_plugins.exposures.tracks.fit import fitted
+from crossgrad_plugins.exposures.tracks.gains import fitted
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
 #: Observations of a track, twice the coefficients of degree 1, and the radius in degrees of the

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.prepare.epipolar import Rays, off_lines
-from crossgrad_plugins.prepare.subprocess_wait import quiet
+from crossgrad_plugins.prepare.pose_from_pairs import Rays, off_lines
+from crossgrad_plugins.prepare.pycolmap_calls import quiet
 
 if TYPE_CHECKING:
     import pycolmap

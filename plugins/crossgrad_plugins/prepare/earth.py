@@ -1,7 +1,8 @@
-"""Places on Earth in a local frame: east, north, up in metres."""
+"""GPS positions in a local frame, and the roll of a model about a line of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import median
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,22 @@ from numpy.typing import NDArray
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.prepare.plan import Plan, Position
 
+if TYPE_CHECKING:
+    import pycolmap
+
+
 #: Degrees of longitude in half a turn.
 _HALF = 180.0
+#: Camera axes (x right, y down) that point to the top of a photo, by EXIF orientation.
+_TOPS: Final = {3: (0.0, 1.0, 0.0), 4: (0.0, 1.0, 0.0), 5: (-1.0, 0.0, 0.0), 6: (-1.0, 0.0, 0.0),
+                7: (1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}  # fmt: skip
+_TOP: Final = (0.0, -1.0, 0.0)
+_STEPS: Final = 1440
+#: Sines of the tilt of level photos, root mean square: at most so much, and at the worst roll at
+#: least so much more, else their directions say nothing about the roll.
+_LEVEL, _TELLING = 0.15, 0.3
+#: Photos show their top upwards or look down, by this much on average.
+_UPRIGHT: Final = 0.3
 
 
 def origin_of(plan: Plan) -> Position | None:
@@ -49,4 +64,60 @@ def _to_local(places: Sequence[Position], origin: Position) -> NDArray[np.float6
     transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     return np.asarray(
         transform.ellipsoid_to_enu(angles, origin.latitude, origin.longitude, origin.altitude)
+    )
+
+
+def top_of(orientation: int) -> NDArray[np.float64]:
+    """[3] camera axis towards the top of a photo as it is shown."""
+    return np.array(_TOPS.get(orientation, _TOP))
+
+
+def levelled(
+    model: "pycolmap.Reconstruction",
+    similarity: "pycolmap.Sim3d",
+    line: tuple[NDArray[np.float64], NDArray[np.float64]],
+    tops: Mapping[str, NDArray[np.float64]],
+) -> "pycolmap.Sim3d | None":
+    """A similarity turned about a line such that photos are level; None where they do not tell.
+
+    Args:
+        model: The model.
+        similarity: From the model to metres east, north, up; right but for the roll.
+        line: [3] a point of the line and [3] its direction, of length 1.
+        tops: Name -> [3] camera axis towards the top of the photo.
+    """
+    import pycolmap
+
+    point, along = line
+    turn = similarity.rotation.matrix()
+    images = [model.image(number) for number in model.reg_image_ids()]
+    to_world = [turn @ image.cam_from_world().rotation.matrix().T for image in images]
+    up = np.array([rows @ tops[image.name] for rows, image in zip(to_world, images, strict=True)])
+    ahead = np.array([rows[:, 2] for rows in to_world])
+    level = np.cross(up, ahead)
+    angles = np.linspace(0.0, 2.0 * np.pi, _STEPS, endpoint=False, dtype=np.float64)
+    tilts = np.sqrt((_heights(level, along, angles) ** 2).mean(axis=0))
+    if tilts.max() - tilts.min() < _TELLING or tilts.min() > _LEVEL:
+        return None
+    upright = (_heights(up, along, angles) - _heights(ahead, along, angles)).mean(axis=0)
+    # Half a turn apart photos are as level, but one of both stands on its head.
+    best = int(np.argmin(np.where(upright > _UPRIGHT, tilts, np.inf)))
+    if upright[best] <= _UPRIGHT or tilts[best] > _LEVEL:
+        return None
+    roll = pycolmap.Rotation3d(angles[best] * along).matrix()
+    matrix = similarity.matrix()
+    moved = np.column_stack([roll @ matrix[:, :3], roll @ (matrix[:, 3] - point) + point])
+    return pycolmap.Sim3d(moved)
+
+
+def _heights(
+    vectors: NDArray[np.float64], along: NDArray[np.float64], angles: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[N, A] z of vectors [N, 3], each turned about an axis [3] by angles [A] (Rodrigues)."""
+    kept = np.outer(vectors @ along, along)
+    across = vectors - kept
+    return np.asarray(
+        kept[:, 2, None]
+        + across[:, 2, None] * np.cos(angles)
+        + np.cross(along, vectors)[:, 2, None] * np.sin(angles)
     )

@@ -13,7 +13,7 @@ from crossgrad_core.commands import UserError, available_memory, check_folder, w
 from crossgrad_plugins.prepare.earth import local_positions
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Photo, Plan
-from crossgrad_plugins.prepare.subprocess_wait import JOURNAL, quiet, rows_of, waited
+from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_plugins.prepare.gravity import levelled
-from crossgrad_plugins.prepare.subprocess_wait import quiet
+from crossgrad_plugins.prepare.earth import levelled
+from crossgrad_plugins.prepare.pycolmap_calls import quiet
 
 if TYPE_CHECKING:
     import pycolmap

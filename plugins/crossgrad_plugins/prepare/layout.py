@@ -13,7 +13,7 @@ from crossgrad_core.commands import (
     disk_errors,
     is_leftover,
 )
-from crossgrad_plugins.prepare.scene_integrity import is_whole
+from crossgrad_plugins.prepare.pycolmap_calls import is_whole
 
 #: The folder of what is needed on the way, and the file that says that `prepare` made it.
 WORK: Final = "prepare"

@@ -16,9 +16,8 @@ from crossgrad_core.commands import UserError, disk_errors, write_atomically
 from crossgrad_plugins.prepare.contradictions import contradicted
 from crossgrad_plugins.prepare.layout import Layout, emptied, models_in, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
+from crossgrad_plugins.prepare.pycolmap_calls import quiet, waited, write_model
 from crossgrad_plugins.prepare.refine_poses import looked_again
-from crossgrad_plugins.prepare.scene_integrity import write_model
-from crossgrad_plugins.prepare.subprocess_wait import quiet, waited
 
 if TYPE_CHECKING:
     import pycolmap

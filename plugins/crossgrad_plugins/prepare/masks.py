@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from crossgrad_core.commands import UserError
 from crossgrad_core.plugin import is_file
-from crossgrad_core.scene.decode import decode_mask, decode_photo, turn
-from crossgrad_core.scene.mask_files import mask_names, pair_masks
-from crossgrad_core.scene.photo_files import PhotoFolder
-from crossgrad_core.scene.shapes import check_mask, is_turned
+from crossgrad_core.scene.photos.decode import decode_mask, decode_photo, turn
+from crossgrad_core.scene.photos.photo_files import PhotoFolder, mask_names, pair_masks
+from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from crossgrad_core.commands import UserError, check_folder, write_atomically
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.subprocess_wait import JOURNAL, quiet, rows_of, waited
+from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, quiet, rows_of, waited
 
 if TYPE_CHECKING:
     import pycolmap

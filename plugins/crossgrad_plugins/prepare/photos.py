@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crossgrad_core.commands import UserError
-from crossgrad_core.scene import pillow
-from crossgrad_core.scene.headers import PhotoHeader, read_header
-from crossgrad_core.scene.photo_files import walked
-from crossgrad_core.scene.pillow import opened
-from crossgrad_core.scene.raw_checks import is_possible_name
+from crossgrad_core.scene.photos import pillow
+from crossgrad_core.scene.photos.headers import PhotoHeader, read_header
+from crossgrad_core.scene.photos.photo_files import walked
+from crossgrad_core.scene.photos.pillow import opened
+from crossgrad_core.scene.raw import is_possible_name
 from crossgrad_core.scene.wording import megapixels, name_some
 from crossgrad_plugins.georeference.gps_tags import gps_of, is_place
 from crossgrad_plugins.prepare.masks import HALF, sorted_out, with_mask

@@ -19,8 +19,7 @@ import numpy as np
 
 from crossgrad_core.commands import check_folder
 from crossgrad_plugins.prepare.pose_from_pairs import Pairs, Support, best_place, support
-from crossgrad_plugins.prepare.scene_integrity import write_model
-from crossgrad_plugins.prepare.subprocess_wait import JOURNAL
+from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, write_model
 
 if TYPE_CHECKING:
     import pycolmap

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.commands import write_atomically
-from crossgrad_plugins.prepare.earth import local_positions, origin_of
+from crossgrad_plugins.prepare.earth import local_positions, origin_of, top_of
 from crossgrad_plugins.prepare.georegister import Placement, centers_of, merged, placement_of
-from crossgrad_plugins.prepare.gravity import top_of
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.scene_integrity import write_model
+from crossgrad_plugins.prepare.pycolmap_calls import write_model
 
 if TYPE_CHECKING:
     import pycolmap

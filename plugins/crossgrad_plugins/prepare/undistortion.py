@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crossgrad_core.commands import UserError, check_folder, disk_errors, write_atomically
-from crossgrad_core.scene.decode import decode_photo
+from crossgrad_core.scene.photos.decode import decode_photo
 from crossgrad_plugins.prepare.layout import Layout, emptied, scratch_of
 from crossgrad_plugins.prepare.masks import HALF, counting_pixels
 from crossgrad_plugins.prepare.plan import Plan
-from crossgrad_plugins.prepare.scene_integrity import check_written
-from crossgrad_plugins.prepare.subprocess_wait import quiet, waited
+from crossgrad_plugins.prepare.pycolmap_calls import check_written, quiet, waited
 
 if TYPE_CHECKING:
     import pycolmap

@@ -20,8 +20,7 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 from crossgrad_plugins.rasterizers import _speeds
-from crossgrad_plugins.rasterizers.gpu.empty_render import empty_render
-from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
+from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn, empty_render
 from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 

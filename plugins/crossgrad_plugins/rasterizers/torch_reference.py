@@ -13,17 +13,17 @@ from crossgrad_core.plugin import Camera, Gaussians, Rasterizer, Render, Respons
 from crossgrad_plugins.rasterizers import _speeds
 from crossgrad_plugins.rasterizers.footprint import DESCRIPTION, Footprint
 from crossgrad_plugins.rasterizers.reference.compositing import (
+    TILE,
     Drawing,
     PixelCounter,
     composite_tiles,
     splat_table,
+    tile_boxes,
+    tile_lists,
 )
-from crossgrad_plugins.rasterizers.reference.directions import longest_axes
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
-from crossgrad_plugins.rasterizers.reference.projection import Projection, project
-from crossgrad_plugins.rasterizers.reference.responses import Shape, shape
-from crossgrad_plugins.rasterizers.reference.statistics import Recorder, recorded
-from crossgrad_plugins.rasterizers.reference.tiles import TILE, tile_boxes, tile_lists
+from crossgrad_plugins.rasterizers.reference.projection import Projection, Shape, project, shape
+from crossgrad_plugins.rasterizers.reference.statistics import Recorder, longest_axes, recorded
 
 #: Standard deviations, and the least square of half the difference of the variances, px^4.
 SIGMAS, LEAST_SPREAD = 3.0, 0.1

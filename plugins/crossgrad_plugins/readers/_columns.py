@@ -1,12 +1,11 @@
-"""The header of a table in a text file: its line, its separator and the names of its columns."""
+"""The first bytes of files, and the header of a table: line, separator, columns."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crossgrad_plugins.readers._sniff import head_of
-
 _DELIMITERS: Final = (",", ";", "\t")
+_HEAD: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -41,3 +40,24 @@ def column_names(cells: list[str]) -> tuple[str, ...]:
     while names and not names[-1]:
         names.pop()
     return tuple(names)
+
+
+def head_of(path: Path) -> bytes:
+    """The first bytes of a file; none where there is no such file, or it may not be read."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as file:
+            return file.read(_HEAD)
+    except (OSError, ValueError):
+        return b""
+
+
+def begins_with(path: Path, sign: bytes) -> bool:
+    """Whether a file begins with a sign, but for spaces and a byte order mark."""
+    return head_of(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(sign)
+
+
+def holds(path: Path, piece: bytes) -> bool:
+    """Whether a piece stands among the first bytes of a file."""
+    return piece in head_of(path)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from crossgrad_core.plugin import UserError
-from crossgrad_core.scene.file_names import FileNames
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.photos.file_names import FileNames
+from crossgrad_core.scene.photos.headers import read_header
 from crossgrad_core.scene.wording import name_some
 
 

@@ -12,10 +12,17 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from crossgrad_core.plugin import UserError, is_file
-from crossgrad_core.scene.file_kinds import MASK, PHOTO, POINTS, kind_of
-from crossgrad_core.scene.file_names import FileNames, is_absolute, same_spelling
-from crossgrad_core.scene.photo_files import walked
-from crossgrad_core.scene.raw_checks import LONGEST_NAME, LONGEST_PART, is_possible_name
+from crossgrad_core.scene.photos.file_names import (
+    MASK,
+    PHOTO,
+    POINTS,
+    FileNames,
+    is_absolute,
+    kind_of,
+    same_spelling,
+)
+from crossgrad_core.scene.photos.photo_files import walked
+from crossgrad_core.scene.raw import LONGEST_NAME, LONGEST_PART, is_possible_name
 
 #: Folders that tell training views from held-out ones and nothing else.
 SPLIT_FOLDERS: Final = frozenset({"train", "test", "val"})

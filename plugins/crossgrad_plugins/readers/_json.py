@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import UserError
 from crossgrad_core.plugin import read_json as json_in
-from crossgrad_core.scene.raw_checks import FARTHEST
+from crossgrad_core.scene.raw import FARTHEST
 
 #: Bytes of a file. Large reconstructions have millions of points.
 LARGEST: Final = 512 << 20

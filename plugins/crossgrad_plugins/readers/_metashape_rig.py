@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.georeference.frames import rotation_of
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._metashape_numbers import numbers
+from crossgrad_plugins.readers._xml import numbers
 
 _IDENTITY = np.eye(4)
 

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import is_file
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.photos.headers import read_header
 from crossgrad_core.scene.raw import RawView
 from crossgrad_plugins.georeference.frames import SAME, Frame3D, rotation_of
+from crossgrad_plugins.readers._cameras import Frame, from_opengl, refuse_lens, refuse_term
 from crossgrad_plugins.readers._inside import Inside, shared_folder
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
-from crossgrad_plugins.readers._poses import from_opengl
 from crossgrad_plugins.readers._raw import raw_view
 
 _RADIAL: Final = ("k1", "k2", "k3", "k4")

@@ -1,4 +1,4 @@
-"""XML files of scenes, read with the standard library's expat behind a guard.
+"""XML files of scenes, read with expat behind a guard, and numbers in their elements.
 
 Entities are what makes XML dangerous: they expand without bound and can name other files. They can
 only be declared in a document type, so a file that has one is refused before anything in it is
@@ -11,7 +11,11 @@ from typing import Final
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crossgrad_core.plugin import UserError, open_file, size_text
+from crossgrad_plugins.readers._json import Fields
 
 #: Bytes of a file and of one tag or comment; elements within each other; elements and attributes.
 LARGEST: Final = 128 << 20
@@ -85,3 +89,19 @@ def _parsed(path: Path) -> Element:
                 raise _RefusedError(f"a tag or comment of more than {size_text(_LONGEST)}")
     parser.Parse(b"", True)
     return builder.tree.close()
+
+
+def numbers(element: Element | None, count: int, file: Path, place: str) -> NDArray[np.float64]:
+    """[count] numbers in the text of an element.
+
+    Raises:
+        UserError: The element is missing, or holds something else.
+    """
+    words = (element.text or "").split() if element is not None else []
+    values: list[object] = []
+    for word in words[: count + 1]:
+        try:
+            values.append(word if "_" in word else float(word))
+        except ValueError:
+            values.append(word)
+    return Fields({"text": values}, file, place).numbers("text", count)

@@ -12,12 +12,11 @@ from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import read_object
-from crossgrad_plugins.readers._points import find_points
-from crossgrad_plugins.readers._raw import raw_scene
+from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 
 #: The first one that is there is held out; validation views are left out where there are others.
 _HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")

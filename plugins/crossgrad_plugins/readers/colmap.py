@@ -11,20 +11,20 @@ from typing_extensions import override
 from crossgrad_core.numerics.rotations import matrix_rows
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, is_file
 from crossgrad_core.scene.build import build_scene
-from crossgrad_core.scene.photo_names import with_photo_names
+from crossgrad_core.scene.photos.photo_files import with_photo_names
 from crossgrad_core.scene.point_cloud import NO_POINTS, PointCloud
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import (
+from crossgrad_plugins.readers._inside import Inside
+from crossgrad_plugins.readers.colmap_files.binary import ColmapImage, ColmapModel
+from crossgrad_plugins.readers.colmap_files.folder import (
     check_scene_folder,
     choose_model,
 )
-from crossgrad_plugins.readers._colmap_model import model_files, read_model
-from crossgrad_plugins.readers._colmap_types import ColmapImage, ColmapModel
-from crossgrad_plugins.readers._inside import Inside
-from crossgrad_plugins.readers._place import by_code, by_file, by_gps
+from crossgrad_plugins.readers.colmap_files.model import model_files, read_model
+from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
 #: The place on Earth, beside a model or in the scene's folder.
 _GEOREF = "georef.json"
@@ -129,7 +129,7 @@ def _beside(
     scene: Path, model: Path, views: tuple[RawView, ...], options: SceneOptions
 ) -> PointCloud:
     """The points of a PLY in the folder of the model, or in a folder above it within the scene."""
-    from crossgrad_plugins.readers._points import find_points
+    from crossgrad_plugins.readers._raw import find_points
 
     inside, base = Inside(scene), Path(os.path.relpath(model, scene))
     places = [base, *base.parents] if ".." not in base.parts else []

@@ -17,13 +17,12 @@ from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.frames import rotation_of
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._cameras import from_opengl
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
-from crossgrad_plugins.readers._points import find_points
-from crossgrad_plugins.readers._poses import from_opengl
-from crossgrad_plugins.readers._raw import raw_scene
+from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_lens, transform_of
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 
 _TO_UNIT: Final = 100.0
 _PHOTOS: Final = "rgb"

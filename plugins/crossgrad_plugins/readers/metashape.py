@@ -20,26 +20,23 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.file_names import FileNames
-from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.photos.file_names import FileNames
+from crossgrad_core.scene.photos.photo_files import PhotoFolder
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.ellipsoid import place_at
 from crossgrad_plugins.georeference.frames import SAME, Frame3D, rotation_of
 from crossgrad_plugins.georeference.on_earth import OnEarth
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._cameras import Frame, from_opencv, refuse_lens, refuse_term
 from crossgrad_plugins.readers._equal_labels import Labelled, paired
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._lenses import Frame, refuse_lens, refuse_term
-from crossgrad_plugins.readers._metashape_numbers import numbers
 from crossgrad_plugins.readers._metashape_rig import Rig
-from crossgrad_plugins.readers._place import at, by_gps
-from crossgrad_plugins.readers._points import find_points
-from crossgrad_plugins.readers._poses import from_opencv
-from crossgrad_plugins.readers._raw import raw_scene, raw_view
-from crossgrad_plugins.readers._xml import read_xml
+from crossgrad_plugins.readers._raw import find_points, raw_scene, raw_view
+from crossgrad_plugins.readers._xml import numbers, read_xml
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
+from crossgrad_plugins.readers.place.place import at, by_gps
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
 #: The compensation of a rolling shutter, and what is told where there is none.

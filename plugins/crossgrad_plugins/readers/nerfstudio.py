@@ -15,18 +15,17 @@ from crossgrad_core.scene.split import has_lists
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.georeference.frames import Frame3D, rotation_of
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_object
-from crossgrad_plugins.readers._place import by_gps
-from crossgrad_plugins.readers._points import find_points
-from crossgrad_plugins.readers._raw import raw_scene
+from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import (
     photo_name,
     raw_views,
     read_frame,
     transform_of,
 )
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
+from crossgrad_plugins.readers.place.place import by_gps
 
 #: The views that are trained on, and the held-out ones: those of the first list that has any.
 _TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"

@@ -20,19 +20,17 @@ from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.point_cloud import PointCloud
-from crossgrad_core.scene.raw import RawView
-from crossgrad_core.scene.raw_checks import FARTHEST
+from crossgrad_core.scene.raw import FARTHEST, RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.georeference.frames import SAME
 from crossgrad_plugins.georeference.on_earth import OnEarth
 from crossgrad_plugins.readers import _accepts
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._cameras import Frame, refuse_lens
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields, read_json
-from crossgrad_plugins.readers._lenses import Frame, refuse_lens
-from crossgrad_plugins.readers._photos import PhotoNames
-from crossgrad_plugins.readers._place import at, by_gps, origin_of
-from crossgrad_plugins.readers._raw import raw_scene, raw_view
+from crossgrad_plugins.readers._raw import PhotoNames, raw_scene, raw_view
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
+from crossgrad_plugins.readers.place.place import at, by_gps, origin_of
 
 _BYTE: Final = 255
 #: Below this many radians a rotation is its own sine.

@@ -19,22 +19,19 @@ from typing_extensions import override
 from crossgrad_core.plugin import Reader, Scene, SceneOptions, UserError, read_rows
 from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.photos.headers import read_header
 from crossgrad_core.scene.points_in_view import check_seen
 from crossgrad_core.scene.raw import RawView
 from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers._accepts import COLUMNS, NAME_COLUMN, POSE_COLUMNS
-from crossgrad_plugins.readers._colmap_folder import check_scene_folder
+from crossgrad_plugins.readers._cameras import Frame, from_opengl, refuse_term
 from crossgrad_plugins.readers._columns import Columns, column_names
 from crossgrad_plugins.readers._inside import Inside
 from crossgrad_plugins.readers._json import Fields
-from crossgrad_plugins.readers._lenses import Frame, refuse_term
-from crossgrad_plugins.readers._photos import PhotoNames
-from crossgrad_plugins.readers._place import by_gps
-from crossgrad_plugins.readers._points import find_points
-from crossgrad_plugins.readers._poses import from_opengl
-from crossgrad_plugins.readers._raw import raw_scene, raw_view
+from crossgrad_plugins.readers._raw import PhotoNames, find_points, raw_scene, raw_view
+from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
+from crossgrad_plugins.readers.place.place import by_gps
 
 _LENS: Final = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _SENSOR: Final = 36.0  # mm

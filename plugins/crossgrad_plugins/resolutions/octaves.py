@@ -7,8 +7,7 @@ from pydantic import model_validator
 from typing_extensions import override
 
 from crossgrad_core.plugin import Field, Schedule
-from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
-from crossgrad_plugins.resolutions.course import Course
+from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part
 
 
 class Octaves(CoarseToFine):

@@ -8,8 +8,7 @@ from typing import ClassVar, Literal
 from typing_extensions import override
 
 from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed, shortness
-from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Part
-from crossgrad_plugins.resolutions.course import Course
+from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part
 
 #: Share of a short run up to which one pixel of each 2 x 2 is drawn; of longer ones less.
 _SHARE = 0.8

@@ -18,8 +18,7 @@ from crossgrad_core.plugin import (
     ViewSample,
     octave,
 )
-from crossgrad_plugins.samplers.draws import training_views
-from crossgrad_plugins.samplers.groups import drawn, groups_of
+from crossgrad_plugins.samplers.draws import drawn, groups_of, training_views
 
 _SMALLEST_TEMPERATURE = 1e-8
 

@@ -15,8 +15,7 @@ from crossgrad_core.plugin import (
     ViewSample,
     hookimpl,
 )
-from crossgrad_plugins.samplers.draws import training_views
-from crossgrad_plugins.samplers.groups import drawn, members_of
+from crossgrad_plugins.samplers.draws import drawn, members_of, training_views
 
 _OPPOSITE = {"near": "far", "far": "near"}
 

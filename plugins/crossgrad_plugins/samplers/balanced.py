@@ -1,9 +1,140 @@
-"""Equal numbers of views from every group."""
+"""Samplers of equal numbers of views from every group."""
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar, cast
 
-from crossgrad_core.plugin import PluginState, SampleContext, ViewSample
-from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    Json,
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    UserError,
+    ViewCounts,
+    ViewSample,
+)
+from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, groups_of, training_views
+
+HALVES = ("first", "second")
+
+
+class NearFar(Sampler):
+    """K/2 near and K/2 far views per step, near and far taking turns within the step.
+
+    With `alternating` a step has one view: near in odd steps, far in even ones. Under a grouping
+    whose two labels are not near and far, the labels take turns in alphabetical order.
+
+    Source: the paper, altitude-balanced view pairing (one uniform near view and one uniform far
+    view, independent).
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
+    default_views: ClassVar[int] = 2
+    default_grouping: ClassVar[str | None] = "radial"
+    groups: ClassVar[int | None] = 2
+
+    alternating: bool = Field(False, description="one view per step, near and far in turn (K = 1)")
+    order: Order = Field(
+        "iid",
+        description="draws within a group: iid; distinct: no view twice in a step; "
+        "epoch: every view once before any comes again",
+    )
+
+    @property
+    @override
+    def view_counts(self) -> ViewCounts:
+        return ViewCounts(1, 1) if self.alternating else self.views
+
+    @property
+    @override
+    def usual_views(self) -> int:
+        return 1 if self.alternating else self.default_views
+
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
+        return idle_order(self.order, selection.views_per_step, 2)
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        groups = groups_of(context, "near-far", 2)
+        if self.alternating:
+            label = list(groups)[(context.step - 1) % 2]
+            groups = {label: groups[label]}
+        return balanced_draw(groups, context, state, self.order)
+
+
+class ThreeWay(Sampler):
+    """One near, one middle and one far view per step.
+
+    Three renders per step: compare with the others at equal rendered views, not at equal steps.
+
+    Source: the paper, partition threshold study; groups are thirds of the radial distance.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(3, 3)
+    default_views: ClassVar[int] = 3
+    default_grouping: ClassVar[str | None] = "terciles"
+    groups: ClassVar[int | None] = 3
+
+    order: Order = Field(
+        "iid",
+        description="draws within a group: iid; distinct: no view twice in a step; "
+        "epoch: every view once before any comes again",
+    )
+
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
+        return idle_order(self.order, selection.views_per_step, 3)
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        groups = groups_of(context, "three-way", 3)
+        return balanced_draw(groups, context, state, self.order)
+
+
+class RandomSplit(Sampler):
+    """K/2 views of each of two random halves of the training views, drawn once at the first step.
+
+    Any grouping of the run is ignored; the labels of the draw are `first` and `second`.
+
+    Source: the paper announces this control and shows no figures.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
+    default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
+    own_labels: ClassVar[tuple[str, ...]] = HALVES
+
+    order: Order = Field(
+        "iid",
+        description="draws within a half: iid; distinct: no view twice in a step; "
+        "epoch: every view once before any comes again",
+    )
+
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
+        return idle_order(self.order, selection.views_per_step, len(HALVES))
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        views = training_views(context)
+        if len(views) < len(HALVES):
+            raise UserError(
+                "sampler random-split needs two training views",
+                where="sampler",
+                found=str(len(views)),
+                todo="choose --sampler epoch",
+            )
+        if "split" not in state.values:
+            shuffled = [int(view) for view in context.rng.permutation(len(views))]
+            state = PluginState({**state.values, "split": cast("list[Json]", shuffled)})
+        shuffled = cast("list[int]", state.values["split"])
+        middle = (len(shuffled) + 1) // 2
+        groups = {HALVES[0]: shuffled[:middle], HALVES[1]: shuffled[middle:]}
+        return balanced_draw(groups, context, state, self.order)
 
 
 def balanced_draw(

@@ -8,8 +8,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewCounts, ViewSample
-from crossgrad_plugins.samplers.draws import EpochOrder, require_enough, training_views
-from crossgrad_plugins.samplers.groups import drawn
+from crossgrad_plugins.samplers.draws import EpochOrder, drawn, require_enough, training_views
 
 
 class FarthestPoint(Sampler):

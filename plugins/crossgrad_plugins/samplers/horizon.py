@@ -15,8 +15,7 @@ from crossgrad_core.plugin import (
     ViewCounts,
     ViewSample,
 )
-from crossgrad_plugins.samplers.draws import EpochOrder, draw
-from crossgrad_plugins.samplers.groups import drawn, groups_of
+from crossgrad_plugins.samplers.draws import EpochOrder, draw, drawn, groups_of
 
 #: Decimals of a number of steps that are no rounding.
 _DIGITS = 6

@@ -29,16 +29,13 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.sweep.best import best_grid
 from crossgrad_plugins.sweep.engines import Stop, Work, check_options, engine
-from crossgrad_plugins.sweep.estimate import estimated
 from crossgrad_plugins.sweep.grid import Grid, check_assignments, read_grid, with_scenes
-from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.job import Layout
 from crossgrad_plugins.sweep.machine import Machine, divided
 from crossgrad_plugins.sweep.plan import planned
-from crossgrad_plugins.sweep.progress import Screen
-from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.run_status import Standing, standings
+from crossgrad_plugins.sweep.progress import Screen, Watch, estimated
+from crossgrad_plugins.sweep.run_status import Standing, read_records, standings
 from crossgrad_plugins.sweep.summary import listing, table, write_plan
-from crossgrad_plugins.sweep.watch import Watch
 
 _WORDS = "stopping: the runs under way save a checkpoint first (once more: without an evaluation)"
 

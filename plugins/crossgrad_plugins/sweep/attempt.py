@@ -1,24 +1,37 @@
-"""One attempt at a run: a process of its own, watched until it ends."""
+"""Attempts at a run: a process watched until it ends, and tried again if it died."""
 
 import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic
-from typing import BinaryIO
+from time import monotonic, sleep
+from typing import BinaryIO, Final
 
 from crossgrad_core.commands import summary_of, write_settings, writer_of
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.records import Status, append
-from crossgrad_plugins.sweep.run_status import begun, is_finished
+from crossgrad_plugins.sweep.job import Job, Layout
+from crossgrad_plugins.sweep.run_status import Status, append, begun, is_finished
 
 #: Seconds between two looks.
 _PAUSE = 1.0
 _GIB = 2**30
+#: Seconds between two looks at a process.
+PAUSE = 0.1
+#: What trains a run; the numbers of cores and the arguments of `crossgrad` follow.
+COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
+#: What says how many threads a library takes.
+_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+#: Exit status of a run that was refused.
+_REFUSED = 2
+#: Lines of a process that are kept as the reason of its failure, at most.
+_MOST_LINES = 12
+#: Deaths without a new checkpoint after which a run has failed.
+MOST: Final = 3
+#: Seconds between two looks at a folder that another process writes into.
+_WAIT = 1.0
 
 
 @dataclass
@@ -68,18 +81,6 @@ def resident_bytes(process: int) -> int | None:
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) * 1024
     return None
-
-
-#: Seconds between two looks at a process.
-PAUSE = 0.1
-#: What trains a run; the numbers of cores and the arguments of `crossgrad` follow.
-COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
-#: What says how many threads a library takes.
-_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-#: Exit status of a run that was refused.
-_REFUSED = 2
-#: Lines of a process that are kept as the reason of its failure, at most.
-_MOST_LINES = 12
 
 
 @dataclass(frozen=True)
@@ -231,3 +232,65 @@ def _signal(code: int) -> str:
     known = {each.value: each.name for each in signal.Signals}
     killed = " (by hand, or for want of memory)" if known.get(number) == "SIGKILL" else ""
     return f"{known[number]}{killed}" if number in known else ""
+
+
+class Retries:
+    """Counts the deaths of runs between two checkpoints.
+
+    Args:
+        out: Folder of the sweep.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._layout = Layout(out)
+        self._deaths = Counter[str]()
+        self._reached: dict[str, str] = {}
+
+    def once_more(self, job: Job, outcome: Outcome, worker: str = "sweep") -> bool:
+        """Whether a run is to be tried again after an attempt.
+
+        One that died too often gets a record that says that it failed.
+        """
+        if outcome.status != "died":
+            return False
+        reached = self._newest(job)
+        if reached != self._reached.get(job.id):
+            self._deaths[job.id] = 0
+            self._reached[job.id] = reached
+        self._deaths[job.id] += 1
+        if self._deaths[job.id] < MOST:
+            return True
+        error = f"{outcome.error}, {MOST} times without a new checkpoint between"
+        record = {"event": "ended", "run": job.id, "worker": worker}
+        append(self._layout.records, {**record, "status": "failed", "error": error})
+        return False
+
+    def _newest(self, job: Job) -> str:
+        """The newest checkpoint of a run; empty where it has none."""
+        folders = self._layout.run(job.id).glob("checkpoints/step-*")
+        return max((folder.name for folder in folders), default="")
+
+
+def carried_out(job: Job, worker: Worker, name: str) -> Outcome:
+    """Carries out a run and waits for its end; an interrupt stops it with a checkpoint.
+
+    A task that is repeated because its machine was lost finds what the first one left.
+
+    Args:
+        job: The run.
+        worker: Who carries it out.
+        name: His name.
+    """
+    worker = replace(worker, name=name)
+    while not is_free(job, worker):
+        sleep(_WAIT)
+    if is_finished(Layout(worker.out).run(job.id)):
+        return Outcome("finished")
+    attempt = Attempt(job, worker)
+    while True:
+        try:
+            if (outcome := attempt.poll()) is not None:
+                return outcome
+            sleep(PAUSE)
+        except KeyboardInterrupt:
+            attempt.stop()

@@ -1,9 +1,10 @@
-"""One run of a sweep, and its id."""
+"""One run of a sweep, its id, and where things are in the folder of the sweep."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from pathlib import Path
 from typing import Any, Final
 
 #: Settings that change neither what is trained nor what is reported.
@@ -52,3 +53,41 @@ def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
         kept.pop("steps", None)  # They follow the clock.
     text = json.dumps([kept, fingerprint], sort_keys=True, default=str)
     return sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The folder of a sweep.
+
+    Attributes:
+        out: The folder.
+    """
+
+    out: Path
+
+    def run(self, name: str) -> Path:
+        """Results of a run, as `crossgrad run` writes them."""
+        return self.out / "runs" / name
+
+    def settings(self, name: str) -> Path:
+        """What a run is started with."""
+        return self.out / "settings" / f"{name}.yaml"
+
+    def output(self, name: str) -> Path:
+        """What the processes of a run printed."""
+        return self.out / "output" / f"{name}.txt"
+
+    @property
+    def records(self) -> Path:
+        """One file for each worker."""
+        return self.out / "workers"
+
+    @property
+    def plan(self) -> Path:
+        """Which run is what, as a table."""
+        return self.out / "runs.csv"
+
+    def make(self) -> None:
+        """Makes the folders."""
+        for path in ("runs", "settings", "output", "workers"):
+            (self.out / path).mkdir(parents=True, exist_ok=True)

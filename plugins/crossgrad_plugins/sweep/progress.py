@@ -1,19 +1,108 @@
-"""The screen of a sweep: one live table on a terminal, elsewhere a line for each end."""
+"""The screen of a sweep: how far it is, and how long it is going to take."""
 
 import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from shutil import get_terminal_size
+from statistics import mean
 from time import monotonic
 from typing import Final
 
-from crossgrad_core.commands import controls_of, is_live, one_line
-from crossgrad_plugins.sweep.estimate import duration, estimated
-from crossgrad_plugins.sweep.records import Record, read_records
-from crossgrad_plugins.sweep.watch import UnderWay, Watch
+from crossgrad_core.commands import controls_of, count, is_live, one_line
+from crossgrad_plugins.sweep.job import Job, Layout
+from crossgrad_plugins.sweep.run_status import Record, Standing, newest_row, read_records
 
 #: Seconds between two looks at the records, and failures that the live table shows.
 PAUSE: Final = 1.0
 MOST_FAILURES: Final = 8
+#: Seconds of a run besides its training, where none has told: libraries, scene, results.
+BESIDES = 12.0
+
+
+@dataclass(frozen=True)
+class UnderWay:
+    """A run under way.
+
+    Attributes:
+        job: The run.
+        record: The line that says that it began.
+        row: Its newest evaluation, column -> text.
+    """
+
+    job: Job
+    record: Record
+    row: dict[str, str]
+
+
+@dataclass
+class Watch:
+    """The events since the sweep began.
+
+    Attributes:
+        layout: Folder of the sweep.
+        before: How far all runs were.
+        ended: Id of a run -> its last end since then.
+        under_way: What is under way.
+    """
+
+    layout: Layout
+    before: Sequence[Standing]
+    ended: dict[str, Record] = field(default_factory=dict)
+    under_way: tuple[UnderWay, ...] = ()
+    _known: set[Record] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._known = set(read_records(self.layout.records))
+        self._jobs = {each.job.id: each.job for each in self.before}
+        self._begun: dict[str, Record] = {}
+
+    def look(self) -> list[Record]:
+        """Reads what is new; answers how runs ended since the last look."""
+        # The clocks of several machines differ: what is new need not be the latest.
+        found = [each for each in read_records(self.layout.records) if each not in self._known]
+        self._known.update(found)
+        new = [each for each in found if each.run in self._jobs]
+        for record in new:
+            if record.event == "begun":
+                self._begun[record.run] = record
+            else:
+                self._begun.pop(record.run, None)
+                self.ended[record.run] = record
+        self.under_way = tuple(
+            UnderWay(self._jobs[run], record, newest_row(self.layout.run(run)))
+            for run, record in self._begun.items()
+        )
+        return [each for each in new if each.event == "ended"]
+
+    def job(self, record: Record) -> Job:
+        """The run that a record is about."""
+        return self._jobs[record.run]
+
+    @property
+    def finished(self) -> int:
+        """Runs that are finished, before or since."""
+        return sum(
+            each.state == "finished" or self._is(each.job, "finished") for each in self.before
+        )
+
+    @property
+    def failed(self) -> list[Record]:
+        """The last lines of runs that failed since."""
+        return [each for each in self.ended.values() if each.status == "failed"]
+
+    @property
+    def left(self) -> list[Job]:
+        """Runs that are neither finished nor failed since, those under way included."""
+        return [
+            each.job
+            for each in self.before
+            if each.state != "finished"
+            and not (self._is(each.job, "finished") or self._is(each.job, "failed"))
+        ]
+
+    def _is(self, job: Job, status: str) -> bool:
+        return job.id in self.ended and self.ended[job.id].status == status
 
 
 class Screen:
@@ -87,3 +176,62 @@ def _write(text: str) -> None:
     stream = controls_of(sys.stderr)
     stream.write(text)
     stream.flush()
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """How long some runs take, one after another.
+
+    Attributes:
+        seconds: Wall seconds of those of which something is known.
+        unknown: Number of the others.
+        longest: Seconds of the longest of those of which something is known.
+    """
+
+    seconds: float
+    unknown: int
+    longest: float = 0.0
+
+    def text(self, at_a_time: int) -> str:
+        """The estimate in words, for so many runs at a time."""
+        if not self.seconds:
+            return "their time is known once one has finished" if self.unknown else "nothing to do"
+        known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
+        unknown = f" and {count(self.unknown, 'run')} of which nothing is known yet"
+        others = unknown if self.unknown else ""
+        return known + others
+
+
+def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Record]) -> Estimate:
+    """How long runs take: as those of the same configuration and scene, or of the same scene.
+
+    Args:
+        jobs: The runs.
+        of: Id -> run, of all that the records may be about.
+        records: What workers did.
+    """
+    same: dict[tuple[str, ...], list[float]] = {}
+    for record in records:
+        if record.status == "finished" and record.seconds is not None and record.run in of:
+            job = of[record.run]
+            for key in ((job.scene, job.label), (job.scene,)):
+                same.setdefault(key, []).append(record.seconds)
+    found = [_seconds(job, same) for job in jobs]
+    known = [each for each in found if each is not None]
+    return Estimate(sum(known), len(found) - len(known), max(known, default=0.0))
+
+
+def _seconds(job: Job, same: Mapping[tuple[str, ...], Sequence[float]]) -> float | None:
+    if (job.scene, job.label) in same:
+        return mean(same[job.scene, job.label])
+    if job.seconds is not None:
+        return job.seconds + BESIDES
+    return mean(same[(job.scene,)]) if (job.scene,) in same else None
+
+
+def duration(seconds: float) -> str:
+    """A time for people."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.{unit == 'h':d}f} {unit}"
+    return f"{seconds:.0f} s"

@@ -13,8 +13,7 @@ from crossgrad_core.commands import (
     write_table,
 )
 from crossgrad_plugins.sweep.grid import Metric
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.run_status import Standing, figure, figures
 
 _COLUMNS = ("run", "scene", "configuration", "seed")

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from crossgrad_plugins.exporters.ply_format.file import read_ply
+from crossgrad_plugins.exporters.ply_file import read_ply
 
 #: Columns of metrics.csv that no two runs share.
 CLOCKS = frozenset({"train_seconds", "cpu_seconds", "peak_memory_mib"})

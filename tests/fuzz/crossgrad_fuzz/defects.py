@@ -12,12 +12,12 @@ from typing import BinaryIO
 import numpy as np
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import pillow, reduction
-from crossgrad_core.scene.headers import PhotoHeader
+from crossgrad_core.scene.photos import pillow, shapes
+from crossgrad_core.scene.photos.headers import PhotoHeader
 from crossgrad_core.system import ply_table, yaml_values
 from crossgrad_core.system.ply_table import Element, Header
 from crossgrad_fuzz.targets import photos
-from crossgrad_plugins.exporters.ply_format import file as ply
+from crossgrad_plugins.exporters import ply_file as ply
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ DEFECTS: dict[str, Defect] = {
     "photos of too many pixels without a way out": Defect(
         "photo-headers",
         (
-            (reduction, "choose_reduction", _no_way_out),
+            (shapes, "choose_reduction", _no_way_out),
             (photos, "choose_reduction", _no_way_out),
         ),
     ),

@@ -7,9 +7,9 @@ import pytest
 import torch
 from support.extremes import jittered
 
-from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.base import in_frustum
 from crossgrad_backbones.anchors.decode import decoded
+from crossgrad_backbones.anchors.heads import Seen
 from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene
 

@@ -7,8 +7,8 @@ import torch
 from support.extremes import jittered
 
 from crossgrad_backbones.anchors import decode as decoding
-from crossgrad_backbones.anchors.activation import Seen
 from crossgrad_backbones.anchors.base import mean_volume
+from crossgrad_backbones.anchors.heads import Seen
 from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_core.contract.blocks import Edit, apply_to_parameters
 from crossgrad_core.numerics.threads import configure_threads

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.levels.fitting import (
+from crossgrad_backbones.levels.lattice import (
     MOST_LEVELS,
+    Lattice,
     automatic_root_cell,
     bounding_range,
     distance_range,
@@ -16,7 +17,6 @@ from crossgrad_backbones.levels.fitting import (
     root_above,
     root_cell,
 )
-from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.octree import allowed_top, init_anchors, opening_steps, visible_share
 
 

@@ -15,8 +15,13 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.errors import IncompatibleSelectionError, UserError
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.fixtures import sample_camera, sample_phase, sample_scene
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import (
+    posed_scene,
+    posed_view,
+    sample_camera,
+    sample_phase,
+    sample_scene,
+)
 from crossgrad_plugins.losses.l1_ssim import photometric_loss
 from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 

@@ -12,7 +12,7 @@ from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.contexts import RegularizeContext
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.numerics.spherical import SH_C0
+from crossgrad_core.numerics.raster_constants import SH_C0
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_phase, sample_scene, step_fields
 from crossgrad_core.training.loop import timed_step

@@ -8,7 +8,7 @@ from support.run_folders import RunFolder
 from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare.arms import arms_of, renamed
 from crossgrad_plugins.compare.load_runs import read_runs
-from crossgrad_plugins.compare.settings import settings_of
+from crossgrad_plugins.compare.run import settings_of
 
 SCAFFOLD = {"backbone": {"name": "scaffold", "offsets": 10}}
 

@@ -11,9 +11,9 @@ from crossgrad_core.errors import UserError
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.app import differing_code
 from crossgrad_plugins.compare.comparison import compared
-from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.options import Options
+from crossgrad_plugins.compare.quantity import ClockChoice
 
 LOADED = {"load": {"mean": 5.0, "max": 9.0}}
 

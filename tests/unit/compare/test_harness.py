@@ -7,8 +7,7 @@ difference of a pair has the square root of 2 times as much.
 import numpy as np
 import pytest
 
-from crossgrad_plugins.compare.statistics.estimate import estimate
-from crossgrad_plugins.compare.statistics.verdict import Verdict, verdicts
+from crossgrad_plugins.compare.statistics import Verdict, estimate, verdicts
 
 TRIALS = 200
 NOISE, MARGIN = 0.1, 0.1

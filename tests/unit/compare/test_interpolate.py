@@ -7,16 +7,13 @@ from pathlib import Path
 import pytest
 from support.run_folders import RunFolder
 
-from crossgrad_plugins.compare.arms import arms_of
-from crossgrad_plugins.compare.cells import Cells
+from crossgrad_plugins.compare.arms import Cells, arms_of
 from crossgrad_plugins.compare.comparison import compared
-from crossgrad_plugins.compare.cost import SECONDS, STEPS, VIEWS
-from crossgrad_plugins.compare.interpolate import cost_to, value_at
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.options import Options
-from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.quantity import SECONDS, STEPS, VIEWS, Quantity
 from crossgrad_plugins.compare.tables import csv_tables
-from crossgrad_plugins.compare.targets import ratios, targets_of
+from crossgrad_plugins.compare.targets import cost_to, ratios, targets_of, value_at
 
 
 def comparison(folder: Path, *runs: RunFolder, **options):

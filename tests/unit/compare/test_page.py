@@ -13,12 +13,12 @@ from support.run_folders import RunFolder
 from crossgrad_core.cli.main import main
 from crossgrad_plugins.compare import app
 from crossgrad_plugins.compare.comparison import compared
-from crossgrad_plugins.compare.cost import ClockChoice
 from crossgrad_plugins.compare.figures import differences
 from crossgrad_plugins.compare.figures.differences import draw_differences
 from crossgrad_plugins.compare.figures.phases import draw_phases, phases_of
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.options import Options
+from crossgrad_plugins.compare.quantity import ClockChoice
 from crossgrad_plugins.compare.tables import TABLES, cost_table, csv_tables
 
 SCENE = '<b>&"x"$y_$'

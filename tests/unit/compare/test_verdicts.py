@@ -11,15 +11,18 @@ from support.run_folders import RunFolder
 from crossgrad_plugins.compare.comparison import compared
 from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.options import Options
-from crossgrad_plugins.compare.statistics.estimate import (
+from crossgrad_plugins.compare.statistics import (
     IQM,
     MEAN,
     Bootstrap,
+    Verdict,
     estimate,
+    holm,
     iqm,
+    opposed,
     pairs_needed,
+    verdicts,
 )
-from crossgrad_plugins.compare.statistics.verdict import Verdict, holm, opposed, verdicts
 
 RNG = np.random.default_rng(0)
 

@@ -8,7 +8,7 @@ from crossgrad_core.contract.contexts import AggregateContext
 from crossgrad_core.contract.gramian_operator import aggregate_by_gramians
 from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.testing.fixtures import step_fields
-from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_operators.projection import PCGrad
 
 BLOCKS = tuple(
     Block(name, (name,), per_primitive=True, kind="geometry", lr=LearningRate(0.1))

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.errors import UserError
-from crossgrad_core.run.checkpoint import checkpoint
-from crossgrad_core.run.checkpoint import checkpoint as checkpoints
-from crossgrad_core.run.checkpoint.checkpoint import (
+from crossgrad_core.run import checkpoint
+from crossgrad_core.run import checkpoint as checkpoints
+from crossgrad_core.run.checkpoint import (
     Checkpoint,
     Keep,
     digest,
@@ -186,7 +186,7 @@ def test_a_failed_save_leaves_the_earlier_checkpoint(
 ):
     before = make_checkpoint(100, seed=1)
     save(tmp_path, before)
-    monkeypatch.setattr("crossgrad_core.run.checkpoint.checkpoint.write_tensors", failure)
+    monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", failure)
     with pytest.raises(error):
         save(tmp_path, make_checkpoint(step, seed=2))
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step-000100"]
@@ -197,7 +197,7 @@ def test_a_failed_save_leaves_the_earlier_checkpoint(
 def test_a_full_disk_is_explained_with_what_is_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("crossgrad_core.run.checkpoint.checkpoint.write_tensors", full_disk)
+    monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", full_disk)
     big = replace(make_checkpoint(), parameters={"means": torch.zeros(3 * 2**18)})
     with pytest.raises(UserError, match=r"expected: 3\.0 MiB free"):
         save(tmp_path, big)
@@ -218,7 +218,7 @@ def test_where_the_disk_is_full_what_would_be_deleted_anyway_makes_room(
             full_disk(path, packed)
         write(path, packed)
 
-    monkeypatch.setattr("crossgrad_core.run.checkpoint.checkpoint.write_tensors", with_room_for_two)
+    monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", with_room_for_two)
     with nullcontext() if 300 in left else pytest.raises(UserError, match="not enough disk space"):
         save(tmp_path, make_checkpoint(300), keep)
     assert steps_in(tmp_path) == left

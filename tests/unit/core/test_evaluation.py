@@ -11,8 +11,8 @@ from support.figures import FIGURES, METRICS, of
 from torch import Tensor
 
 from crossgrad_core.contract.figure import Figure
-from crossgrad_core.contract.metric import Metric
 from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.slots.metric import Metric
 from crossgrad_core.evaluation.evaluation import Evaluated, evaluate
 from crossgrad_core.evaluation.result import ViewMetrics, summarised
 

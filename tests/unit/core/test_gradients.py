@@ -14,8 +14,8 @@ from crossgrad_core.gradients.separate import DenseGradients
 from crossgrad_core.gradients.sparse_rows import sparse_rows, values_of
 from crossgrad_core.gradients.summed import SummedGradients
 from crossgrad_core.registry.entries import build
+from crossgrad_operators.projection import Symmetric
 from crossgrad_operators.sum import Sum
-from crossgrad_operators.symmetric import Symmetric
 
 RATE = LearningRate(1.0)
 BLOCKS = (

@@ -6,12 +6,12 @@ import pluggy
 import pytest
 from pydantic import BaseModel, ConfigDict
 
+from crossgrad_core.contract.component import PROJECT
 from crossgrad_core.contract.contexts import DensifyResult, SampleResult, ViewSample
-from crossgrad_core.contract.markers import PROJECT
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import NO_EDIT, Edit, hookimpl
 from crossgrad_core.registry.manager import call_first_result, make_manager
-from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_operators.projection import PCGrad
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 
 

@@ -8,9 +8,9 @@ import torch
 from skimage.metrics import structural_similarity
 
 from crossgrad_core.contract.scene import to_uint8
-from crossgrad_core.evaluation.metrics import PSNR_LIMIT, psnr
+from crossgrad_core.evaluation.evaluation import PSNR_LIMIT, psnr
 from crossgrad_plugins.losses.photometric.reference import ssim_map
-from crossgrad_plugins.metrics.similarity import ssim, ssim_skimage
+from crossgrad_plugins.metrics.ssim import ssim, ssim_skimage
 
 
 def levels(seed, h=30, w=40):

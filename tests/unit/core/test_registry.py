@@ -6,11 +6,10 @@ import pytest
 from support.distributions import write_distribution
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.grouping import Grouping
+from crossgrad_core.contract.slots.grouping import Grouping
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry import entries as registry
-from crossgrad_core.registry.slots import GROUPS
-from crossgrad_core.registry.strays import strays
+from crossgrad_core.registry.slots import GROUPS, strays
 from crossgrad_core.run.assemble import check_names
 from crossgrad_core.system.version import VERSION
 

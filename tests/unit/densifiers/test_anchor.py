@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.anchors.growth.cells import (
+from crossgrad_backbones.anchors.growth.control import AnchorControl
+from crossgrad_backbones.anchors.voxels import (
     FARTHEST,
     cells_of,
     free_cells,
     in_reach,
     numbered,
 )
-from crossgrad_backbones.anchors.growth.control import AnchorControl
 from crossgrad_backbones.scaffold import Scaffold
 from crossgrad_core.contract.blocks import (
     NO_EDIT,
@@ -26,7 +26,7 @@ from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 
 SCHEDULE = AnchorControl().window(Schedule.for_run(30_000))
 CAMERA = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, torch.eye(4, dtype=torch.float64))

@@ -13,13 +13,13 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import NO_EDIT, PluginState, apply_to_parameters
 from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
-from crossgrad_core.contract.rasterizer import Rasterizer
 from crossgrad_core.contract.scene import Camera, View
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.run import select as selecting
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.dc4gs import DirectionalConsistency, split_positions

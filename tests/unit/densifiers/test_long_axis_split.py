@@ -16,7 +16,7 @@ from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import Camera, View
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl
 from crossgrad_plugins.densifiers.adc import AdaptiveDensityControl
 from crossgrad_plugins.densifiers.multiview import MultiViewDensityControl

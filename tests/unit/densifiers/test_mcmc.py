@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import (
     EMPTY_STATE,
     NO_EDIT,
@@ -21,6 +20,7 @@ from crossgrad_core.contract.blocks import (
 )
 from crossgrad_core.contract.contexts import AfterStepContext, DensifyContext, RegularizeContext
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.slots.backbone import Backbone
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.run import assemble as assembling
 from crossgrad_core.run import select as selecting

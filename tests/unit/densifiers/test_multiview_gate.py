@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from crossgrad_backbones.anchors.growth.anchor_base import GrowthRequest
 from crossgrad_backbones.anchors.growth.control import AnchorControl
-from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import Edit, PluginState
 from crossgrad_core.errors import UserError

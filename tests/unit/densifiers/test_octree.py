@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_backbones.anchors.growth.new_anchors import GrowthRequest
+from crossgrad_backbones.anchors.growth.anchor_base import GrowthRequest
 from crossgrad_backbones.levels.lattice import Lattice
 from crossgrad_backbones.levels.octree_control import (
     OctreeControl,
@@ -27,7 +27,7 @@ from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.schedule import Schedule
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 
 ORIGIN, ROOT, FORK, DISTANCE = -1.1, 0.5, 2, 4.0
 THRESHOLDS = Thresholds(2e-4, 2**0.2)

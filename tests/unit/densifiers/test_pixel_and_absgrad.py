@@ -14,7 +14,7 @@ from crossgrad_core.contract.contexts import DensifyContext
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.scene import View
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 from crossgrad_plugins.densifiers.absgrad import AbsGradDensityControl, quantile
 from crossgrad_plugins.densifiers.pixel import PixelDensityControl
 

@@ -7,7 +7,7 @@ import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import Keep, latest, load, save
+from crossgrad_core.run.checkpoint import Keep, latest, load, save
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.loop import timed_step

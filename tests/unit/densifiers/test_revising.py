@@ -24,7 +24,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import HEIGHT, WIDTH, sample_scene, step_fields
-from crossgrad_core.testing.renders import renders_of
+from crossgrad_core.testing.support.renders import renders_of
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 from crossgrad_plugins.densifiers.revising import (

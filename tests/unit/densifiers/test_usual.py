@@ -4,7 +4,7 @@ import pytest
 
 from crossgrad_core.commands import configured
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.registry.entries import load
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import table_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crossgrad_plugins.diagnostics.distances import conflict_by_distance
-from crossgrad_plugins.diagnostics.ratios import geometric_mean, gradient_ratio
+from crossgrad_plugins.diagnostics.grouped import geometric_mean, gradient_ratio
 from crossgrad_plugins.diagnostics.table import conflict, distance_exponent
 
 NEAR = np.array([True, True, False, False])

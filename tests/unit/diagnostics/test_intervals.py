@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
-from crossgrad_plugins.diagnostics.intervals.interval import Interval
-from crossgrad_plugins.diagnostics.intervals.intervals import StudentisedGap, split_intervals
-from crossgrad_plugins.diagnostics.intervals.resampling import Resamples, multiplicities
-from crossgrad_plugins.diagnostics.variance import split_of, variance_split
+from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of, variance_split
+from crossgrad_plugins.diagnostics.intervals import Interval, StudentisedGap, split_intervals
+from crossgrad_plugins.diagnostics.resampling import Resamples, multiplicities
 
 
 def benchmark():

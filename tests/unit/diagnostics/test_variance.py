@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_plugins.diagnostics.grouped import Groups
+from crossgrad_plugins.diagnostics.grouped import Groups, variance_split
 from crossgrad_plugins.diagnostics.table import noise_scale
-from crossgrad_plugins.diagnostics.variance import variance_split
 
 NEAR_CAMERAS, FAR_CAMERAS, DIMENSION = 5, 6, 4
 

@@ -11,8 +11,8 @@ import torch
 from crossgrad_core.contract.gaussians import Gaussians
 from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.errors import UserError
-from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_format.file import (
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_file import (
     PROPERTIES,
     position_offset,
     read_ply,
@@ -209,7 +209,7 @@ def test_gaussians_that_are_not_finite_are_left_out(tmp_path: Path):
 
 
 def test_more_than_one_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("crossgrad_plugins.exporters.ply_format.file._CHUNK", 7)
+    monkeypatch.setattr("crossgrad_plugins.exporters.ply_file._CHUNK", 7)
     cloud = make_cloud(50)
     write_ply(tmp_path / "a.ply", cloud)
     assert_same(read_ply(tmp_path / "a.ply"), cloud)
@@ -283,7 +283,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     def fail(*_args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("crossgrad_plugins.exporters.ply_format.file._rows", fail)
+    monkeypatch.setattr("crossgrad_plugins.exporters.ply_file._rows", fail)
     with pytest.raises(UserError, match="not enough disk space"):
         write_ply(path, make_cloud(9))
     assert path.read_bytes() == before

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.exposures import initial_values
 from crossgrad_plugins.exposures.gain import Gain
-from crossgrad_plugins.exposures.neighbours import TELLING, Neighbours
+from crossgrad_plugins.exposures.initial_values import TELLING, Neighbours
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -6,11 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.exposures import per_photo
 from crossgrad_plugins.exposures.affine import Affine
-from crossgrad_plugins.exposures.channel import ChannelGain
-from crossgrad_plugins.exposures.gain import Gain
+from crossgrad_plugins.exposures.gain import ChannelGain, Gain
 from crossgrad_plugins.exposures.initial_values import Starts
 
 MODELS = [Gain(), ChannelGain(), Affine()]

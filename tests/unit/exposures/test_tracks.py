@@ -8,18 +8,16 @@ import torch
 from support.grey_scene import grey_scene
 
 from crossgrad_core.plugin import Camera
-from crossgrad_plugins.exposures.auto import Auto
-from crossgrad_plugins.exposures.none import NoExposure
-from crossgrad_plugins.exposures.tracks.fit import fitted
+from crossgrad_plugins.exposures.auto import Auto, NoExposure
 from crossgrad_plugins.exposures.tracks.gains import (
     MOST_DECIDING,
     TrackGains,
     deciding_gains,
+    fitted,
     track_gains,
     training_gains,
 )
-from crossgrad_plugins.exposures.tracks.light import light_at
-from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
+from crossgrad_plugins.exposures.tracks.observations import Observations, light_at, observations_of
 
 RNG = np.random.default_rng(0)
 

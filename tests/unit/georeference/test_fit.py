@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from crossgrad_plugins.georeference.fit import Fit, fit_similarity
-from crossgrad_plugins.georeference.frames import Frame3D, similarity_of
+from crossgrad_plugins.georeference.frames import Fit, Frame3D, fit_similarity, similarity_of
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -15,7 +15,7 @@ from support.gaussians import posed_camera, random_gaussians
 from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
-from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
 from crossgrad_plugins.georeference.ellipsoid import Place, geocentric
 from crossgrad_plugins.georeference.frames import Frame3D
 from crossgrad_plugins.georeference.on_earth import OnEarth

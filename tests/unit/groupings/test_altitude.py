@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.groupings.altitude import Altitude
 from crossgrad_plugins.groupings.heights import altitudes, upward
-from crossgrad_plugins.groupings.thresholds import gap_threshold, otsu_threshold
+from crossgrad_plugins.groupings.split import gap_threshold, otsu_threshold
 
 GRID = [(x, y) for x in (-4.0, -1.0, 1.0, 4.0) for y in (-3.0, 3.0)]
 

@@ -9,13 +9,10 @@ from scipy.stats import norm
 from crossgrad_core.contract.scene import Similarity, radial_distances
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_core.testing.posed import posed_scene, posed_view
-from crossgrad_plugins.groupings.anchors import Anchors
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
+from crossgrad_plugins.groupings.distance import Anchors, Percentile, Radial, Terciles
 from crossgrad_plugins.groupings.gmm import GaussianMixture
 from crossgrad_plugins.groupings.kmeans import KMeans
-from crossgrad_plugins.groupings.percentile import Percentile
-from crossgrad_plugins.groupings.radial import Radial
-from crossgrad_plugins.groupings.terciles import Terciles
 
 BY_POSITION = (
     "altitude",

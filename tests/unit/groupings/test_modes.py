@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract.grouping import Grouping, GroupingRule, Quantity
+from crossgrad_core.contract.slots.grouping import Grouping, GroupingRule, Quantity
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view, sample_scene
 from crossgrad_core.training.modes import mode_note
 
 CENTERS = Path(__file__).with_name("camera_centers.csv")

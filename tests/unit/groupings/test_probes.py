@@ -5,15 +5,15 @@ import pytest
 
 from crossgrad_core.contract.scene import footprint_of
 from crossgrad_core.errors import UserError
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.groupings.conflict_signature import (
     ConflictSignature,
     mean_cosines,
     spectral_cut,
 )
+from crossgrad_plugins.groupings.distance import Radial
 from crossgrad_plugins.groupings.footprint import Footprint
 from crossgrad_plugins.groupings.lists import Lists
-from crossgrad_plugins.groupings.radial import Radial
 
 RNG = np.random.default_rng(0)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.contract.scene import Camera
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.initializers.cells import Cells
 from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
 from crossgrad_plugins.initializers.fill_gaps import Filled

@@ -12,7 +12,7 @@ from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.training.start import first_state
-from crossgrad_plugins.initializers import two_views
+from crossgrad_plugins.initializers import triangulated
 from crossgrad_plugins.initializers.triangulated import Triangulated
 from crossgrad_plugins.readers.colmap import ColmapReader
 
@@ -109,10 +109,10 @@ def test_rays_meet_where_the_point_is(scene):
     count = len(points)
     colors, unlike = np.zeros((count, 3), np.uint8), np.eye(count, dtype=np.float32)
     ends = [
-        two_views.Features(view.camera, view.camera.project(points)[0], unlike, colors)
+        triangulated.Features(view.camera, view.camera.project(points)[0], unlike, colors)
         for view in (first, second)
     ]
-    met = two_views.meet(*ends, pixels=0.01)
+    met = triangulated.meet(*ends, pixels=0.01)
     assert len(met.points) > 10
     assert met.first.tolist() == met.second.tolist()
     np.testing.assert_allclose(met.points, points[met.first], atol=1e-9)

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from crossgrad_plugins.losses.l1_ssim import _DeviceLoss, photometric_loss
-from crossgrad_plugins.losses.photometric import on_device
+from crossgrad_plugins.losses.photometric import reference as on_device
 from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 from crossgrad_plugins.losses.photometric.reference import (
     _window_for,

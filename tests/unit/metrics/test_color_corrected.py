@@ -6,10 +6,12 @@ import torch
 
 from crossgrad_core.plugin import Compared, psnr
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_plugins.metrics.color_correction import color_corrected
-from crossgrad_plugins.metrics.psnr_cc import ColorCorrectedPSNR
-from crossgrad_plugins.metrics.similarity import ssim
-from crossgrad_plugins.metrics.ssim_cc import ColorCorrectedSSIM
+from crossgrad_plugins.metrics.color_correction import (
+    ColorCorrectedPSNR,
+    ColorCorrectedSSIM,
+    color_corrected,
+)
+from crossgrad_plugins.metrics.ssim import ssim
 
 SEEDS = range(6)
 

@@ -11,10 +11,8 @@ from torch import nn
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import Compared
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_plugins.metrics.lpips import LPIPS
-from crossgrad_plugins.metrics.lpips_vgg import LPIPSOfVGG
-from crossgrad_plugins.metrics.lpips_vgg_3dgs import LPIPSOfVGGAs3DGS
-from crossgrad_plugins.metrics.perceptual.trunks import ALEXNET, VGG16
+from crossgrad_plugins.metrics.lpips import LPIPS, LPIPSOfVGG, LPIPSOfVGGAs3DGS
+from crossgrad_plugins.metrics.lpips_trunks import ALEXNET, VGG16
 
 KINDS = (LPIPS, LPIPSOfVGG, LPIPSOfVGGAs3DGS)
 NO_SELECTION = SimpleNamespace()
@@ -220,7 +218,7 @@ def test_heads_without_a_trunk_are_refused(heads):
 
 
 def test_missing_heads_say_where_to_get_them(trunks, monkeypatch):
-    place = "crossgrad_plugins.metrics.perceptual.weights.find_spec"
+    place = "crossgrad_plugins.metrics.lpips_distance.find_spec"
     monkeypatch.setattr(place, lambda package: None)
     # A path of its own, since weights are kept once they are read.
     moved = trunks / "copy.pth"

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from crossgrad_core.registry.entries import build
-from crossgrad_operators.stress.case import short
+from crossgrad_operators.stress.cases import short
 from crossgrad_operators.stress.promises import ALL
 from crossgrad_operators.stress.runner import run_case
-from crossgrad_operators.stress.search.batch import Batch, results
+from crossgrad_operators.stress.search.families import Batch, results
 from crossgrad_operators.stress.suite import made, reference_of
 from crossgrad_operators.stress.verdict import ExactCase
 

@@ -13,7 +13,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_operators.chain import Chain
 from crossgrad_operators.dispatch import Dispatch
-from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_operators.projection import PCGrad
 
 ROWS = np.array([[1.0, 0.0, 2.0], [-1.0, 1.0, -1.0], [0.5, -2.0, 0.0]])
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_operators.stress.case import short
+from crossgrad_operators.stress.cases import short
 from crossgrad_operators.stress.runner import run_case
 from crossgrad_operators.stress.suite import made, reference_of
 from crossgrad_operators.stress.verdict import ExactCase

@@ -10,19 +10,17 @@ from typer.testing import CliRunner
 
 from crossgrad_core.contract.gramian_operator import GramianOperator
 from crossgrad_core.errors import UserError
+from crossgrad_operators.projection import Symmetric
 from crossgrad_operators.stress.promises import PROMISES
 from crossgrad_operators.stress.reference import ORACLES
-from crossgrad_operators.stress.search.batch import Batch, results
 from crossgrad_operators.stress.search.examine import examine
-from crossgrad_operators.stress.search.families import FAMILIES, rounded
+from crossgrad_operators.stress.search.families import FAMILIES, Batch, results, rounded
 from crossgrad_operators.stress.search.finite import as_text, run_finite
-from crossgrad_operators.stress.search.loop import Extent, fresh, search
+from crossgrad_operators.stress.search.loop import Extent, fresh, search, shrunk
 from crossgrad_operators.stress.search.repeat import read_rows
 from crossgrad_operators.stress.search.report import failed
 from crossgrad_operators.stress.search.samples import Sample
-from crossgrad_operators.stress.search.shrink import shrunk
 from crossgrad_operators.stress.suite import Subject, reference_of, subject_of
-from crossgrad_operators.symmetric import Symmetric
 
 BOTH = (torch.float32, torch.float64)
 

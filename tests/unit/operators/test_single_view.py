@@ -6,8 +6,8 @@ import torch
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.aggregation import aggregated, sample_gradients
 from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.aggregation import aggregated, sample_gradients
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.start import first_state
 

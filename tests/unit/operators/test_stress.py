@@ -11,13 +11,18 @@ from typer.testing import CliRunner
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import entries
-from crossgrad_operators.stress.case import Case, short
-from crossgrad_operators.stress.cases import cases
+from crossgrad_operators.projection import Symmetric
+from crossgrad_operators.stress.cases import Case, cases, short
 from crossgrad_operators.stress.runner import Reference, run_case
-from crossgrad_operators.stress.suite import made, reference_of, run_suite
-from crossgrad_operators.stress.table import as_text, failed, write_csv
+from crossgrad_operators.stress.suite import (
+    as_text,
+    failed,
+    made,
+    reference_of,
+    run_suite,
+    write_csv,
+)
 from crossgrad_operators.stress.verdict import ExactCase
-from crossgrad_operators.symmetric import Symmetric
 
 OURS = sorted(n for n, e in entries("operators").items() if e.value.startswith("crossgrad_"))
 #: The same cases with shorter gradients.

@@ -22,10 +22,9 @@ from crossgrad_core.commands import (
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.app import bundled_scene
 from crossgrad_core.run.decisions import with_decisions
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks import gains as tracks
-from crossgrad_plugins.exposures.tracks.fit import Fit
-from crossgrad_plugins.exposures.tracks.gains import TrackGains
+from crossgrad_plugins.exposures.tracks.gains import Fit, TrackGains
 from crossgrad_plugins.planner import appearance, data, grouping
 from crossgrad_plugins.planner.app import lines_of
 from crossgrad_plugins.planner.evidence import Evidence

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.commands import configured
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.exposures.tracks.observations import Observations
 from crossgrad_plugins.planner import appearance, view_dependence
 from crossgrad_plugins.planner.evidence import Evidence

@@ -9,7 +9,7 @@ import pytest
 from crossgrad_core.commands import ComponentChoice, UserError, configured
 from crossgrad_core.run import decisions
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.planner import plan_of
 from crossgrad_plugins.planner.view_schedule import directions, view_schedule

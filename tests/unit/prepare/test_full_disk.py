@@ -15,9 +15,9 @@ from crossgrad_core.system import check_writable
 from crossgrad_plugins.prepare import features, mapping, matching, undistortion
 from crossgrad_plugins.prepare.layout import Layout, check_ours, clear_damaged, clear_leftovers
 from crossgrad_plugins.prepare.plan import Photo, Plan, Settings
+from crossgrad_plugins.prepare.pycolmap_calls import is_whole, write_model
 from crossgrad_plugins.prepare.refine_poses import _Again
 from crossgrad_plugins.prepare.results import _place
-from crossgrad_plugins.prepare.scene_integrity import is_whole, write_model
 
 FULL = "not enough disk space"
 FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")

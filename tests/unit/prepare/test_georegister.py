@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from crossgrad_plugins.prepare import georegister
+from crossgrad_plugins.prepare.earth import top_of
 from crossgrad_plugins.prepare.georegister import centers_of, merged, placement_of
-from crossgrad_plugins.prepare.gravity import top_of
 
 
 def synthetic(frames=12, seed=0):

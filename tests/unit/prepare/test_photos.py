@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import pillow
+from crossgrad_core.scene.photos import pillow
 from crossgrad_plugins.prepare import photos
 from crossgrad_plugins.prepare.masks import counting_pixels
 from crossgrad_plugins.prepare.photos import camera_of, find_photos, position_of

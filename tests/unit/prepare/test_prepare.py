@@ -22,8 +22,8 @@ from crossgrad_plugins.prepare.earth import local_positions, origin_of
 from crossgrad_plugins.prepare.layout import Layout
 from crossgrad_plugins.prepare.photos import find_photos
 from crossgrad_plugins.prepare.plan import Plan, Position, Settings
+from crossgrad_plugins.prepare.pycolmap_calls import rows_of
 from crossgrad_plugins.prepare.report import data_of, summary_lines
-from crossgrad_plugins.prepare.subprocess_wait import rows_of
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 #: Metres of a unit of the bundled scene, for GPS, and a place in the south and the west.

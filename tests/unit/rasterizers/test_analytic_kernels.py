@@ -4,8 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from crossgrad_plugins.rasterizers.numba_kernels import analytic
-from crossgrad_plugins.rasterizers.numba_kernels.analytic import CUBIC, LINEAR, TAIL
+from crossgrad_plugins.rasterizers.numba_kernels.tiles import analytic
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import CUBIC, LINEAR, TAIL
 
 
 # Device functions have no entry point for Python.

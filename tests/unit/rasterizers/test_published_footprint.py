@@ -9,7 +9,7 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run import select as selecting

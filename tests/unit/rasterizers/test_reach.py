@@ -4,7 +4,7 @@ import numpy as np
 
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.simd import WIDE, load_wide
-from crossgrad_plugins.rasterizers.numba_kernels.reach import reached_patches
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.footprint import reached_patches
 
 
 @kernel

@@ -12,7 +12,7 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.file_names import FileNames
+from crossgrad_core.scene.photos.file_names import FileNames
 from crossgrad_plugins.readers._equal_labels import Labelled, paired
 from crossgrad_plugins.readers.metashape import MetashapeReader
 

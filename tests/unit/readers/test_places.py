@@ -32,8 +32,8 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 from crossgrad_plugins.georeference.ellipsoid import Place, geocentric
 from crossgrad_plugins.georeference.frames import Frame3D
 from crossgrad_plugins.georeference.on_earth import OnEarth
-from crossgrad_plugins.readers._gps import of_headers
-from crossgrad_plugins.readers._priors import of_priors
+from crossgrad_plugins.readers.place.files import of_priors
+from crossgrad_plugins.readers.place.headers import of_headers
 
 SIZE = {"width": 24, "height": 16, "points": 40}
 

@@ -8,8 +8,7 @@ import crossgrad_core as cg
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.decision import Length
 from crossgrad_core.errors import UserError
-from crossgrad_core.recipe.lines import LINES, short_lines
-from crossgrad_core.recipe.table import DECIDED
+from crossgrad_core.recipe.table import DECIDED, LINES, short_lines
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import with_decisions
 from crossgrad_core.run.resolve import resolved

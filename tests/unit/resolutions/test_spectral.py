@@ -16,10 +16,9 @@ from crossgrad_core.plugin import PluginState
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.fixtures import sample_scene, step_fields
 from crossgrad_plugins.resolutions import spectral
-from crossgrad_plugins.resolutions.course import LATEST, window_of
+from crossgrad_plugins.resolutions.coarse_to_fine import LATEST, window_of
 from crossgrad_plugins.resolutions.octaves import Octaves
-from crossgrad_plugins.resolutions.spectral import MOST_PHOTOS, Scales, Spectral, _Group
-from crossgrad_plugins.resolutions.spectrum import GRID
+from crossgrad_plugins.resolutions.spectral import GRID, MOST_PHOTOS, Scales, Spectral, _Group
 
 WIDTH, HEIGHT = 320, 240
 

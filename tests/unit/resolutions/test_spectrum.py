@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_plugins.resolutions import spectrum
-from crossgrad_plugins.resolutions.spectrum import (
+from crossgrad_plugins.resolutions import spectral
+from crossgrad_plugins.resolutions.spectral import (
     GRID,
     amplitudes_within,
     grey_window,
@@ -98,7 +98,7 @@ def test_pixels_that_do_not_count_do_not_matter():
 
 
 def test_of_a_large_photo_the_middle_is_looked_at_in_its_own_pixels(monkeypatch):
-    monkeypatch.setattr(spectrum, "_WINDOW", 8)
+    monkeypatch.setattr(spectral, "_WINDOW", 8)
     image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (13, 20, 3), dtype=np.uint8))
     expected = image[2:10, 6:14].double().mean(2).numpy()
     assert grey_window(image, None) == pytest.approx(expected)
@@ -127,7 +127,7 @@ def test_no_bit_depends_on_threads(monkeypatch):
     found = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        monkeypatch.setattr(spectrum, "_AT_ONCE", threads)
+        monkeypatch.setattr(spectral, "_AT_ONCE", threads)
         found.append(kept_shares(views_of(*photos)))
     torch.set_num_threads(before)
     assert (found[0] == found[1]).all()

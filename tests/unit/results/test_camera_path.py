@@ -12,7 +12,7 @@ from crossgrad_core.contract.scene import Similarity
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.camera_path import camera_path, zoom_path
 from crossgrad_core.run.results import video
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 
 FRAMES = 9
 IDENTITY = np.eye(4).ravel().tolist()

@@ -14,7 +14,7 @@ from crossgrad_core.run.cross_capture import (
     _are_trained,
     _check_place,
 )
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view
 
 
 def moved(view, shift, angle, rng):

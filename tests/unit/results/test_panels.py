@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from support.figures import of
 
-from crossgrad_core.contract.metric import Compared
+from crossgrad_core.contract.slots.metric import Compared
 from crossgrad_core.errors import UserError
 from crossgrad_core.evaluation.evaluation import Evaluated
 from crossgrad_core.run.results.panels import (

@@ -9,13 +9,12 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import ViewSample
-from crossgrad_core.contract.rule import GaussiansContext
+from crossgrad_core.contract.slots.rule import GaussiansContext
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.scene.shown_points import photos_per_point
-from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view, sample_scene
 from crossgrad_core.training.rules import view_gaussians
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import take_step

@@ -9,14 +9,13 @@ import torch
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import PluginState
-from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
-from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.posed import posed_scene, posed_view
+from crossgrad_core.testing.fixtures import posed_scene, posed_view, sample_scene
 from crossgrad_core.training.rules import eval_parameters
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.step import final_edits, model_of, take_step

@@ -13,7 +13,7 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.contexts import Answer, DensifyResult, ViewSample
 from crossgrad_core.contract.decision import Length
-from crossgrad_core.contract.rule import FinalEdit, GaussiansResult
+from crossgrad_core.contract.slots.rule import FinalEdit, GaussiansResult
 from crossgrad_core.errors import UserError
 from crossgrad_core.plugin import Edit, PluginState, Rows, Rule, hookimpl
 from crossgrad_core.registry.entries import entries

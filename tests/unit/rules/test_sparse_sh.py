@@ -8,8 +8,8 @@ import torch
 
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import RegularizeResult
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene

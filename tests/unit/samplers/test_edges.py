@@ -9,10 +9,10 @@ from support.selections import selection_of
 from crossgrad_core.contract.objections import objections_to
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
+from crossgrad_core.testing.fixtures import SamplerRun, posed_scene, posed_view
+from crossgrad_plugins.samplers.balanced import NearFar
 from crossgrad_plugins.samplers.fps import FarthestPoint, farthest_point_order
 from crossgrad_plugins.samplers.horizon import Horizon
-from crossgrad_plugins.samplers.near_far import NearFar
 
 ADMITTED = {
     "active": {2},

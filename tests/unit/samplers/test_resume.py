@@ -7,7 +7,7 @@ import pytest
 
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.registry.entries import build
-from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
+from crossgrad_core.testing.fixtures import SamplerRun, posed_scene, posed_view
 
 TWO = ("near",) * 4 + ("far",) * 7
 THREE = ("near",) * 3 + ("middle",) * 4 + ("far",) * 4

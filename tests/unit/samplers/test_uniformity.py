@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from crossgrad_core.testing.posed import SamplerRun, posed_scene, posed_view
+from crossgrad_core.testing.fixtures import SamplerRun, posed_scene, posed_view
 from crossgrad_plugins.samplers.active import Active
 from crossgrad_plugins.samplers.anchors_30 import Anchors30
-from crossgrad_plugins.samplers.epoch import Epoch
+from crossgrad_plugins.samplers.balanced import NearFar, RandomSplit, ThreeWay
 from crossgrad_plugins.samplers.fps import FarthestPoint
 from crossgrad_plugins.samplers.horizon import Horizon
-from crossgrad_plugins.samplers.near_far import NearFar
-from crossgrad_plugins.samplers.random import Random
-from crossgrad_plugins.samplers.random_split import RandomSplit
-from crossgrad_plugins.samplers.three_way import ThreeWay
+from crossgrad_plugins.samplers.uniform import Epoch, Random
 
 STEPS = 1500
 UNEQUAL = ("near",) * 3 + ("far",) * 6

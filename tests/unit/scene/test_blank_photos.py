@@ -87,7 +87,7 @@ def test_photos_without_masks_are_not_decoded(scene, monkeypatch):
     def decoded(*args):
         raise AssertionError("a photo was decoded")
 
-    monkeypatch.setattr("crossgrad_core.scene.photos.PhotoSource.decode", decoded)
+    monkeypatch.setattr("crossgrad_core.scene.photos.photos.PhotoSource.decode", decoded)
     monkeypatch.setattr("crossgrad_core.scene.build.decode_photo", decoded)
     mask(scene, "0001.png", np.full(SIZE[::-1], 255))
     assert len(read(scene).views) == 9

@@ -6,7 +6,7 @@ from PIL import Image, ImageOps
 from skimage.transform import resize as skimage_resize
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.decode import blend, decode_mask, decode_photo, resize, turn
+from crossgrad_core.scene.photos.decode import blend, decode_mask, decode_photo, resize, turn
 
 RNG = np.random.default_rng(0)
 GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)

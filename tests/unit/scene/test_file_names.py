@@ -2,7 +2,7 @@
 
 import pytest
 
-from crossgrad_core.scene.file_names import FileNames, same_spelling
+from crossgrad_core.scene.photos.file_names import FileNames, same_spelling
 
 TWO = ("cam0/p0.png", "cam1/p0.png")
 

@@ -15,8 +15,14 @@ from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_scene
 from crossgrad_core.run.results.scene_file import FILE, check_scene, read_scene_file, write_scene
-from crossgrad_core.scene.differences import Weight, differences
-from crossgrad_core.scene.fingerprint import END, FileMark, fingerprint_of, mark_of
+from crossgrad_core.scene.fingerprint import (
+    END,
+    FileMark,
+    Weight,
+    differences,
+    fingerprint_of,
+    mark_of,
+)
 from crossgrad_core.testing.fixtures import sample_scene
 
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.decode import decode_photo
-from crossgrad_core.scene.headers import PhotoHeader, read_header, read_quarter_turn
+from crossgrad_core.scene.photos.decode import decode_photo
+from crossgrad_core.scene.photos.headers import PhotoHeader, read_header, read_quarter_turn
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
 

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import heif
-from crossgrad_core.scene.decode import decode_photo
-from crossgrad_core.scene.headers import read_header
-from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.photos import pillow
+from crossgrad_core.scene.photos.decode import decode_photo
+from crossgrad_core.scene.photos.headers import read_header
+from crossgrad_core.scene.photos.photo_files import PhotoFolder
 
 #: The first box of an iPhone's photo.
 HEAD = b"\0\0\0\x24ftypheic\0\0\0\0mif1MiHBheic"
@@ -18,10 +18,10 @@ HEAD = b"\0\0\0\x24ftypheic\0\0\0\0mif1MiHBheic"
 
 @pytest.fixture
 def missing(monkeypatch):
-    heif._registered.cache_clear()
+    pillow._registered.cache_clear()
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     yield
-    heif._registered.cache_clear()
+    pillow._registered.cache_clear()
 
 
 def test_the_error_names_the_package(tmp_path, missing):

@@ -10,10 +10,10 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene import decode, pillow
-from crossgrad_core.scene.decode import decode_photo, resize
-from crossgrad_core.scene.headers import PhotoHeader, read_header
-from crossgrad_core.scene.reduction import choose_reduction
+from crossgrad_core.scene.photos import decode, pillow
+from crossgrad_core.scene.photos.decode import decode_photo, resize
+from crossgrad_core.scene.photos.headers import PhotoHeader, read_header
+from crossgrad_core.scene.photos.shapes import choose_reduction
 from crossgrad_plugins.readers.colmap import ColmapReader
 
 resource = pytest.importorskip("resource")

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.photo_notes import note_undistortion
-from crossgrad_core.scene.photos import PhotoSource
+from crossgrad_core.scene.photos.photo_notes import note_undistortion
+from crossgrad_core.scene.photos.photos import PhotoSource
 
 WIDTH, HEIGHT = 160, 120
 #: Model, parameters behind the focal length and the principal point, and the fold's radius at

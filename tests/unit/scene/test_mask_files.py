@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.mask_files import check_masks, find_mask_folder, pair_masks
+from crossgrad_core.scene.photos.photo_files import check_masks, find_mask_folder, pair_masks
 
 
 def found(folder, masks, *photos):

@@ -11,9 +11,9 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.registry.entries import build
-from crossgrad_core.scene.choose_photos import white_of
-from crossgrad_core.scene.decode import brightest, decode_photo
-from crossgrad_core.scene.headers import read_header
+from crossgrad_core.scene.photos.choose_photos import white_of
+from crossgrad_core.scene.photos.decode import brightest, decode_photo
+from crossgrad_core.scene.photos.headers import read_header
 
 RAMP = np.linspace(0.0, 0.95, 40 * 60).reshape(40, 60)
 

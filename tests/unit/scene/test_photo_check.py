@@ -10,8 +10,7 @@ from support.scenes import write_tiny_scene
 from crossgrad_core.config import RunConfig
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import read_scene
-from crossgrad_core.scene.photo_check import check_photos, fits
-from crossgrad_core.scene.photos_ahead import AT_ONCE, PhotosAhead
+from crossgrad_core.scene.photos.photos_ahead import AT_ONCE, PhotosAhead, check_photos, fits
 from crossgrad_core.testing.fixtures import sample_scene
 
 SECONDS = 30

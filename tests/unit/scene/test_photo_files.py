@@ -3,8 +3,7 @@
 import pytest
 from PIL import Image
 
-from crossgrad_core.scene.mask_files import find_mask
-from crossgrad_core.scene.photo_files import PhotoFolder
+from crossgrad_core.scene.photos.photo_files import PhotoFolder, find_mask
 
 LONGEST = "a" * 251 + ".png"
 

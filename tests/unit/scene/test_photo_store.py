@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from crossgrad_core.scene import photo_store
-from crossgrad_core.scene.photo_store import PhotoStore, store_folder
-from crossgrad_core.scene.photos import PhotoCache
+from crossgrad_core.scene.photos import photo_store
+from crossgrad_core.scene.photos.photo_store import PhotoStore, store_folder
+from crossgrad_core.scene.photos.photos import PhotoCache
 
 WIDTH, HEIGHT = 40, 30
 BYTES = 12 + 3 * WIDTH * HEIGHT

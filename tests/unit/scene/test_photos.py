@@ -9,8 +9,8 @@ from PIL import Image
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.photos import FilePhoto, PhotoCache, PhotoSource
-from crossgrad_core.scene.shapes import is_turned
+from crossgrad_core.scene.photos.photos import FilePhoto, PhotoCache, PhotoSource
+from crossgrad_core.scene.photos.shapes import is_turned
 
 RNG = np.random.default_rng(0)
 RGB = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)

@@ -6,9 +6,9 @@ from threading import Event
 import pytest
 import torch
 
-from crossgrad_core.scene import photos
-from crossgrad_core.scene.photos import FilePhoto, PhotoCache
-from crossgrad_core.scene.photos_ahead import AT_ONCE, PhotosAhead
+from crossgrad_core.scene.photos import photos
+from crossgrad_core.scene.photos.photos import FilePhoto, PhotoCache
+from crossgrad_core.scene.photos.photos_ahead import AT_ONCE, PhotosAhead
 from crossgrad_core.testing.fixtures import sample_scene
 
 SECONDS = 30

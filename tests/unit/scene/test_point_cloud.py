@@ -10,10 +10,8 @@ from support.scenes import write_tiny_scene
 
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.errors import UserError
-from crossgrad_core.scene.las import read_las
-from crossgrad_core.scene.point_cloud import read_cloud
-from crossgrad_core.scene.raw_checks import CheckedPoints
-from crossgrad_core.scene.thinning import thinned
+from crossgrad_core.scene.point_cloud import read_cloud, read_las, thinned
+from crossgrad_core.scene.raw import CheckedPoints
 from crossgrad_plugins.exporters.ply import Ply
 from crossgrad_plugins.readers.colmap import ColmapReader
 
@@ -220,8 +218,8 @@ def test_of_a_huge_las_file_each_so_many_points_is_read(tmp_path, monkeypatch):
     laspy = pytest.importorskip("laspy")
     xyz = np.arange(300.0).reshape(100, 3)
     path = write_las(laspy, tmp_path / "scan.las", xyz, None)
-    monkeypatch.setattr("crossgrad_core.scene.las._MOST", 40)
-    monkeypatch.setattr("crossgrad_core.scene.las._AT_ONCE", 7)
+    monkeypatch.setattr("crossgrad_core.scene.point_cloud._MOST_IN_LAS", 40)
+    monkeypatch.setattr("crossgrad_core.scene.point_cloud._AT_ONCE", 7)
     np.testing.assert_allclose(read_cloud(path, "").positions, xyz[::3], atol=1e-3)
 
 

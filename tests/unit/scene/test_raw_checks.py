@@ -6,8 +6,7 @@ import pytest
 from crossgrad_core.errors import UserError
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import camera_centers, make_frame
-from crossgrad_core.scene.raw import RawScene, RawView
-from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
+from crossgrad_core.scene.raw import RawScene, RawView, check_distances, check_points, check_views
 
 CAMERA = Calibration("PINHOLE", 48, 32, (50.0, 50.0, 24.0, 16.0))
 POINTS = np.arange(12.0).reshape(4, 3)

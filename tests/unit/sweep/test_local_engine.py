@@ -8,11 +8,9 @@ import pytest
 from support import fake_run
 
 from crossgrad_plugins.sweep.engines import Stop, Work, engine
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
+from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.machine import Machine
-from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.run_status import standings
+from crossgrad_plugins.sweep.run_status import read_records, standings
 
 GIB = 2**30
 

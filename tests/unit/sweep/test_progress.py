@@ -8,15 +8,11 @@ import pytest
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep import progress as screens
-from crossgrad_plugins.sweep.estimate import duration, estimated
 from crossgrad_plugins.sweep.grid import Metric
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.progress import Screen
-from crossgrad_plugins.sweep.records import append, read_records
-from crossgrad_plugins.sweep.run_status import Standing
+from crossgrad_plugins.sweep.job import Job, Layout
+from crossgrad_plugins.sweep.progress import Screen, Watch, duration, estimated
+from crossgrad_plugins.sweep.run_status import Standing, append, read_records
 from crossgrad_plugins.sweep.summary import earlier_rows, table, write_plan
-from crossgrad_plugins.sweep.watch import Watch
 
 JOBS = [Job(f"id{n}", "arm", "city", n, {}) for n in range(4)]
 

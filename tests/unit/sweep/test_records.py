@@ -7,7 +7,7 @@ import os
 import pytest
 
 from crossgrad_core.commands import UserError
-from crossgrad_plugins.sweep.records import append, read_records
+from crossgrad_plugins.sweep.run_status import append, read_records
 
 
 def add(folder, worker="1", **more):

@@ -7,10 +7,8 @@ from support import fake_run
 
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.sweep.engines import Work, engine
-from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.layout import Layout
-from crossgrad_plugins.sweep.records import read_records
-from crossgrad_plugins.sweep.run_status import standings
+from crossgrad_plugins.sweep.job import Job, Layout
+from crossgrad_plugins.sweep.run_status import read_records, standings
 
 pytest.importorskip("submitit")
 

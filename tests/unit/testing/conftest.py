@@ -2,7 +2,7 @@
 
 import pytest
 
-from crossgrad_core.testing import growth
+from crossgrad_core.testing.support import growth
 
 
 @pytest.fixture

@@ -15,9 +15,7 @@ from pydantic import ConfigDict, field_serializer
 from crossgrad_core import plugin as api
 from crossgrad_core.registry.entries import load
 from crossgrad_core.testing import (
-    aggregation,
     backbones,
-    components,
     densifiers,
     exporters,
     exposures,
@@ -28,10 +26,10 @@ from crossgrad_core.testing import (
     operators,
     rasterizers,
     readers,
-    reference,
     samplers,
 )
-from crossgrad_core.testing.contract import ContractError
+from crossgrad_core.testing.support import aggregation, components, reference
+from crossgrad_core.testing.support.contract import ContractError
 
 Vanilla = load("backbones", "vanilla")
 Torch = load("rasterizers", "torch")

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.pairwise import pairs_of, pairwise
 
-from crossgrad_plugins.authoring.matrix.pairwise import meetings
+from crossgrad_plugins.authoring.matrix.combinations import meetings
 
 
 def pairs(rows):

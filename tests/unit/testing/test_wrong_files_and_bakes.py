@@ -9,7 +9,7 @@ import pytest
 from crossgrad_core import plugin as api
 from crossgrad_core.registry.entries import load
 from crossgrad_core.testing import backbones, exporters
-from crossgrad_core.testing.contract import ContractError
+from crossgrad_core.testing.support.contract import ContractError
 
 Vanilla = load("backbones", "vanilla")
 Ply = load("exporters", "ply")

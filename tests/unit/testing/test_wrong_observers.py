@@ -9,7 +9,7 @@ from pydantic import PrivateAttr
 
 from crossgrad_core import plugin as api
 from crossgrad_core.testing import observers
-from crossgrad_core.testing.contract import ContractError
+from crossgrad_core.testing.support.contract import ContractError
 
 
 class RaisesLate(api.Observer):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from crossgrad_core.registry.entries import load
-from crossgrad_core.testing import reference
-from crossgrad_core.testing.contract import ContractError
+from crossgrad_core.testing.support import reference
+from crossgrad_core.testing.support.contract import ContractError
 
 Torch = load("rasterizers", "torch")
 

@@ -8,8 +8,9 @@ import torch
 
 from crossgrad_core import plugin as api
 from crossgrad_core.registry.entries import load
-from crossgrad_core.testing import aggregation, densifiers, growth, operators, resolutions, samplers
-from crossgrad_core.testing.contract import ContractError
+from crossgrad_core.testing import densifiers, operators, resolutions, samplers
+from crossgrad_core.testing.support import aggregation, growth
+from crossgrad_core.testing.support.contract import ContractError
 
 NoDensification = load("densifiers", "none")
 FullSize = load("resolutions", "full")

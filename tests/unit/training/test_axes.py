@@ -16,7 +16,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.entries import entries
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import Checkpoint
+from crossgrad_core.run.checkpoint import Checkpoint
 from crossgrad_core.run.load_run import check_settings, settings_of
 from crossgrad_core.run.unused_settings import refuse_settings_for_nothing
 from crossgrad_core.testing.fixtures import sample_scene

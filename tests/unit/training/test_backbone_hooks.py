@@ -9,7 +9,7 @@ import torch
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import NO_EDIT, Block, Edit, LearningRate, PluginState
-from crossgrad_core.contract.densifier import Densifier
+from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.errors import IncompatibleSelectionError
 from crossgrad_core.registry.entries import build, load
 from crossgrad_core.run import assemble as assembling

@@ -8,8 +8,8 @@ import pytest
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import Block
-from crossgrad_core.contract.densifier import Densifier
 from crossgrad_core.contract.schedule import Schedule
+from crossgrad_core.contract.slots.densifier import Densifier
 from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.decisions import with_decisions

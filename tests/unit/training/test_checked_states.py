@@ -9,8 +9,8 @@ import torch
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import Edit, Rows
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import DensifyResult
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble

@@ -16,7 +16,7 @@ from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.contract.schedule import Counting, Schedule, ViewsPerStepSpec
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import Keep, latest, load, save
+from crossgrad_core.run.checkpoint import Keep, latest, load, save
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.run.resolve import resolved
 from crossgrad_core.testing.fixtures import sample_scene

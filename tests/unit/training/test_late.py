@@ -11,13 +11,13 @@ import torch
 from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.blocks import AdamRule, AdamState
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import RegularizeResult
 from crossgrad_core.contract.gaussians import Gaussians
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.screen_statistics import seen
 from crossgrad_core.gradients.sparse_rows import coalesced, dense, rows_of, sparse_rows, values_of
 from crossgrad_core.run.assemble import assemble
-from crossgrad_core.run.checkpoint.checkpoint import Keep, latest, load, save
+from crossgrad_core.run.checkpoint import Keep, latest, load, save
 from crossgrad_core.run.load_run import from_checkpoint, to_checkpoint
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training.adam import late
@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams
 from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import RollbackGuard, Snapshot, TrainState
 from crossgrad_operators.graddrop import GradDrop
-from crossgrad_operators.pcgrad import PCGrad
+from crossgrad_operators.projection import PCGrad
 from crossgrad_operators.sum import Sum
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 

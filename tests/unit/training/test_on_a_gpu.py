@@ -17,7 +17,7 @@ from support import counted
 
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.gaussians import Render, Screen
-from crossgrad_core.contract.rasterizer import Rasterizer
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
@@ -28,8 +28,7 @@ from crossgrad_core.training.state import NonFiniteError
 from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn
 from crossgrad_plugins.rasterizers.numba_cpu import NumbaRasterizer
 from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
-from crossgrad_plugins.rasterizers.reference.projection import project
-from crossgrad_plugins.rasterizers.reference.responses import shape
+from crossgrad_plugins.rasterizers.reference.projection import project, shape
 
 #: Set in the process that has the device: torch has to know it before the first backward pass.
 FRESH = "CROSSGRAD_COUNTED_DEVICE"

@@ -11,11 +11,11 @@ import torch
 from crossgrad_core.contract.component import ViewCounts
 from crossgrad_core.contract.contexts import AggregateResult
 from crossgrad_core.contract.gramian_operator import GramianOperator
-from crossgrad_core.contract.operator import Operator
+from crossgrad_core.contract.slots.operator import Operator
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
-from crossgrad_core.testing.aggregation import aggregate_context, sample_gradients
-from crossgrad_core.testing.contract import admitted
+from crossgrad_core.testing.support.aggregation import aggregate_context, sample_gradients
+from crossgrad_core.testing.support.contract import admitted
 from crossgrad_core.training.setup import OperatorScale, Scale, neutral
 from crossgrad_core.training.views import joined
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.hooks import HookSpecs
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.run.load_run import to_checkpoint

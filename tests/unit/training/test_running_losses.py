@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crossgrad_core.contract.blocks import EMPTY_STATE, PluginState
-from crossgrad_core.contract.resolution import octave
+from crossgrad_core.contract.slots.resolution import octave
 from crossgrad_core.registry.entries import build
 from crossgrad_core.testing.samplers import sampler_run
 

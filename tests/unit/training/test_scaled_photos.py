@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from crossgrad_core.contract.gaussians import Gaussians, Screen
 from crossgrad_core.contract.screen_statistics import ndc_gradient, pixels, radii
 from crossgrad_core.testing.fixtures import sample_scene
-from crossgrad_core.testing.records import view_record
+from crossgrad_core.testing.support.renders import view_record
 from crossgrad_core.training.scaled_photos import ScaledPhotos, _bytes, reduced
 from crossgrad_core.training.views import camera_at
 

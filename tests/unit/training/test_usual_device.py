@@ -8,9 +8,9 @@ import torch
 
 from crossgrad_core.errors import UserError
 from crossgrad_core.run.assemble import assemble
+from crossgrad_core.run.devices import with_device
 from crossgrad_core.run.load_run import _config
 from crossgrad_core.run.settings import parsed
-from crossgrad_core.run.usual_device import with_device
 from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_plugins.rasterizers.gpu import missing
 from crossgrad_plugins.rasterizers.gswarp_cuda import GswarpRasterizer

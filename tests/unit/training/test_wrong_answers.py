@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from crossgrad_core.config import RunConfig
-from crossgrad_core.contract import densifier, operator, resolution, sampler
-from crossgrad_core.contract.backbone import Backbone
 from crossgrad_core.contract.blocks import (
     NO_EDIT,
     TAKEN,
@@ -18,12 +16,14 @@ from crossgrad_core.contract.blocks import (
     PluginState,
     Rows,
 )
+from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import DensifyResult, RegularizeResult, ViewSample
-from crossgrad_core.contract.exposure import Exposure
 from crossgrad_core.contract.gramian_operator import GramianOperator, Weighting, _kinds
-from crossgrad_core.contract.initializer import MorePoints
-from crossgrad_core.contract.markers import hookimpl
 from crossgrad_core.contract.objections import objections_to
+from crossgrad_core.contract.slots import densifier, operator, resolution, sampler
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.exposure import Exposure
+from crossgrad_core.contract.slots.initializer import MorePoints
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager

@@ -10,14 +10,14 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import override
 
-from crossgrad_backbones.anchors.growth.anchor_base import AnchorDensifier
-from crossgrad_backbones.anchors.growth.cells import cells_of, free_cells, in_reach
-from crossgrad_backbones.anchors.growth.new_anchors import (
+from crossgrad_backbones.anchors.growth.anchor_base import (
+    AnchorDensifier,
     GrowthRequest,
     NewAnchors,
     largest,
     offset_means,
 )
+from crossgrad_backbones.anchors.voxels import cells_of, free_cells, in_reach
 from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selection
 
 

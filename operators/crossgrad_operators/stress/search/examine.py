@@ -8,11 +8,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crossgrad_operators.stress.case import short
+from crossgrad_operators.stress.cases import short
 from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import compared
-from crossgrad_operators.stress.search.batch import Batch, results, search_views
-from crossgrad_operators.stress.search.families import USUAL
+from crossgrad_operators.stress.search.families import USUAL, Batch, results, search_views
 from crossgrad_operators.stress.solvers import UnprovenError
 from crossgrad_operators.stress.suite import Subject
 from crossgrad_operators.stress.verdict import ExactCase, Finding, by_law, facts_of

@@ -1,27 +1,31 @@
-"""Random gradients of the kinds that small solvers get wrong."""
+"""Many short gradients at once, of the kinds that small solvers get wrong."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from crossgrad_core.plugin import EMPTY_STATE, Block, GramianOperator, LearningRate, Operator
+from crossgrad_operators.stress.reference import Views
+from crossgrad_operators.stress.runner import context_of
+
 Rows = NDArray[np.float64]
 #: (generator, B, K, P) -> [B, K, P] gradients.
 Family = Callable[[np.random.Generator, int, int, int], Rows]
-
 #: Largest number of views and of elements.
 VIEWS, ELEMENTS = 20, 50
 #: The distribution that shares of gradients outside a set are stated for.
 USUAL: Final = "random"
-
-
 #: Numbers of views, and how often each is drawn: 50 digits take 1 ms for two views, 1 s for 20.
 _VIEWS: Final = np.arange(2, VIEWS + 1)
 _SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
 #: Cases of a batch, times K^2.
 _CASES: Final = 256
+#: The block whose rows are gradients of their own.
+BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
 def cases_of(views: int) -> int:
@@ -135,3 +139,62 @@ FAMILIES: Final[Mapping[str, Family]] = {
     "zeros": zeros,
     "mixed": mixed,
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """B cases of equal size.
+
+    Attributes:
+        rows: [B, K, P] gradients, exact in their type.
+        dtype: Type of the gradients.
+        family: Where they come from.
+    """
+
+    rows: Rows
+    dtype: torch.dtype
+    family: str
+
+    @property
+    def views(self) -> int:
+        """K."""
+        return int(self.rows.shape[1])
+
+
+def search_views(count: int, seed: int = 0) -> Views:
+    """Near and far views in turn, at distances whose powers multiply gradients without error."""
+    labels = tuple(("near", "far")[k % 2] for k in range(count))
+    return Views(labels, tuple(2.0 ** (k % 6 - 2) for k in range(count)), seed)
+
+
+def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
+    """[B, P] what an operator makes of each case; NaN where it raises an error."""
+    if isinstance(operator, GramianOperator):
+        operator = operator.model_copy(update={"granularity": "gaussian"})
+    return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))
+
+
+def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
+    gradients = [
+        {BLOCK.name: torch.from_numpy(np.ascontiguousarray(rows[:, k])).to(dtype)}
+        for k in range(rows.shape[1])
+    ]
+    context = context_of(gradients, (BLOCK,), views)
+    try:
+        found = operator.aggregate(context, EMPTY_STATE)[0].gradients[BLOCK.name]
+    except Exception:
+        # Third-party code may raise anything.
+        return _halved(operator, rows, dtype, views)
+    if found is None:
+        return np.full(rows[:, 0].shape, np.nan)
+    result: Rows = found.detach().double().numpy()
+    return result
+
+
+def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
+    """The cases that raise the error found by halves, so that the others keep their results."""
+    if len(rows) == 1:
+        return np.full(rows[:, 0].shape, np.nan)
+    half = len(rows) // 2
+    parts = (rows[:half], rows[half:])
+    return np.concatenate([_results(operator, part, dtype, views) for part in parts])

@@ -11,8 +11,7 @@ import torch
 
 from crossgrad_core.commands import write_table
 from crossgrad_core.numerics.threads import on_one_thread
-from crossgrad_operators.stress.search.batch import Batch, results
-from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, rounded
+from crossgrad_operators.stress.search.families import FAMILIES, VIEWS, Batch, results, rounded
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.suite import Subject
 

@@ -1,7 +1,7 @@
-"""Rounds of the search: fresh gradients for all operators, then mutants of each one's worst."""
+"""Rounds of the search: fresh gradients, then mutants of each operator's worst, shrunk."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from time import monotonic
 from zlib import crc32
 
@@ -11,16 +11,26 @@ import torch
 from crossgrad_core.numerics.threads import on_one_thread
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.runner import UNPROVEN, judged
-from crossgrad_operators.stress.search.batch import Batch, search_views
 from crossgrad_operators.stress.search.examine import exact_case, examine, largest_jump
-from crossgrad_operators.stress.search.families import FAMILIES, cases_of, rounded, sizes
-from crossgrad_operators.stress.search.samples import mutants
-from crossgrad_operators.stress.search.shrink import shrunk
-from crossgrad_operators.stress.search.worst_cases import WorstCases, specimen
+from crossgrad_operators.stress.search.families import (
+    FAMILIES,
+    Batch,
+    Rows,
+    cases_of,
+    rounded,
+    search_views,
+    sizes,
+)
+from crossgrad_operators.stress.search.samples import Sample, mutants
+from crossgrad_operators.stress.search.worst_cases import WorstCases, severity, specimen
 from crossgrad_operators.stress.suite import Subject
 
 #: Cases of a round that are moved by a little, which needs no exact arithmetic.
 JUMPS = 64
+#: What a smaller case must keep of the value.
+KEPT = 0.7
+#: Significant digits that elements are rounded to.
+FEW_DIGITS = (1, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -113,3 +123,51 @@ def _over_steps(subject: Subject, tally: WorstCases, batch: Batch, turn: int) ->
     finding, _ = judged(subject.operator, exact_case(batch, 0), subject.reference, search_views)
     if finding.verdict == "failed" and finding.reason != UNPROVEN:
         tally.fail(specimen(batch, 0, turn), f"over several steps: {finding.reason}")
+
+
+def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
+    """The case without the rows, elements and digits that it does not need.
+
+    Args:
+        subject: The operator.
+        specimen: A case of a large error inside the set, or of a long result outside.
+        inside: Which of the two.
+    """
+    least = KEPT * specimen.value
+    while True:
+        for rows in _smaller(subject, specimen.rows, specimen.dtype):
+            batch = Batch(rows[None], specimen.dtype, specimen.family)
+            value = severity(examine(subject, batch)[0], inside=inside)
+            if value >= least:
+                specimen = replace(specimen, rows=rows, value=value)
+                break
+        else:
+            return specimen
+
+
+def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]:
+    """Cases with fewer rows or elements (half of them, a quarter, ... one), then fewer digits."""
+    for part in _parts(len(rows), least=2):
+        if subject.operator.views.admits(len(rows) - len(part)):
+            yield np.delete(rows, part, axis=0)
+    for part in _parts(rows.shape[1], least=1):
+        yield np.delete(rows, part, axis=1)
+    for digits in FEW_DIGITS:
+        short = rounded(_to_digits(rows, digits), dtype)
+        if not np.array_equal(short, rows):
+            yield short
+
+
+def _parts(count: int, least: int) -> Iterator[range]:
+    """Ranges of places to leave out, the longest first; at least `least` places are left."""
+    size = count // 2
+    while size:
+        for first in range(0, count, size):
+            part = range(first, min(first + size, count))
+            if count - len(part) >= least:
+                yield part
+        size //= 2
+
+
+def _to_digits(rows: Rows, digits: int) -> Rows:
+    return np.array([[float(f"{value:.{digits - 1}e}") for value in row] for row in rows.tolist()])

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 
 from crossgrad_core.plugin import UserError
-from crossgrad_operators.stress.case import Case, short
+from crossgrad_operators.stress.cases import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.runner import Cell, judged
-from crossgrad_operators.stress.search.batch import search_views
+from crossgrad_operators.stress.search.families import search_views
 from crossgrad_operators.stress.suite import Subject
 from crossgrad_operators.stress.verdict import ExactCase, Finding
 

@@ -7,8 +7,14 @@ import numpy as np
 import torch
 
 from crossgrad_core.plugin import ViewCounts
-from crossgrad_operators.stress.search.batch import Batch
-from crossgrad_operators.stress.search.families import ELEMENTS, VIEWS, Rows, cases_of, rounded
+from crossgrad_operators.stress.search.families import (
+    ELEMENTS,
+    VIEWS,
+    Batch,
+    Rows,
+    cases_of,
+    rounded,
+)
 
 
 @dataclass(frozen=True, eq=False)

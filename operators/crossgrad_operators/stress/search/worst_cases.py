@@ -7,8 +7,7 @@ from math import isnan
 import torch
 
 from crossgrad_operators.stress.runner import UNPROVEN
-from crossgrad_operators.stress.search.batch import Batch
-from crossgrad_operators.stress.search.families import USUAL
+from crossgrad_operators.stress.search.families import USUAL, Batch
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 

@@ -1,10 +1,10 @@
-"""Combinations of components, and the short run that trains one.
+"""Combinations of components, few that bring every two together, and the run of one.
 
 Components of five slots meet in every combination. The components of further slots (losses,
 exposures, starts, resolutions, groupings, observers) are put into such combinations one at a time.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, product
@@ -20,7 +20,6 @@ from crossgrad_core.commands import (
     plural,
 )
 from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
-from crossgrad_plugins.authoring.matrix.pairwise import Row
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
@@ -39,7 +38,8 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
 _TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
-
+#: One value per factor.
+Row: TypeAlias = tuple[str, ...]
 #: Row -> reasons; rows that work are not there.
 Refused: TypeAlias = Mapping[Row, Collection[str]]
 
@@ -152,3 +152,40 @@ def _slots_that_decide(concerned: set[Row], rows: Sequence[Row]) -> tuple[int, .
             if all(row in concerned for row in rows if tuple(row[i] for i in places) in names):
                 return places
     return tuple(everything)
+
+
+def meetings(
+    place: int,
+    value: str,
+    values: Sequence[Sequence[str]],
+    usual: Callable[[Mapping[int, str]], Row],
+    admits: Callable[[Row], bool],
+) -> Iterator[Row]:
+    """Few admitted rows in which one value meets every value of the other factors.
+
+    The values of all factors come in turn first. Those that such a row did not admit are tried with
+    the usual values of the other factors, of which one at a time is changed. Not every row is tried
+    like this: with many factors there are too many.
+
+    Args:
+        place: Factor of the value.
+        value: The value.
+        values: The values of each factor.
+        usual: Completes a row of which some values are given.
+        admits: Whether a row can work.
+    """
+    missing = {(i, each) for i, some in enumerate(values) if i != place for each in some}
+    for turn in range(max(map(len, values))):
+        given = dict(enumerate(some[turn % len(some)] for some in values)) | {place: value}
+        row = tuple(given[i] for i in range(len(values)))
+        if missing.intersection(enumerate(row)) and admits(row):
+            missing -= set(enumerate(row))
+            yield row
+    for i, each in sorted(missing):
+        fixed = {place: value, i: each}
+        changes: list[dict[int, str]] = [{}]
+        changes += [{j: v} for j, some in enumerate(values) if j not in fixed for v in some]
+        rows = (usual({**fixed, **change}) for change in changes)
+        found = next(filter(admits, dict.fromkeys(rows)), None)
+        if found is not None:
+            yield found

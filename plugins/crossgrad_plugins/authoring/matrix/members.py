@@ -10,10 +10,11 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     FURTHER,
     SLOTS,
     Factors,
+    Row,
     every_row,
+    meetings,
     usual_row,
 )
-from crossgrad_plugins.authoring.matrix.pairwise import Row, meetings
 
 #: Whether a combination of these slots can work.
 Admits = Callable[[Row, tuple[str, ...]], bool]

@@ -5,18 +5,18 @@ from dataclasses import dataclass, field
 from textwrap import fill
 
 from crossgrad_core.commands import Progress, UserError, count, listed
-from crossgrad_core.testing.short_runs import reasons_to_refuse, try_out
+from crossgrad_core.testing.support.short_runs import reasons_to_refuse, try_out
 from crossgrad_plugins.authoring.matrix.combinations import (
     FURTHER,
     SLOTS,
     STEPS,
     Refused,
+    Row,
     as_lines,
     config_of,
     named,
 )
 from crossgrad_plugins.authoring.matrix.members import Members, combinations_of, members_of
-from crossgrad_plugins.authoring.matrix.pairwise import Row
 
 _WIDTH = 80
 #: Seconds between two lines of progress.

@@ -1,23 +1,25 @@
-"""Figures with a panel for each scene: quality and primitives over a cost, frontier, regimes."""
+"""Figures with a panel for each scene: curves, frontier, regimes, performance profile."""
 
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from crossgrad_plugins.compare.comparison import OVERALL, Comparison
-from crossgrad_plugins.compare.cost import Cost
 from crossgrad_plugins.compare.figures.panels import Grid, draw_bands
 from crossgrad_plugins.compare.figures.style import Drawn, literal, looks
-from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.quantity import Cost, Quantity
+from crossgrad_plugins.compare.targets import LARGEST_RATIO, ratios
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
 
 #: The first evaluations, far below the others, may be cut off: lower quantile that stays.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
 #: Room that the signs of all arms take beside each other, of the distance between two groups.
 _SPREAD: Final = 0.62
+_POINTS = 301
 
 
 def draw_curves(c: Comparison, cost: Cost) -> Drawn:
@@ -129,3 +131,34 @@ def draw_regimes(c: Comparison) -> Drawn:
         y=c.quantity.with_unit,
         height=1.75,
     ).by_scene(c, panel)
+
+
+def draw_profile(c: Comparison) -> Drawn | None:
+    """Draw a panel for each cost; None with one arm, or if no problem is shared by all arms."""
+    by_cost = {cost: ratios([row for row in c.reached if row.cost == cost]) for cost in c.costs}
+    shown = {cost.title: by for cost, by in by_cost.items() if any(by.values())}
+    if len(c.arms) < 2 or not shown:  # noqa: PLR2004 - nothing to compare
+        return None
+    look = looks([arm.name for arm in c.arms])
+    at = np.linspace(1.0, LARGEST_RATIO, _POINTS)
+
+    def panel(ax: "Axes", index: int) -> None:
+        for arm, own in list(shown.values())[index].items():
+            share = [np.mean(np.asarray(own) <= ratio + 1e-9) for ratio in at]
+            ax.plot(at, share, color=look[arm].color, linestyle=look[arm].dash, label=literal(arm))
+        ax.set_xlim(1.0, LARGEST_RATIO)
+        ax.set_ylim(-0.02, 1.02)
+        ax.tick_params(axis="y", labelleft=index == 0)
+
+    problems = max(len(own) for by in shown.values() for own in by.values())
+    return Grid(
+        "profile",
+        "Performance profile",
+        f"Share of the {problems} problems (a scene with a seed) that an arm solves within this "
+        "multiple of what the best arm needed. A run that never gets there stays in the "
+        "denominator.",
+        y="share of problems",
+        x=[f"{title} to the quality,\nover the least of all arms" for title in shown],
+        height=1.85,
+        has_titles=False,
+    ).draw(list(shown), panel, list(look))

@@ -20,7 +20,7 @@ from crossgrad_plugins.compare.figures.style import (
     wrapped,
 )
 from crossgrad_plugins.compare.narrative import where_text
-from crossgrad_plugins.compare.statistics.verdict import Verdict
+from crossgrad_plugins.compare.statistics import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crossgrad_plugins.compare.comparison import Comparison
-from crossgrad_plugins.compare.cost import Cost
 from crossgrad_plugins.compare.figures.style import (
     PAGE,
     Drawn,
@@ -20,7 +19,7 @@ from crossgrad_plugins.compare.figures.style import (
     panel_title,
     styled,
 )
-from crossgrad_plugins.compare.quantity import Quantity
+from crossgrad_plugins.compare.quantity import Cost, Quantity
 from crossgrad_plugins.compare.run import Array
 
 if TYPE_CHECKING:

@@ -3,7 +3,6 @@
 import numpy as np
 
 from crossgrad_plugins.compare.comparison import Comparison
-from crossgrad_plugins.compare.cost import SECONDS
 from crossgrad_plugins.compare.figures.style import (
     COLORS,
     FAINT,
@@ -16,6 +15,7 @@ from crossgrad_plugins.compare.figures.style import (
     styled,
     wrapped,
 )
+from crossgrad_plugins.compare.quantity import SECONDS
 
 _OTHER = "other"
 #: Letters of a line of an arm's name beside its bar.

@@ -1,4 +1,4 @@
-"""A drawing of another package inside an autograd function of ours, which fills the statistics."""
+"""A drawing of another package in an autograd function, and the render of no Gaussians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from typing_extensions import override
+
+from crossgrad_core.plugin import Camera, Gaussians, Render, Screen
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +79,22 @@ class _Nested(torch.autograd.Function):
         if (of_centers := by_tensor.get(id(drawing.centers))) is not None:
             ctx.call.observe(drawing.centers, of_centers)
         return None, *(by_tensor.get(id(leaf)) for leaf in ctx.leaves)
+
+
+def empty_render(
+    gaussians: Gaussians, camera: Camera, background: Tensor, outputs: frozenset[str]
+) -> Render:
+    """The background, of which a gradient of zero comes back, and statistics of no rows."""
+    # The sum of nothing is 0: through it every tensor is in the graph, as where one is drawn.
+    zero = torch.stack([tensor.sum() for tensor in gaussians.floats()]).sum()
+    image = background.expand(camera.height, camera.width, 3) + zero
+    alpha = torch.zeros_like(image[..., 0])
+    none = torch.zeros(0, dtype=torch.int32, device=background.device)
+    screen = Screen(
+        radii=none,
+        mean_gradient=image.new_zeros(0, 2),
+        abs_gradient=image.new_zeros(0, 2) if "abs_gradient" in outputs else None,
+        pixels=none if "pixels" in outputs else None,
+        count=(lambda _marked: none) if "count" in outputs else None,
+    )
+    return Render(image, alpha, screen, alpha if "depth" in outputs else None)

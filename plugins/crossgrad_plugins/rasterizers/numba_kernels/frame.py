@@ -20,7 +20,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     TileLists,
     in_lines,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.backward import differentiate
 from crossgrad_plugins.rasterizers.numba_kernels.binning import (
     PARTS,
     SHELF,
@@ -29,28 +28,29 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import (
     find_tiles,
     start_tiles,
 )
-from crossgrad_plugins.rasterizers.numba_kernels.constants import vector_constants
-from crossgrad_plugins.rasterizers.numba_kernels.directions import (
-    BINS,
-    FIELDS,
-    SUMS,
-    bin_directions,
-)
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import pinhole
-from crossgrad_plugins.rasterizers.numba_kernels.forward import composite
 from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     CHUNK,
     PARTIAL,
     RECORD,
     TILE_HEIGHT,
     TILE_WIDTH,
+    vector_constants,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.longest_axes import add_directions, longest_axes
-from crossgrad_plugins.rasterizers.numba_kernels.marked import count_marked
 from crossgrad_plugins.rasterizers.numba_kernels.projection import listed, project
 from crossgrad_plugins.rasterizers.numba_kernels.projection_backward import project_backward
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import count_pixels
 from crossgrad_plugins.rasterizers.numba_kernels.spherical_harmonics import sh_backward, sh_forward
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.backward import differentiate
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.directions import (
+    BINS,
+    FIELDS,
+    SUMS,
+    bin_directions,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.forward import composite
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.marked import count_marked
 
 
 def forward(

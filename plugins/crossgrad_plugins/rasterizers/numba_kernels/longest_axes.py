@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, next_job
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
-from crossgrad_plugins.rasterizers.numba_kernels.directions import BINS, FIELDS, SUMS
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     KernelCamera,
     clamped,
@@ -20,6 +19,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.directions import BINS, FIELDS, SUMS
 
 #: An axis that the camera sees shorter than this (pixels) is seen end on and has no direction.
 SHORTEST = 1e-6

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jobs import Jobs, next_job
-from crossgrad_plugins.rasterizers.numba_kernels.analytic import main_axes
 from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOTS
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import (
     BLOCK,
@@ -19,23 +18,21 @@ from crossgrad_plugins.rasterizers.numba_kernels.blocks import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import (
     KernelCamera,
+    axes_gradient,
     clamped,
+    combined,
     covariance,
+    covariance_gradient,
     dot,
+    factor_gradient,
     in_axes,
     in_registers,
     jacobian_rows,
     rotation,
     times,
     to_camera,
-    unit_quaternion,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.gradients import (
-    axes_gradient,
-    combined,
-    covariance_gradient,
-    factor_gradient,
     turn_gradient,
+    unit_quaternion,
     weighted_sum,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
@@ -61,6 +58,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     SUM_YY,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import main_axes
 
 # Rows of a block: the sums by their own numbers, what its Gaussians bring along, what is found.
 _MEAN = PARTIAL

@@ -6,14 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD
-from crossgrad_plugins.rasterizers.numba_kernels.analytic import (
-    SIGMA_CEILING,
-    SIGMA_FLOOR,
-    central_window,
-    main_axes,
-    squared_radius,
-    window,
-)
 from crossgrad_plugins.rasterizers.numba_kernels.blocks import get, get_four, put
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import clamped
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
@@ -40,6 +32,14 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     V_PART,
     V_WHOLE,
     WIDTH,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import (
+    SIGMA_CEILING,
+    SIGMA_FLOOR,
+    central_window,
+    main_axes,
+    squared_radius,
+    window,
 )
 
 #: Rows of a block of projected Gaussians, seen or not: camera depth, projected mean (pixels),

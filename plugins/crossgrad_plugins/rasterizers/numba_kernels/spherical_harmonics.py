@@ -10,12 +10,17 @@ from crossgrad_core.numerics.simd import WIDE, aligned, prefetch
 from crossgrad_plugins.rasterizers.numba_kernels.basis import (
     BASIS,
     C0,
+    FLOATS,
+    HIGHER,
     TABLE,
     WAYS,
     basis_of,
     normalize,
     pull_ways,
     put_way,
+    rest_basis_gradients,
+    spread,
+    sum_up,
     turned,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
@@ -24,13 +29,6 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     LOG_OPACITY,
     RECORD,
     RED,
-)
-from crossgrad_plugins.rasterizers.numba_kernels.third_degree import (
-    FLOATS,
-    HIGHER,
-    rest_basis_gradients,
-    spread,
-    sum_up,
 )
 
 #: Floats of a cache line.

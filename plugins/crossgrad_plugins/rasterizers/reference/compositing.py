@@ -9,16 +9,16 @@ from torch.utils.checkpoint import checkpoint
 
 from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, TRANSMITTANCE_STOP
 from crossgrad_core.plugin import Response
-from crossgrad_plugins.rasterizers.reference.responses import Shape, coverage
+from crossgrad_plugins.rasterizers.reference.projection import Shape, coverage
 from crossgrad_plugins.rasterizers.reference.statistics import offsets
-from crossgrad_plugins.rasterizers.reference.tiles import TILE, TileLists
 
 #: Channels that are composited: RGB, depth, and ones for the accumulated opacity.
 CHANNELS = 5
-
 #: Up to so many (pixel, Gaussian) entries the backward pass finds all intermediates in memory
 #: (about 0.4 GB in float64); beyond, each tile is drawn a second time when its gradient is due.
 REMEMBERED_ENTRIES = 2**21
+#: Side of a tile, pixels.
+TILE = 16
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,19 @@ def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) ->
     """[N, 7 + S] one row per Gaussian, as `composite` reads it."""
     columns = (means, shapes.opacities[:, None], colors, depths[:, None], shapes.parameters)
     return torch.cat(columns, -1)
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Lists of all tiles, one after the other, tiles in row-major order.
+
+    Attributes:
+        rows: [P] int64 rows of the Gaussians' table, front to back within each tile.
+        sizes: Length of each tile's list.
+    """
+
+    rows: Tensor
+    sizes: list[int]
 
 
 def composite_tiles(
@@ -151,3 +164,33 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     # Transmittance only falls, so this also stops everything behind the first that stops.
     blended = touching & (after >= TRANSMITTANCE_STOP)
     return touching, blended, torch.where(blended, alpha * before, 0.0)
+
+
+def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
+    """[N, 4] int64 tile boxes (x0, y0, x1, y1), ends excluded; empty where off the image.
+
+    Args:
+        means: [N, 2] pixels; finite.
+        reach: [N, 2] half-extents, pixels.
+        size: Width and height of the image, pixels.
+    """
+    # One pixel of slack so that no rounding here can cut a footprint.
+    low, high = means - reach - 1, means + reach + 1
+    limit = torch.tensor(size).to(means, non_blocking=True)
+    seen = (high > 0) & (low < limit)
+    first = (low.clamp(min=0).minimum(limit) / TILE).floor().long()
+    last = (high.clamp(min=0).minimum(limit) / TILE).ceil().long()
+    return torch.cat([first, torch.where(seen.all(-1, keepdim=True), last, first)], -1)
+
+
+def tile_lists(boxes: Tensor, size: tuple[int, int]) -> TileLists:
+    """Fills the lists of all tiles from `boxes` [N, 4], which are in depth order."""
+    across, down = (-(-pixels // TILE) for pixels in size)
+    x0, y0, x1, y1 = boxes.unbind(-1)
+    counts = (x1 - x0) * (y1 - y0)
+    rows = torch.arange(len(boxes), device=boxes.device).repeat_interleave(counts)
+    place = torch.arange(len(rows), device=boxes.device) - (counts.cumsum(0) - counts)[rows]
+    columns = (x1 - x0)[rows]
+    tiles = (y0[rows] + place // columns) * across + x0[rows] + place % columns
+    order = tiles.argsort(stable=True)
+    return TileLists(rows[order], torch.bincount(tiles, minlength=across * down).tolist())

@@ -1,13 +1,25 @@
-"""From world space to the image plane: means, depths and 2-D covariances (EWA splatting)."""
+"""From world space to the image plane (EWA splatting), and how a Gaussian fills a pixel.
+
+A response is a pair of functions: one turns a projection into a `Shape`, the other turns the offset
+of pixel centres from the mean into a coverage, so that alpha = min(max_alpha, opacity * coverage).
+"""
 
 from dataclasses import dataclass
+from math import pi, sqrt
 
 import torch
 from torch import Tensor
 
-from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
+from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_MARGIN
 from crossgrad_core.numerics.rotations import unit_rotation_matrices
-from crossgrad_core.plugin import Camera
+from crossgrad_core.plugin import Camera, Response
+
+#: Mip-Splatting draws nothing whose 2-D determinant is at most this, px^4.
+MIP_EPSILON = 1e-6
+#: Smallest standard deviation along an axis of the analytic response, px.
+SIGMA_FLOOR = 1e-3
+#: Analytic-Splatting approximates the normal distribution by sigmoid(LINEAR x + CUBIC x^3).
+LINEAR, CUBIC = 1.6, 0.07
 
 
 @dataclass(frozen=True)
@@ -73,3 +85,133 @@ def _slopes(size: int, focal: float, center: float) -> tuple[float, float]:
     """The range of x / z in which the Jacobian is evaluated: the image and a margin around it."""
     margin = JACOBIAN_MARGIN * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The footprints of N Gaussians.
+
+    Attributes:
+        parameters: [N, S] what `coverage` needs: the conic (a, b, c), or for the analytic response
+            (cosine, sine, sigma1, sigma2) of the main axes.
+        opacities: [N] factor of the coverage.
+        peaks: [N] alpha at the mean, before the cap.
+        reach: [N, 2] half-extents in pixels of a box that holds every pixel centre with
+            alpha >= 1/255.
+        radii: [N] half-extent in pixels to be reported.
+    """
+
+    parameters: Tensor
+    opacities: Tensor
+    peaks: Tensor
+    reach: Tensor
+    radii: Tensor
+
+
+def shape(projection: Projection, opacities: Tensor, dilation: float, response: Response) -> Shape:
+    """Footprints of projected Gaussians with `opacities` [N]; the analytic one ignores dilation."""
+    if response == "analytic":
+        return _windowed(projection, opacities)
+    xx, yy = projection.xx + dilation, projection.yy + dilation
+    det = projection.det + dilation * (projection.xx + projection.yy) + dilation**2
+    if response == "antialiased":
+        opacities = opacities * _mip_factor(projection.det, det)
+    conic = torch.stack([yy / det, -projection.xy / det, xx / det], -1)
+    # The level set alpha = 1/255 is an ellipse; these are its exact half-extents.
+    reach = (2 * _log_contrast(opacities)[:, None] * torch.stack([xx, yy], -1)).sqrt()
+    return Shape(conic, opacities, opacities, reach, reach.amax(-1))
+
+
+def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> Tensor:
+    """[P, N] share of its opacity that each Gaussian gives to each pixel.
+
+    Args:
+        dx: [P, N] mean minus pixel centre, pixels; likewise `dy`.
+        dy: See `dx`.
+        parameters: [N, S] of `Shape`.
+        response: The response that the parameters belong to.
+    """
+    if response == "analytic":
+        cosine, sine, sigma1, sigma2 = parameters.unbind(-1)
+        u = cosine * dx + sine * dy
+        v = cosine * dy - sine * dx
+        return 2 * pi * sigma1 * sigma2 * _window(u, sigma1) * _window(v, sigma2)
+    a, b, c = parameters.unbind(-1)
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+    # Only rounding can make the power positive. The clamp keeps exp and its gradient finite there.
+    return power.clamp(max=0.0).exp() * (power <= 0)
+
+
+def _mip_factor(before: Tensor, after: Tensor) -> Tensor:
+    """Mip-Splatting, 2-D filter: what the dilation added in area is taken off the opacity."""
+    drawn = (before > MIP_EPSILON) & (after > MIP_EPSILON)
+    factor = (before / (after + MIP_EPSILON) + MIP_EPSILON).sqrt()
+    return torch.where(drawn, factor, 0.0)
+
+
+def _log_contrast(peaks: Tensor) -> Tensor:
+    """Natural logarithm of how far `peaks` are above the threshold; not below 0."""
+    return (peaks / ALPHA_THRESHOLD).log().clamp(min=0.0)
+
+
+def _windowed(projection: Projection, opacities: Tensor) -> Shape:
+    """Analytic-Splatting: the Gaussian is integrated over the pixel, turned onto its main axes."""
+    middle, half = (projection.xx + projection.yy) / 2, (projection.xx - projection.yy) / 2
+    # A round Gaussian has no main axes: take those of the image, without derivative.
+    round_ = (half == 0) & (projection.xy == 0)
+    half = torch.where(round_, 1.0, half)
+    xy = torch.where(round_, 0.0, projection.xy)
+    angle = 0.5 * torch.atan2(xy, half)
+    spread = torch.where(round_, 0.0, torch.hypot(half, xy))
+    larger = middle + spread
+    sigma1 = _floored_root(larger)
+    sigma2 = _floored_root(projection.det / larger)
+    window1, window2 = (_window(torch.zeros_like(s), s) for s in (sigma1, sigma2))
+    volume = 2 * pi * sigma1 * sigma2
+    reach1 = _window_reach(sigma1, _log_contrast(opacities * volume * window2))
+    reach2 = _window_reach(sigma2, _log_contrast(opacities * volume * window1))
+    cosine, sine = angle.cos(), angle.sin()
+    reach_x = cosine.abs() * reach1 + sine.abs() * reach2
+    reach_y = sine.abs() * reach1 + cosine.abs() * reach2
+    peaks = opacities * volume * window1 * window2
+    radii = (2 * _log_contrast(opacities) * torch.maximum(projection.xx, projection.yy)).sqrt()
+    return Shape(
+        torch.stack([cosine, sine, sigma1, sigma2], -1),
+        opacities,
+        peaks,
+        torch.stack([reach_x, reach_y], -1),
+        radii,
+    )
+
+
+def _floored_root(squares: Tensor) -> Tensor:
+    """Standard deviations of `squares`, not below the floor and without gradient at it."""
+    return squares.clamp(min=SIGMA_FLOOR**2).sqrt()
+
+
+def _window(offset: Tensor, sigma: Tensor) -> Tensor:
+    """Mass of a 1-D Gaussian at `offset` from the centre of a window of one pixel.
+
+    This is F(x + h) - F(x - h) with F(x) = sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and
+    h = 0.5 / sigma, as a product so that neither tails nor wide Gaussians cancel.
+    """
+    x = -offset.abs() / sigma
+    h = 0.5 / sigma
+    upper, lower = _cubic(x + h), _cubic(x - h)
+    difference = 2 * h * (LINEAR + CUBIC * (3 * x * x + h * h))
+    return -upper.sigmoid() * (-lower).sigmoid() * torch.expm1(-difference)
+
+
+def _cubic(x: Tensor) -> Tensor:
+    return x * (LINEAR + CUBIC * x * x)
+
+
+def _window_reach(sigma: Tensor, log_contrast: Tensor) -> Tensor:
+    """Offset beyond which `_window` is below exp(-log_contrast).
+
+    Beyond half a pixel the window is below sigmoid(-y) < exp(-y), y = LINEAR t + CUBIC t^3 and
+    t = (offset - 0.5) / sigma; the cubic y(t) = log_contrast has this one real root.
+    """
+    p = LINEAR / (3 * CUBIC)
+    t = 2 * sqrt(p) * torch.sinh(torch.asinh(log_contrast / (2 * CUBIC * p * sqrt(p))) / 3)
+    return 0.5 + sigma * t

@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from time import sleep
 from typing import Final
 
-from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Worker, is_free
+from crossgrad_plugins.sweep.attempt import PAUSE, Attempt, Retries, Worker, is_free
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.retries import Retries
 
 OPTIONS: Final = ()
 

@@ -12,11 +12,9 @@ from types import ModuleType
 from typing import Any, Final
 
 from crossgrad_core.commands import UserError
-from crossgrad_plugins.sweep.attempt import Outcome, Worker
-from crossgrad_plugins.sweep.elsewhere import carried_out
+from crossgrad_plugins.sweep.attempt import Outcome, Retries, Worker, carried_out
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
-from crossgrad_plugins.sweep.retries import Retries
 
 #: Options that sbatch is given as they are.
 SBATCH: Final = (

@@ -16,9 +16,8 @@ import torch
 from crossgrad_core.contract.blocks import AdamState, Block, LearningRate, PluginState
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.errors import UserError
-from crossgrad_core.run import load_run
-from crossgrad_core.run.checkpoint import checkpoint
-from crossgrad_core.run.checkpoint.checkpoint import (
+from crossgrad_core.run import checkpoint, load_run
+from crossgrad_core.run.checkpoint import (
     STATE,
     TENSORS,
     Checkpoint,

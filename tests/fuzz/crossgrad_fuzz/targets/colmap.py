@@ -11,14 +11,11 @@ from support.scenes import write_tiny_scene
 from crossgrad_fuzz.case import Case, load
 from crossgrad_fuzz.mutate import NUMBERS, at_offsets, matcher
 from crossgrad_fuzz.target import Target
-from crossgrad_plugins.readers import (
-    _colmap_binary,
-    _colmap_model,
-    _colmap_types,
-    colmap,
-)
-from crossgrad_plugins.readers._colmap_model import count_images, has_model, read_model
+from crossgrad_plugins.readers import colmap
 from crossgrad_plugins.readers.colmap import _make_views
+from crossgrad_plugins.readers.colmap_files import binary
+from crossgrad_plugins.readers.colmap_files import model as _colmap_model
+from crossgrad_plugins.readers.colmap_files.model import count_images, has_model, read_model
 
 _CAMERA, _IMAGE, _POINT, _OBSERVATION = 24, 64, 43, 24
 _MODELS = ("PINHOLE", "SIMPLE_RADIAL", "OPENCV_FISHEYE")
@@ -132,8 +129,7 @@ BINARY = Target(
     parse=_parse,
     parser={
         _colmap_model: ("count_images",),
-        _colmap_binary: (),
-        _colmap_types: (),
+        binary: (),
         colmap: _READER,
     },
     words=(b"\0", b"0000.png\0", b"0001.png\0", b"../x\0", struct.pack("<Q", 2**64 - 1)),
@@ -143,7 +139,7 @@ TEXT = Target(
     name="colmap-text",
     seeds=_text,
     parse=_parse,
-    parser={_colmap_model: (), _colmap_types: (), colmap: _READER},
+    parser={_colmap_model: (), binary: (), colmap: _READER},
     mutators=(matcher(rb"\n(\d+) ", (b"1", b"2", b"3")), matcher(rb" ([-\d.e]+)", NUMBERS)),
     words=_WORDS,
 )

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from crossgrad_core.scene import decode, headers, photo_store, photos, pillow, reduction
 from crossgrad_core.scene.calibration import Calibration
-from crossgrad_core.scene.decode import decode_photo
-from crossgrad_core.scene.headers import read_header, read_quarter_turn
-from crossgrad_core.scene.photos import PhotoSource
-from crossgrad_core.scene.reduction import choose_reduction
+from crossgrad_core.scene.photos import decode, headers, photo_store, photos, pillow, shapes
+from crossgrad_core.scene.photos.decode import decode_photo
+from crossgrad_core.scene.photos.headers import read_header, read_quarter_turn
+from crossgrad_core.scene.photos.photos import PhotoSource
+from crossgrad_core.scene.photos.shapes import choose_reduction
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import at_offsets
 from crossgrad_fuzz.target import Mutator, Target
@@ -210,7 +210,7 @@ HEADERS = Target(
     name="photo-headers",
     seeds=_header_seeds,
     parse=_limited(_parse_header),
-    parser={headers: (), reduction: (), pillow: ()},
+    parser={headers: (), shapes: (), pillow: ()},
     words=_WORDS,
     mutators=_FORMAT,
     quiet=False,

@@ -19,11 +19,11 @@ from crossgrad_fuzz.target import Target
 from crossgrad_plugins.georeference import frames, gps_tags
 from crossgrad_plugins.georeference.ellipsoid import Place
 from crossgrad_plugins.georeference.on_earth import OnEarth
-from crossgrad_plugins.readers import _geo_list, _gps, _place, _priors
-from crossgrad_plugins.readers._geo_list import of_list
-from crossgrad_plugins.readers._gps import Measured, of_headers
-from crossgrad_plugins.readers._place import by_file
-from crossgrad_plugins.readers._priors import of_priors
+from crossgrad_plugins.readers.place import files, headers
+from crossgrad_plugins.readers.place import place as _place
+from crossgrad_plugins.readers.place.files import of_list, of_priors
+from crossgrad_plugins.readers.place.headers import Measured, of_headers
+from crossgrad_plugins.readers.place.place import by_file
 
 _PHOTO, _LIST, _DATABASE, _FILE = "photo.jpg", "geo.txt", "database.db", "georef.json"
 _NAMES = ("a.jpg", "b/c.jpg", "d/c.jpg")
@@ -53,7 +53,7 @@ def _database(column: str) -> bytes:
         )
         for number, name in enumerate(_NAMES):
             database.execute("INSERT INTO images VALUES (?, ?)", (number, name))
-            blob = _priors._POSITION.pack(52.0, 13.0 + number, math.nan if number else 3.0)
+            blob = files._POSITION.pack(52.0, 13.0 + number, math.nan if number else 3.0)
             blob = blob[: 24 - 8 * (number == 2)]
             database.execute("INSERT INTO pose_priors VALUES (?, ?, 0)", (number, blob))
         database.execute("INSERT INTO pose_priors VALUES (9, x'', 0)")  # Of a photo elsewhere.
@@ -106,10 +106,9 @@ PLACES = Target(
     seeds=_seeds,
     parse=_parse,
     parser={
-        _gps: (),
+        headers: (),
         gps_tags: (),
-        _geo_list: (),
-        _priors: (),
+        files: (),
         # What is made of places that were read.
         _place: ("by_gps", "_sources", "_file_of", "_named", "_fitted", "_residuals", "by_code"),
         frames: ("Frame3D",),

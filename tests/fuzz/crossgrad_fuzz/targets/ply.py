@@ -11,9 +11,9 @@ from crossgrad_core.system import ply_table
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import COUNTS, NUMBERS, matcher
 from crossgrad_fuzz.target import Target
-from crossgrad_plugins.exporters.ply_format import file as ply
-from crossgrad_plugins.exporters.ply_format.cloud import SplatCloud
-from crossgrad_plugins.exporters.ply_format.file import (
+from crossgrad_plugins.exporters import ply_file as ply
+from crossgrad_plugins.exporters.ply_cloud import SplatCloud
+from crossgrad_plugins.exporters.ply_file import (
     PROPERTIES,
     read_ply,
     sh_degree_of,

@@ -16,20 +16,18 @@ from PIL import Image
 from support.formats import FORMATS, Written
 from support.scenes import write_tiny_scene
 
-from crossgrad_core.contract.reader import Reader
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.scene.photos import FilePhoto
+from crossgrad_core.contract.slots.reader import Reader
+from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_fuzz.case import Case, load
 from crossgrad_fuzz.mutate import NUMBERS, matcher
 from crossgrad_fuzz.target import Mutator, Target
 from crossgrad_plugins.readers import (
+    _accepts,
+    _cameras,
     _inside,
     _json,
-    _kind,
-    _lenses,
-    _photos,
-    _points,
-    _poses,
+    _raw,
     _transforms,
     _xml,
     blender,
@@ -213,7 +211,7 @@ def _target(
         # Links, which no input holds.
         _inside: ("Inside.files",),
         # Files that options name, or of which there are none or several.
-        _kind: ("Kind.one",),
+        _accepts: ("Kind.one",),
         # Sizes that no input has, and what other formats have.
         _json: ("read_object", "Fields.texts"),
         _xml: ("_parsed", "_Builder.start"),
@@ -241,19 +239,19 @@ TARGETS = (
         _forms("matrixcity", *_PLAIN),
     ),
     _target(
-        *("metashape", metashape.MetashapeReader, (metashape, _kind, _xml)),
+        *("metashape", metashape.MetashapeReader, (metashape, _accepts, _xml)),
         _metashape_seeds,
         mutators=(),
     ),
     _target(
         *("nerfstudio", nerfstudio.NerfstudioReader),
-        (nerfstudio, _transforms, _points, _poses, _inside, _lenses),
+        (nerfstudio, _transforms, _raw, _cameras, _inside, _cameras),
         *(_nerfstudio_seeds, _FIELDS),
     ),
     _target("uc-gs", uc_gs.UcGsReader, (uc_gs,), _forms("uc-gs", *_PLAIN), (), (_renamed,)),
     _target("opensfm", opensfm.OpenSfmReader, (opensfm, _json), _opensfm_seeds),
     _target(
-        *("realitycapture", realitycapture.RealityCaptureReader, (realitycapture, _photos)),
+        *("realitycapture", realitycapture.RealityCaptureReader, (realitycapture, _raw)),
         *(_forms("realitycapture", *_LENSES[:2]), (b",", b"\n", b'"', b"#name"), ()),
     ),
 )

@@ -12,14 +12,14 @@ import torch
 from crossgrad_core.run.results import lock, scene_file
 from crossgrad_core.run.results.lock import Holder
 from crossgrad_core.run.results.scene_file import check_scene, write_scene
-from crossgrad_core.scene import differences
-from crossgrad_core.scene.differences import Weight
+from crossgrad_core.scene import fingerprint as differences
 from crossgrad_core.scene.fingerprint import (
     FileMark,
     Fingerprint,
     FrameMark,
     PointsMark,
     ViewMark,
+    Weight,
 )
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, matcher

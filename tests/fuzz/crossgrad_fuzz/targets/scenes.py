@@ -10,25 +10,18 @@ import numpy as np
 from PIL import Image
 
 from crossgrad_core.contract.scene_options import SceneOptions
-from crossgrad_core.scene import (
-    build,
-    calibration,
-    choose_photos,
-    frame,
-    mask_files,
-    photo_files,
-    raw_checks,
-)
+from crossgrad_core.scene import build, calibration, frame
+from crossgrad_core.scene import raw as raw_checks
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import camera_centers, make_frame
-from crossgrad_core.scene.raw import RawScene, RawView
-from crossgrad_core.scene.raw_checks import check_distances, check_points, check_views
+from crossgrad_core.scene.photos import choose_photos, photo_files
+from crossgrad_core.scene.raw import RawScene, RawView, check_distances, check_points, check_views
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.mutate import NUMBERS, at_offsets, matcher
 from crossgrad_fuzz.target import Target
 from crossgrad_fuzz.targets.colmap import fields, files
-from crossgrad_plugins.readers import _colmap_folder
 from crossgrad_plugins.readers.colmap import ColmapReader
+from crossgrad_plugins.readers.colmap_files import folder as _colmap_folder
 
 _MODEL = "sparse/0"
 _SIZE = (24, 16)
@@ -182,8 +175,7 @@ SCENE = Target(
     parser={
         _colmap_folder: ("check_scene_folder", "_check_not_within_sparse", "_similar_folder"),
         build: (),
-        mask_files: ("find_mask", "find_mask_folder", "check_masks"),
-        photo_files: ("find_photo_folders",),
+        photo_files: ("find_mask", "find_mask_folder", "check_masks", "find_photo_folders"),
         choose_photos: ("_find_masks", "_prefer_reduced"),
     },
     words=(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jit import kernel, part
 from crossgrad_core.numerics.jobs import Jobs, next_job, parallel
 from crossgrad_core.numerics.simd import aligned
-from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
+from crossgrad_plugins.losses.photometric.numba_kernels.rows import (
     BACK,
     CHANNELS,
     DIFFERENCE,
@@ -36,8 +36,10 @@ from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     STRIDE,
     TILE_COLUMNS,
     TILE_ROWS,
+    copy,
+    load_row,
+    set_centres,
 )
-from crossgrad_plugins.losses.photometric.numba_kernels.rows import copy, load_row, set_centres
 from crossgrad_plugins.losses.photometric.numba_kernels.terms import (
     clear_row,
     gradient_row,

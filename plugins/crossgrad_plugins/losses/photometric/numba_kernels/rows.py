@@ -1,29 +1,63 @@
-"""Loading the rows of a tile into the rings."""
+"""The rows of a tile: layout, loading into rings, sums over the 11-wide window.
+
+Rows are kept interleaved, [column * 3 + channel]: a step of one column is three floats.
+"""
 
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crossgrad_core.numerics.jit import part
-from crossgrad_core.numerics.simd import LANES, load, splat, store, where
-from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
-    CENTRE_DIFFERENCE,
-    CENTRE_SUM,
-    CHANNELS,
-    DIFFERENCE,
-    KEEP,
-    SLOTS,
-    STRIDE,
-    SUM,
+from crossgrad_core.numerics.jit import device, part
+from crossgrad_core.numerics.simd import (
+    LANES,
+    WIDE,
+    Lanes,
+    fma,
+    load,
+    load_wide,
+    splat,
+    splat_wide,
+    store,
+    where,
 )
-from crossgrad_plugins.losses.photometric.reference import RADIUS
+from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW, gaussian_window
 
+TILE_ROWS = 64
+TILE_COLUMNS = 384
+#: Rows of a ring; a power of two, more than WINDOW: those of two rows overlap.
+SLOTS = 16
+CHANNELS = 3
+#: Floats of the columns that a window reaches beyond its centre.
+HALO = CHANNELS * RADIUS
+# Room for a tile with twice the halo on both sides, and for vectors that start before its end.
+_ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
+STRIDE = _ROOM + -_ROOM % WIDE
+#: Ring of s - centre.
+SUM = 0
+#: Ring of d - centre.
+DIFFERENCE = SUM + SLOTS * STRIDE
+#: Ring of 1 where a pixel counts, else 0.
+KEEP = DIFFERENCE + SLOTS * STRIDE
+#: s, s^2, d, d^2 of two rows, summed down the columns.
+PARTIAL = KEEP + SLOTS * STRIDE
+#: Rings of a, b, c.
+BY_MEAN = PARTIAL + 8 * STRIDE
+BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
+BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
+#: a, b, c of two rows, summed down the columns.
+BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
+#: A row of results.
+LINE = BACK + 6 * STRIDE
+#: What is subtracted from s and from d.
+CENTRE_SUM = LINE + STRIDE
+CENTRE_DIFFERENCE = CENTRE_SUM + STRIDE
+#: Floats in all.
+SCRATCH = CENTRE_DIFFERENCE + STRIDE
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
 _Flags: TypeAlias = NDArray[np.bool_]  # 1-D
 _Box: TypeAlias = tuple[int, int, int, int]  # first row, end row, first column, end column
-
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _WHITE = np.float32(255)
 
@@ -132,3 +166,107 @@ def load_row(
         y = where(zero < kept, load(scratch, d + j), zero)
         store(scratch, s + j, x + y - load(scratch, CENTRE_SUM + j))
         store(scratch, d + j, x - y - load(scratch, CENTRE_DIFFERENCE + j))
+
+
+_Taps = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
+_LAST = SLOTS - 1
+_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in gaussian_window().numpy()[: RADIUS + 1])
+
+
+@device
+def across(array: _Floats, start: int) -> Lanes:
+    """Window sum over eleven columns, the first of them at element `start`."""
+    total = load_wide(array, start + 5 * CHANNELS) * splat_wide(_W5)
+    pair = load_wide(array, start + 4 * CHANNELS) + load_wide(array, start + 6 * CHANNELS)
+    total = fma(pair, splat_wide(_W4), total)
+    pair = load_wide(array, start + 3 * CHANNELS) + load_wide(array, start + 7 * CHANNELS)
+    total = fma(pair, splat_wide(_W3), total)
+    pair = load_wide(array, start + 2 * CHANNELS) + load_wide(array, start + 8 * CHANNELS)
+    total = fma(pair, splat_wide(_W2), total)
+    pair = load_wide(array, start + CHANNELS) + load_wide(array, start + 9 * CHANNELS)
+    total = fma(pair, splat_wide(_W1), total)
+    pair = load_wide(array, start) + load_wide(array, start + 10 * CHANNELS)
+    return fma(pair, splat_wide(_W0), total)
+
+
+@device
+def _tap(ring: _Floats, start: int, row: int) -> Lanes:
+    """Column `start` of a row of the ring."""
+    return load_wide(ring, start + (row & _LAST) * STRIDE)
+
+
+@device
+def _taps(ring: _Floats, start: int, row: int) -> _Taps:
+    """The twelve rows that the windows around `row` and the row below it reach."""
+    return (
+        _tap(ring, start, row - 5),
+        _tap(ring, start, row - 4),
+        _tap(ring, start, row - 3),
+        _tap(ring, start, row - 2),
+        _tap(ring, start, row - 1),
+        _tap(ring, start, row),
+        _tap(ring, start, row + 1),
+        _tap(ring, start, row + 2),
+        _tap(ring, start, row + 3),
+        _tap(ring, start, row + 4),
+        _tap(ring, start, row + 5),
+        _tap(ring, start, row + 6),
+    )
+
+
+@device
+def _sum(
+    a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
+    f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
+) -> Lanes:  # fmt: skip
+    """Window sum of eleven rows."""
+    total = middle * splat_wide(_W5)
+    total = fma(e + f, splat_wide(_W4), total)
+    total = fma(d + g, splat_wide(_W3), total)
+    total = fma(c + h, splat_wide(_W2), total)
+    total = fma(b + i, splat_wide(_W1), total)
+    return fma(a + j, splat_wide(_W0), total)
+
+
+@device
+def _sum_squares(
+    a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
+    f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
+) -> Lanes:  # fmt: skip
+    """Window sum of the squares of eleven rows."""
+    total = middle * middle * splat_wide(_W5)
+    total = fma(fma(e, e, f * f), splat_wide(_W4), total)
+    total = fma(fma(d, d, g * g), splat_wide(_W3), total)
+    total = fma(fma(c, c, h * h), splat_wide(_W2), total)
+    total = fma(fma(b, b, i * i), splat_wide(_W1), total)
+    return fma(fma(a, a, j * j), splat_wide(_W0), total)
+
+
+@device
+def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
+    """Window sums over the rows of a ring around `row` and around the next one.
+
+    Both at once: what they need comes from the second-level cache, and is mostly the same.
+
+    Args:
+        ring: Rows, of which `SLOTS` are kept.
+        start: Element where the column begins.
+        row: Number of a row.
+    """
+    a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
+    return (
+        _sum(a, b, c, d, e, f, g, h, i, j, k),
+        _sum(b, c, d, e, f, g, h, i, j, k, last),
+    )
+
+
+@device
+def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """As `down`: the sums of the values and of their squares, then the same around the next row."""
+    a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
+    return (
+        _sum(a, b, c, d, e, f, g, h, i, j, k),
+        _sum_squares(a, b, c, d, e, f, g, h, i, j, k),
+        _sum(b, c, d, e, f, g, h, i, j, k, last),
+        _sum_squares(b, c, d, e, f, g, h, i, j, k, last),
+    )

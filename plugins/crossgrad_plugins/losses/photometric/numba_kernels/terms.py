@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import part, sum_kernel
 from crossgrad_core.numerics.simd import WIDE, fma, fnma, load_wide, splat_wide, store, where
-from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
+from crossgrad_plugins.losses.photometric.numba_kernels.rows import (
     BACK,
     BY_DIFFERENCE_VARIANCE,
     BY_MEAN,
@@ -23,12 +23,10 @@ from crossgrad_plugins.losses.photometric.numba_kernels.layout import (
     SLOTS,
     STRIDE,
     SUM,
-)
-from crossgrad_plugins.losses.photometric.numba_kernels.rows import fill
-from crossgrad_plugins.losses.photometric.numba_kernels.windows import (
     across,
     down,
     down_with_squares,
+    fill,
 )
 from crossgrad_plugins.losses.photometric.reference import C1, C2, RADIUS
 

@@ -1,0 +1,160 @@
+"""Networks and activations of the anchors in one differentiable step.
+
+Needs float32 on a CPU.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crossgrad_backbones.anchors.heads import PANEL
+from crossgrad_backbones.anchors.numba_kernels import networks
+from crossgrad_backbones.anchors.numba_kernels import networks as layers
+from crossgrad_core.numerics.elementwise import sigmoid_
+from crossgrad_core.numerics.jobs import parallel
+
+#: Anchors of a stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
+STRETCH = 2048
+#: Weight and bias of a linear layer.
+Layer = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Constants in the decoding of a view; A of P anchors are seen.
+
+    Attributes:
+        positions: [P, 3].
+        rows: [A] int64, the anchors that are seen, each once.
+        factor: [A] what multiplies their opacities; None: 1.
+        views: [A, V] direction (and distance) from the camera.
+        feature_rows: [A] int64, the row of each anchor's feature, each once.
+    """
+
+    positions: Tensor
+    rows: Tensor
+    factor: Tensor | None
+    views: Tensor
+    feature_rows: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """A view, and what the Gaussians are differentiable in; H is the width of a hidden layer.
+
+    Attributes:
+        view: The constant part.
+        features: [Q, F].
+        offsets: [P, k, 3].
+        log_scales: [P, 6].
+        first: [3 H, F + V] the first layers one after the other.
+        second: The second layers of opacity, covariance and colour.
+    """
+
+    view: View
+    features: Tensor
+    offsets: Tensor
+    log_scales: Tensor
+    first: Layer
+    second: tuple[Layer, Layer, Layer]
+
+    @classmethod
+    def of(cls, view: View, tensors: Sequence[Tensor]) -> "Inputs":
+        """From a view and all tensors in the order of the attributes, weights before biases."""
+        features, offsets, log_scales, *layers = tensors
+        first, *second = zip(layers[::2], layers[1::2], strict=True)
+        opacity, covariance, color = second
+        return cls(view, features, offsets, log_scales, first, (opacity, covariance, color))
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Values kept for the backward pass besides the inputs; G Gaussians are drawn.
+
+    Attributes:
+        joined: [A or more, F + V] inputs of the networks, padded with rows of 0.
+        hidden: [A or more, 3 H] rectified hidden layers.
+        tanhs: [A, k] opacities before the factor.
+        spreads: [A, 6] exponentials of the log scales.
+        starts: [A + 1] first Gaussian of each anchor.
+        slot: [G].
+        shares: [G, 3] scales divided by the anchor's size.
+        colors: [G, 3].
+    """
+
+    joined: Tensor
+    hidden: Tensor
+    tanhs: Tensor
+    spreads: NDArray[np.float32]
+    starts: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    shares: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+
+def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
+    """The G Gaussians of positive opacity, and what the backward pass needs.
+
+    Returns:
+        Means, quaternions, scales, opacities, colours, origin [G] and slot [G].
+    """
+    joined, hidden = _hidden(inputs)
+    weight, bias = inputs.second[0]
+    width = weight.shape[1]
+    tanhs = torch.addmm(bias, hidden[: len(inputs.view.rows), :width], weight.T).tanh_()
+    opacities = tanhs if inputs.view.factor is None else tanhs * inputs.view.factor[:, None]
+    spreads = torch.exp(inputs.log_scales.index_select(0, inputs.view.rows))
+    starts = np.empty(len(tanhs) + 1, np.int64)
+    networks.count(array(opacities), starts)
+    drawn = int(starts[-1])
+    origin, slot = (torch.empty(drawn, dtype=torch.int64) for _ in range(2))
+    widths = ((3,), (4,), (3,), (3,), (), (3,))
+    means, quats, shares, scales, kept, colors = (torch.empty(drawn, *each) for each in widths)
+    read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
+    written = (origin, slot, means, quats, shares, scales, kept, colors)
+    _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
+    # The kernel gave raw numbers and the anchor's size: torch's sigmoid is vectorised.
+    scales.mul_(sigmoid_(shares))
+    sigmoid_(colors)
+    remembered = (array(spreads), starts, array(slot), array(shares), array(colors))
+    result = (means, quats, scales, kept, colors, origin, slot)
+    return result, Kept(joined, hidden, tanhs, *remembered)
+
+
+def stretches(anchors: int) -> list[slice]:
+    """The anchors in stretches of fixed length."""
+    return [slice(i, min(i + STRETCH, anchors)) for i in range(0, anchors, STRETCH)]
+
+
+def array(tensor: Tensor) -> NDArray[Any]:
+    """The tensor without its graph as an array in C order, without a copy where it is in order."""
+    numbers: NDArray[Any] = tensor.detach().contiguous().numpy()
+    return numbers
+
+
+def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
+    """Inputs and rectified hidden layers, padded to a multiple of `PANEL`: no inputs are 0."""
+    weight, bias = inputs.first
+    anchors = len(inputs.view.rows)
+    joined = torch.empty(anchors + -anchors % PANEL, weight.shape[1])
+    joined[anchors:] = 0.0
+    features, rows, views = map(
+        array, (inputs.features, inputs.view.feature_rows, inputs.view.views)
+    )
+    parallel(layers.join, features, rows, views, array(joined))
+    return joined, torch.addmm(bias, joined, weight.T).relu_()
+
+
+def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> None:
+    """Runs the second layers of covariance and colour and writes what is drawn."""
+    (_, (cov, cov_bias), (color, color_bias)) = inputs.second
+    width = cov.shape[1]
+    for part in stretches(len(inputs.view.rows)):
+        covariances = torch.addmm(cov_bias, hidden[part, width : 2 * width], cov.T)
+        colors = torch.addmm(color_bias, hidden[part, 2 * width :], color.T)
+        parallel(networks.gather, part.start, array(covariances), array(colors), *arrays)

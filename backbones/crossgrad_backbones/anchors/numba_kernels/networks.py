@@ -1,0 +1,249 @@
+"""Kernels of the networks: around matrix products, and from outputs to Gaussians.
+
+All arrays are rows of floats in C order: A anchors that are seen, k slots each, P anchors in all, G
+Gaussians with positive opacity. Kernels work on a stretch of n anchors from `first` on, for which
+alone there are raw numbers. Anchors are divided into shares of a fixed size, and every share writes
+its own rows, so that no bit depends on the number of threads.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_backbones.anchors.heads import COVARIANCE
+from crossgrad_core.numerics.jit import kernel
+from crossgrad_core.numerics.jobs import Jobs, next_job
+
+_Floats: TypeAlias = NDArray[np.float32]
+_Ints: TypeAlias = NDArray[np.int64]
+#: Rows that one thread takes at a time.
+SHARE = 256
+
+
+@kernel
+def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
+    """Writes [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
+    anchors, feature, view = len(rows), features.shape[1], views.shape[1]
+    parts = (anchors + SHARE - 1) // SHARE
+    part = next_job(jobs, parts)
+    while part < parts:
+        for a in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+            row = rows[a]
+            for c in range(feature):
+                out[a, c] = features[row, c]
+            for c in range(view):
+                out[a, feature + c] = views[a, c]
+        part = next_job(jobs, parts)
+
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@kernel
+def rectify_back(
+    jobs: Jobs, first: int, anchors: int, column: int, hidden: _Floats, gradient: _Floats
+) -> None:
+    """Clears the gradient in place where the rectified numbers are 0.
+
+    Args:
+        jobs: From `share`.
+        first: The first anchor.
+        anchors: n.
+        column: Column of `hidden` that belongs to the first one of the gradient.
+        hidden: [A, 3 H] rectified numbers.
+        gradient: [n or more, H or 3 H].
+    """
+    width = gradient.shape[1]
+    parts = (anchors + SHARE - 1) // SHARE
+    part = next_job(jobs, parts)
+    while part < parts:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+            mine = gradient[n]
+            theirs = hidden[first + n, column : column + width]
+            for c in range(width):
+                mine[c] = mine[c] if theirs[c] > _ZERO else _ZERO
+        part = next_job(jobs, parts)
+
+
+@kernel
+def count(opacities: _Floats, starts: _Ints) -> None:
+    """Numbers the positive opacities [A, k]: those of anchor a begin at starts[a]; [A + 1]."""
+    anchors, slots = opacities.shape
+    total = 0
+    for a in range(anchors):
+        starts[a] = total
+        for j in range(slots):
+            total += opacities[a, j] > _ZERO
+    starts[anchors] = total
+
+
+@kernel
+def gather(
+    jobs: Jobs,
+    first: int,
+    covariances: _Floats,
+    colors: _Floats,
+    opacities: _Floats,
+    positions: _Floats,
+    offsets: _Floats,
+    spreads: _Floats,
+    rows: _Ints,
+    starts: _Ints,
+    origin: _Ints,
+    slot: _Ints,
+    out_means: _Floats,
+    out_quats: _Floats,
+    out_shares: _Floats,
+    out_sizes: _Floats,
+    out_opacities: _Floats,
+    out_colors: _Floats,
+) -> None:
+    """Writes what belongs to the Gaussians of positive opacity.
+
+    Args:
+        jobs: From `share`.
+        first: The first anchor.
+        covariances: [n, 7 k] raw.
+        colors: [n, 3 k] raw.
+        opacities: [A, k] as drawn.
+        positions: [P, 3].
+        offsets: [P, k, 3].
+        spreads: [A, 6] stretch of the offsets, size of the Gaussians.
+        rows: [A] row of each anchor.
+        starts: [A + 1] from `count`.
+        origin: [G] written.
+        slot: [G] written.
+        out_means: [G, 3] written.
+        out_quats: [G, 4] written, raw.
+        out_shares: [G, 3] written, raw.
+        out_sizes: [G, 3] written, the size of the anchor.
+        out_opacities: [G] written.
+        out_colors: [G, 3] written, raw.
+    """
+    anchors, slots = len(covariances), opacities.shape[1]
+    parts = (anchors + SHARE - 1) // SHARE
+    part = next_job(jobs, parts)
+    while part < parts:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+            a = first + n
+            g, p = starts[a], rows[a]
+            for j in range(slots):
+                if opacities[a, j] > _ZERO:
+                    origin[g], slot[g] = p, j
+                    out_opacities[g] = opacities[a, j]
+                    for c in range(3):
+                        out_means[g, c] = positions[p, c] + offsets[p, j, c] * spreads[a, c]
+                        out_shares[g, c] = covariances[n, COVARIANCE * j + c]
+                        out_sizes[g, c] = spreads[a, 3 + c]
+                        out_colors[g, c] = colors[n, 3 * j + c]
+                    for c in range(4):
+                        out_quats[g, c] = covariances[n, COVARIANCE * j + 3 + c]
+                    g += 1
+        part = next_job(jobs, parts)
+
+
+@kernel
+def scatter(
+    jobs: Jobs,
+    first: int,
+    anchors: int,
+    rows: _Ints,
+    starts: _Ints,
+    slot: _Ints,
+    spreads: _Floats,
+    shares: _Floats,
+    v_scales: _Floats,
+    out_log_scales: _Floats,
+    raw: _Floats,
+    tanhs: _Floats,
+    factors: _Floats,
+    offsets: _Floats,
+    colors: _Floats,
+    v_means: _Floats,
+    v_quats: _Floats,
+    v_opacities: _Floats,
+    v_colors: _Floats,
+    out_offsets: _Floats,
+) -> None:
+    """Gradients of all inputs from those of all outputs.
+
+    Args:
+        jobs: From `share`.
+        first: The first anchor.
+        anchors: n.
+        rows: [A].
+        starts: [A + 1].
+        slot: [G].
+        spreads: [A, 6].
+        shares: [G, 3] scales divided by the anchor's size.
+        v_scales: [G, 3] gradient by the scales.
+        out_log_scales: [P, 6] zero, written at `rows`.
+        raw: [n or more, 11 k] written: gradient by the raw opacities, covariances and colours.
+        tanhs: [A, k] opacities before the factor.
+        factors: [A] what multiplied them.
+        offsets: [P, k, 3].
+        colors: [G, 3] as drawn.
+        v_means: [G, 3] gradient by the means.
+        v_quats: [G, 4] gradient by the quaternions.
+        v_opacities: [G] gradient by the opacities.
+        v_colors: [G, 3] gradient by the colours.
+        out_offsets: [P, k, 3] zero, written at the slots of `rows` that are drawn.
+    """
+    slots = tanhs.shape[1]
+    to_colors = (1 + COVARIANCE) * slots
+    parts = (anchors + SHARE - 1) // SHARE
+    part = next_job(jobs, parts)
+    while part < parts:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+            a = first + n
+            p = rows[a]
+            raw[n] = _ZERO
+            for g in range(starts[a], starts[a + 1]):
+                j = slot[g]
+                cov, rgb = slots + COVARIANCE * j, to_colors + 3 * j
+                tanh = tanhs[a, j]
+                raw[n, j] = v_opacities[g] * factors[a] * (_ONE - tanh * tanh)
+                for c in range(3):
+                    moved = v_means[g, c] * spreads[a, c]
+                    out_offsets[p, j, c] = moved
+                    out_log_scales[p, c] += moved * offsets[p, j, c]
+                    share, color = shares[g, c], colors[g, c]
+                    by_log = v_scales[g, c] * share * spreads[a, 3 + c]
+                    out_log_scales[p, 3 + c] += by_log
+                    raw[n, cov + c] = by_log * (_ONE - share)
+                    raw[n, rgb + c] = v_colors[g, c] * color * (_ONE - color)
+                for c in range(4):
+                    raw[n, cov + 3 + c] = v_quats[g, c]
+        part = next_job(jobs, parts)
+
+
+@kernel
+def scatter_scales(
+    jobs: Jobs,
+    first: int,
+    anchors: int,
+    rows: _Ints,
+    starts: _Ints,
+    slot: _Ints,
+    spreads: _Floats,
+    shares: _Floats,
+    v_scales: _Floats,
+    out_log_scales: _Floats,
+    raw: _Floats,
+) -> None:
+    """As `scatter` where only the scales have a gradient; `raw` [n, 7 k] is by covariances."""
+    parts = (anchors + SHARE - 1) // SHARE
+    part = next_job(jobs, parts)
+    while part < parts:
+        for n in range(part * SHARE, min(anchors, (part + 1) * SHARE)):
+            a = first + n
+            p = rows[a]
+            raw[n] = _ZERO
+            for g in range(starts[a], starts[a + 1]):
+                cov = COVARIANCE * slot[g]
+                for c in range(3):
+                    by_log = v_scales[g, c] * shares[g, c] * spreads[a, 3 + c]
+                    out_log_scales[p, 3 + c] += by_log
+                    raw[n, cov + c] = by_log * (_ONE - shares[g, c])
+        part = next_job(jobs, parts)

@@ -1,0 +1,178 @@
+"""The commands that work on a trained run: `crossgrad eval`, `export` and `render`."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.startup import announce
+
+Ply = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Evaluate the Gaussians of this PLY instead, drawn on black as viewers draw them.",
+    ),
+]
+On = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="SCENE",
+        help="Evaluate on another capture of the place, in the same coordinates: on those of its "
+        "views that the run was not trained on.",
+    ),
+]
+RunFolder = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Folder of a finished or stopped run.")
+]
+Device = Annotated[
+    str | None,
+    typer.Option(metavar="auto|cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+]
+Threads = Annotated[
+    int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
+]
+AcceptScene = Annotated[
+    bool,
+    typer.Option(
+        "--accept-scene",
+        help="Take the scene although photos, masks, points or held-out views have changed.",
+    ),
+]
+
+
+def evaluate(
+    run: RunFolder,
+    ply: Ply = None,
+    on: On = None,
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
+) -> None:
+    """Evaluate the held-out views of a run again."""
+    announce()
+    from crossgrad_core.run.postprocess import evaluate
+    from crossgrad_core.run.postprocess.open_options import How
+
+    how = How(device, threads, accept_scene)
+    evaluate.evaluate(run, how, ply, on)
+
+
+def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
+    run: RunFolder,
+    file_format: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="File format, an exporter; ply is the usual 3DGS file. Default: the run's.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The file to write. Default: RUN/point_cloud.ply."),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEW",
+            help="Bake what depends on the view for this one, into RUN/point_cloud_VIEW.ply. "
+            "Default: mean of the training views.",
+        ),
+    ] = None,
+    coordinates: Annotated[
+        str,
+        typer.Option(
+            metavar="input|local|enu|utm|epsg:N",
+            help="Coordinates of the file: the scene's, those that are trained in, metres east, "
+            "north and up, or projected ones; others than input go into "
+            "RUN/point_cloud_COORDINATES.ply.",
+        ),
+    ] = "input",
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
+) -> None:
+    """Write the trained scene to a file that viewers open."""
+    announce()
+    from crossgrad_core.run.postprocess import export
+    from crossgrad_core.run.postprocess.open_options import How
+
+    how = How(device, threads, accept_scene)
+    export.export(
+        run, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
+    )
+
+
+class Split(StrEnum):
+    """Which views are drawn."""
+
+    TEST = "test"
+    TRAIN = "train"
+    ALL = "all"
+
+
+def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
+    run: RunFolder,
+    split: Annotated[
+        Split | None, typer.Option(help="Which views are drawn. Default: test.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
+    ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENE",
+            help="ViewSample the views of another capture of the place, as eval does.",
+        ),
+    ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|zoom",
+            help="Draw a video instead: along the cameras of a file, or from the farthest photos "
+            "down to the nearest.",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=2, max=100_000, help="Frames of a zoom path. Default: 120."),
+    ] = None,
+    device: Device = None,
+    threads: Threads = None,
+    accept_scene: AcceptScene = False,
+) -> None:
+    """Draw the views of a run as PNG files."""
+    alone = "a video shows what the cameras of its path see"
+    _check_together(("--on", on), ("--path", path), alone)
+    _check_together(("--split", split), ("--path", path), alone)
+    _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")
+    if frames is not None and path is None:
+        raise UserError(
+            "--frames does nothing without --path zoom",
+            where="--frames",
+            todo="leave out --frames, or draw a zoom path",
+        )
+    announce()
+    from crossgrad_core.run.postprocess import render
+    from crossgrad_core.run.postprocess.open_options import How
+
+    how = How(device, threads, accept_scene)
+    if path is not None:
+        render.render_path(run, path, frames=frames, out=out, how=how)
+        return
+    render.render(run, split=split or "test", out=out, how=how, on=on)
+
+
+def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:
+    """Refuses an option that would do nothing beside another."""
+    if option[1] is not None and other[1] is not None:
+        raise UserError(
+            f"{option[0]} does nothing beside {other[0]}: {why}",
+            where=option[0],
+            todo=f"leave out {option[0]}, or {other[0]}",
+        )

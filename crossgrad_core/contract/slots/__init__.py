@@ -1,0 +1,1 @@
+"""The slots: one file for the base class of each kind of component."""

@@ -1,0 +1,132 @@
+"""The recipe slot: the value of every setting that a run does not take from the user."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from crossgrad_core.contract.component import Component
+from crossgrad_core.contract.decision import Decision
+from crossgrad_core.contract.schedule import (
+    REFERENCE,
+    Counting,
+    Schedule,
+    ScheduleMode,
+    Unit,
+    ViewsPerStepSpec,
+    is_published,
+)
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.densifier import Densifier
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """The facts about a run that a recipe decides from.
+
+    Attributes:
+        device: Torch device type.
+        planned: Steps that the run was planned with; None while only its seconds are known.
+        total: Steps that the run has now, after the clock made it longer or shorter.
+        mode: Whether the published schedule is stretched to the run.
+        reference: Length that the schedule is written for, if that is not the length of the run.
+        views_per_step: Views of each step, K.
+        views_because: Why K is not the usual one of the sampler; empty if it is.
+        photos: Number of training photos.
+        pixels: Pixels of a training photo, mean.
+        photos_per_point: Training photos that an SfM point lies in, median; 0 if there are none.
+        own_points: Whether the run starts from the points of the scene.
+        batched: Whether a batch rule scales rates and averages with K.
+        scale: Local units per unit of the scene's own frame.
+        start: Primitives at the start; None before they are counted.
+        backbone: The backbone, fitted to the scene.
+        densifier: Name -> that densifier with the options that the user set.
+        provides: Screen statistics of the rasterizer that draws.
+        given: The settings that the user set, with their values.
+    """
+
+    device: str
+    planned: int | None
+    total: int
+    mode: ScheduleMode
+    schedule_length: int | None
+    views_per_step: ViewsPerStepSpec
+    views_because: str
+    photos: int
+    pixels: float
+    photos_per_point: float
+    own_points: bool
+    batched: bool
+    scale: float
+    start: int | None
+    backbone: Backbone
+    densifier: Callable[[str], Densifier]
+    provides: frozenset[str]
+    given: Mapping[str, Any]
+
+    @property
+    def published(self) -> bool:
+        """Whether the schedule has the published numbers, whatever the length of the run."""
+        return is_published(self.mode, self.schedule_length)
+
+    @property
+    def unit(self) -> Unit:
+        """What schedules count, unless the recipe says otherwise."""
+        unit: Unit = self.given.get("schedule_unit") or ("steps" if self.published else "views")
+        return unit
+
+    @property
+    def steps(self) -> int | None:
+        """Planned steps; with `--schedule absolute` those that the schedule is written for."""
+        schedule = self.schedule(self.unit)
+        if self.mode == "absolute":
+            return schedule.step_of(schedule.length)
+        return self.planned
+
+    def intervals(self) -> list[Decision]:
+        """Return the rows of evaluations and checkpoints, which no result depends on."""
+        steps = self.planned or self.total
+        return [
+            Decision("eval_every", max(1, steps // 10), "a tenth of the run"),
+            Decision("save_every", max(1, steps // 5), "a fifth of the run"),
+        ]
+
+    @property
+    def views(self) -> int | None:
+        """Planned views, which say how long the run is; None before they are planned."""
+        steps = self.steps
+        return None if steps is None else self.views_per_step.paced(steps).views(steps)
+
+    @property
+    def short(self) -> bool:
+        """Whether the run is shorter than the published ones; True before its length is planned."""
+        return self.views is None or self.views < REFERENCE
+
+    def schedule(self, unit: Unit) -> Schedule:
+        """Return the schedule at the present length of the run, before any decision on it."""
+        counting = Counting(unit, self.views_per_step, self.photos, self.schedule_length)
+        return Schedule.for_run(self.total, self.mode, counting)
+
+
+class Recipe(Component):
+    """Decides every setting that the user leaves open.
+
+    Attributes:
+        settings: Settings that the recipe fixes before any fact is known, such as the sampler and
+            the length. What the user sets wins.
+        rasterizer_options: Options that a rasterizer must have to be chosen for this recipe.
+    """
+
+    slot: ClassVar[str] = "recipes"
+    settings: ClassVar[Mapping[str, Any]] = {}
+    rasterizer_options: ClassVar[frozenset[str]] = frozenset()
+
+    @abstractmethod
+    def decide(self, facts: Facts) -> list[Decision]:
+        """Return one row for each setting; rows of settings that the user set are left out."""
+
+
+def with_rows(rows: Iterable[Decision], others: Sequence[Decision]) -> list[Decision]:
+    """Return the rows of one recipe, of which those of another one replace or follow some."""
+    table = {row.setting: row for row in rows}
+    return [*(table | {row.setting: row for row in others}).values()]

@@ -1,1 +1,0 @@
-"""Checkpoints: safetensors and JSON."""

@@ -1,0 +1,257 @@
+"""Which file, size and calibration every view gets; only headers are read."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crossgrad_core.contract.scene import Pinhole
+from crossgrad_core.contract.scene_options import SceneOptions
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.photos.decode import FULL_16_BIT, WHITES, brightest
+from crossgrad_core.scene.photos.headers import PhotoHeader, read_header, read_quarter_turn
+from crossgrad_core.scene.photos.photo_files import (
+    PhotoFolder,
+    check_masks,
+    find_mask_folder,
+    find_photo_folders,
+    pair_masks,
+)
+from crossgrad_core.scene.photos.photo_notes import (
+    note_kinds,
+    note_links,
+    note_memory,
+    note_pairing,
+    note_reductions,
+    note_sizes,
+    note_undistortion,
+    note_unused,
+)
+from crossgrad_core.scene.photos.photos import PhotoSource
+from crossgrad_core.scene.photos.shapes import check_mask, choose_reduction, is_scaled
+from crossgrad_core.scene.raw import RawScene
+from crossgrad_core.scene.wording import count, name_some
+
+#: Photos of 8, 10, 12 or 14 bits reach this share of that range; darker ones may be anything.
+_REACHED: Final = 0.8
+#: Photos with a larger value use their 16 bits.
+_DARK: Final = WHITES[-2]
+#: Photos that are decoded before the largest value is looked at.
+_AT_ONCE: Final = 8
+
+
+def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
+    """Return the value of white for all photos of 16 bits, and a note if it is not 65535.
+
+    All photos share one value, which depends on the brightest pixel of all. Photos that use a small
+    part of their range without filling that of a smaller number of bits are left dark.
+
+    Args:
+        deep: The photos. They are decoded until one is bright enough for 16 bits.
+
+    Raises:
+        UserError: A photo is damaged.
+    """
+    top = 0 if deep else FULL_16_BIT
+    with ThreadPoolExecutor() as pool:
+        for start in range(0, len(deep), _AT_ONCE):
+            top = max(top, *pool.map(brightest, deep[start : start + _AT_ONCE]))
+            if top > _DARK:
+                break
+    if top > _DARK:
+        return FULL_16_BIT, []
+    white = next(white for white in WHITES if white >= top)
+    photos = f"photos: {count(len(deep), 'photo')} of 16 bits"
+    bits = white.bit_length()
+    if white > WHITES[0] and top >= _REACHED * white:
+        return white, [f"{photos} hold {bits}-bit values (up to {top}): scaled, {white} is white"]
+    return FULL_16_BIT, [
+        f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) and are dark; "
+        f"if they hold {bits}-bit values, save them scaled to 16 bits"
+    ]
+
+
+@dataclass(frozen=True)
+class ChosenPhotos:
+    """The photos of a scene.
+
+    Attributes:
+        sources: View name -> how its photo is decoded; views without a photo are not in it.
+        pinholes: View name -> calibration of the photo as trained.
+        notes: What was left out, undistorted, resized or masked, and files that are not used.
+    """
+
+    sources: Mapping[str, PhotoSource]
+    pinholes: Mapping[str, Pinhole]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Paths and headers of the photos of one folder, by view name."""
+
+    folder: PhotoFolder
+    paths: Mapping[str, Path]
+    headers: Mapping[str, PhotoHeader]
+
+    @property
+    def longest(self) -> int:
+        """Longest side in pixels."""
+        return max(max(header.width, header.height) for header in self.headers.values())
+
+
+def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
+    """Pairs views with photos by name and settles the size of each photo as trained.
+
+    Raises:
+        UserError: No view has a photo, a photo is damaged or does not fit its camera, or the mask
+            folder that was asked for is not there.
+    """
+    # Beside the scene's own folder lies what is not the scene's.
+    folders = find_photo_folders(raw.images)[: 1 if raw.images == raw.root else None]
+    names = sorted(view.name for view in raw.views)
+    full = _read_full(folders[0], names)
+    found, reduced_notes = _prefer_reduced(full, folders[1:], options.max_size)
+    masks = _find_masks(raw, options, tuple(found.paths))
+    white, white_notes = white_of([found.paths[n] for n, h in found.headers.items() if h.deep])
+    sources: dict[str, PhotoSource] = {}
+    pinholes: dict[str, Pinhole] = {}
+    shared: dict[Calibration, Calibration] = {}
+    for view in raw.views:
+        if view.name not in found.paths:
+            continue
+        path, header = found.paths[view.name], found.headers[view.name]
+        reduction = choose_reduction(path, header, options.max_size)
+        header = header.reduced(reduction)
+        width, height, orientation = _fit(view.calibration, header, path)
+        fitted = view.calibration.resized(width, height)
+        # Photos of one camera share its undistortion.
+        fitted = shared.setdefault(fitted, fitted)
+        target = _limit(fitted.pinhole.width, fitted.pinhole.height, options.max_size)
+        pinholes[view.name] = fitted.pinhole.resized(*target)
+        sources[view.name] = PhotoSource(
+            path=path,
+            width=width,
+            height=height,
+            orientation=orientation,
+            mask=masks.get(view.name),
+            alpha=header.alpha,
+            background=raw.background,
+            distorted=None if fitted.is_pinhole else fitted,
+            target=target,
+            reduction=reduction,
+            white=white if header.deep else FULL_16_BIT,
+        )
+    for name, mask in masks.items():
+        source = sources[name]
+        check_mask(mask, (source.width, source.height), may_turn=source.orientation != 1)
+    used = [*full.paths.values(), *found.paths.values(), *masks.values()]
+    started = [options.init_file] if options.init_file else []
+    notes = (
+        *note_pairing(full.folder, full.paths, names, used),
+        *note_links(raw.root, sources),
+        *reduced_notes,
+        *note_undistortion(sources),
+        *note_sizes(found.folder.path.name, sources, _calibrated_sizes(raw)),
+        *note_reductions(sources),
+        *white_notes,
+        *note_kinds(sources, found.headers, raw.background),
+        *note_memory(sources, options),
+        *note_unused(raw, [*used, *started], find_mask_folder(options.masks, raw.root)),
+    )
+    return ChosenPhotos(sources, pinholes, notes)
+
+
+def _calibrated_sizes(raw: RawScene) -> dict[str, tuple[int, int]]:
+    return {view.name: (view.calibration.width, view.calibration.height) for view in raw.views}
+
+
+def _read_full(folder: PhotoFolder, names: Sequence[str]) -> _Found:
+    paths = _pair(folder, names)
+    if not paths:
+        raise UserError(
+            "no posed image has a photo",
+            where=folder.path,
+            expected=f"photos named as in the model, such as {names[0]}",
+            found=name_some(folder.names) or "no photo",
+            todo="put the photos below the image folder under the names that the model gives them",
+        )
+    return _read_found(folder, paths)
+
+
+def _read_found(folder: PhotoFolder, paths: Mapping[str, Path]) -> _Found:
+    return _Found(folder, paths, {name: read_header(path) for name, path in paths.items()})
+
+
+def _pair(folder: PhotoFolder, names: Sequence[str]) -> dict[str, Path]:
+    return {name: folder.path / file for name, file in folder.pair(names).files.items()}
+
+
+def _prefer_reduced(
+    full: _Found, reduced: Sequence[PhotoFolder], max_size: int | None
+) -> tuple[_Found, list[str]]:
+    """The largest photo folder that keeps to the size limit, unless resizing keeps far more.
+
+    A folder with photos smaller than half the limit is not worth what it would throw away.
+    """
+    notes: list[str] = []
+    if max_size is None or full.longest <= max_size:
+        return full, notes
+    for folder in reduced:
+        paths = _pair(folder, tuple(full.paths))
+        if len(paths) < len(full.paths):
+            absent = [name for name in full.paths if name not in paths]
+            notes.append(
+                f"photos: {folder.path.name}/ is not used, {count(len(absent), 'photo')} of it "
+                f"missing: {name_some(absent)}"
+            )
+            continue
+        found = _read_found(folder, paths)
+        if found.longest <= max_size:
+            return (found if 2 * found.longest >= max_size else full), notes
+    return full, notes
+
+
+def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int, int, int]:
+    """Width, height and EXIF orientation of a photo in the pixels that its pose refers to.
+
+    COLMAP ignores EXIF rotation, so the stored pixel grid is taken, unless the camera has the shape
+    of the rotated photo only.
+    """
+    width, height = header.width, header.height
+    posed = calibration.width, calibration.height
+    if is_scaled((width, height), posed):
+        return width, height, 1
+    orientation = read_quarter_turn(path)
+    if orientation is not None and is_scaled((height, width), posed):
+        return height, width, orientation
+    raise UserError(
+        "a photo does not have the shape of its camera",
+        where=path,
+        expected=f"{calibration.width} x {calibration.height} pixels, or in that proportion",
+        found=f"{width} x {height} pixels",
+        todo="use the photos that the poses were estimated from",
+    )
+
+
+def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
+    """The size with the longest side cut down to the limit."""
+    longest = max(width, height)
+    if max_size is None or longest <= max_size:
+        return width, height
+    shortened = (int(side * max_size / longest + 0.5) for side in (width, height))
+    new_width, new_height = (max(1, side) for side in shortened)
+    return new_width, new_height
+
+
+def _find_masks(raw: RawScene, options: SceneOptions, names: Sequence[str]) -> dict[str, Path]:
+    folder = find_mask_folder(options.masks, raw.root)
+    found = frozenset(names)
+    named = {view.name: view.mask for view in raw.views if view.mask and view.name in found}
+    if folder is None or (named and options.masks is None):
+        return named
+    masks = pair_masks(folder, names)
+    check_masks(folder, options.masks, len(masks), names)
+    return masks

@@ -1,0 +1,203 @@
+"""Files of a scene by name: their kind, and names that other programs give them.
+
+Such names may have other folders, another suffix or another case.
+"""
+
+import os
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import PurePosixPath, PureWindowsPath
+from typing import Final, TypeAlias
+
+from crossgrad_core.scene.photos.pillow import SUFFIXES
+
+#: How much a file's path is like a name: same folders, number of shared folders at the end, one
+#: path ends with the other, same base name up to letter case, same base name. Greater is more.
+_Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]
+#: Suffixes of photos and masks.
+IMAGES: Final = frozenset(
+    {".avif", ".bmp", ".gif", ".jp2", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+    | {".webp", *SUFFIXES}
+)
+#: Kinds of files.
+PHOTO, COPY, MASK, DEPTH = "photo", "smaller copy of a photo", "mask", "depth or normal map"
+RAW, POINTS, TABLE = "raw photo", "point file", "CSV file"
+_BY_SUFFIX: Final = {
+    **dict.fromkeys((".exr", ".pfm"), DEPTH),
+    **dict.fromkeys((".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2"), RAW),
+    **dict.fromkeys((".e57", ".las", ".laz", ".pcd", ".ply", ".pts", ".ptx", ".xyz"), POINTS),
+    ".csv": TABLE,
+}
+_WORDS: Final = {
+    **dict.fromkeys(("alpha", "mask", "masks", "matte", "mattes", "seg", "segmentation"), MASK),
+    **dict.fromkeys(("silhouette", "silhouettes"), MASK),
+    **dict.fromkeys(("depth", "depths", "disparity", "normal", "normals"), DEPTH),
+}
+_COPIES: Final = re.compile(r"(images|photos|rgb)_[248]")
+#: Files of numbers, of any kind unless a word says which.
+_ARRAYS: Final = frozenset({".npy", ".npz"})
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Names and their files.
+
+    Attributes:
+        files: Name -> its file.
+        ambiguous: Name -> the files that fit it equally well.
+    """
+
+    files: Mapping[str, str]
+    ambiguous: Mapping[str, Sequence[str]]
+
+
+class FileNames:
+    """Files below one folder, found by the names that other programs give them.
+
+    A name stands for the file with the same path, or else for the file with the same base name
+    whose path is most alike. Suffix, case and Unicode form may differ. A file in another folder
+    stands in only if the folder of the name is not there: otherwise the file itself is missing.
+
+    Args:
+        names: Paths below the folder, with forward slashes.
+        called: Returns the name that a path is compared by.
+        aside: Returns True for a path that no name with other folders stands for.
+    """
+
+    def __init__(
+        self,
+        names: Iterable[str],
+        called: Callable[[str], str] = str,
+        aside: Callable[[str], bool] = lambda _: False,
+    ) -> None:
+        self._aside = aside
+        self._called = {name: called(name) for name in sorted(names)}
+        self._folders = {part for name in self._called for part in _folders(name)}
+        self._alike = defaultdict[str, list[str]](list)
+        for name, call in self._called.items():
+            self._alike[_base(without_suffix(call))].append(name)
+
+    def find(self, name: str) -> str | None:
+        """Return the one file that a name stands for; None if there is none, or several."""
+        return self.pair((name,)).files.get(name)
+
+    def fitting(self, name: str) -> list[str]:
+        """Return the files that fit a name equally well, sorted."""
+        pairs = self.pair((name,))
+        return sorted(pairs.ambiguous.get(name) or filter(None, [pairs.files.get(name)]))
+
+    def pair(self, names: Collection[str], taken: Container[str] = ()) -> Pairs:
+        """Find the file of each name. A file belongs to the name that is most like its path.
+
+        Args:
+            names: The names, relative or absolute, with forward slashes or backslashes.
+            taken: Files that stand for none of the names.
+        """
+        exact = {name: name for name in names if name in self._called and name not in taken}
+        best = {
+            name: self._most_alike(name, lambda file: file in taken or file in exact)
+            for name in names
+            if name not in exact
+        }
+        claims = defaultdict[str, list[_Likeness]](list)
+        for likeness, files in best.values():
+            for file in files:
+                claims[file].append(likeness)
+        # A name that is less like a file's path than another name is has lost its own file.
+        held = {
+            name: (likeness, [file for file in files if likeness == max(claims[file])])
+            for name, (likeness, files) in best.items()
+        }
+        claimed = Counter((likeness, file) for likeness, files in held.values() for file in files)
+        clear = {
+            name: files[0]
+            for name, (likeness, files) in held.items()
+            if len(files) == 1 and claimed[likeness, files[0]] == 1
+        }
+        unclear = {name: files for name, (_, files) in held.items() if files and name not in clear}
+        return Pairs({**exact, **clear}, unclear)
+
+    def _most_alike(
+        self, name: str, is_taken: Callable[[str], bool]
+    ) -> tuple[_Likeness, list[str]]:
+        """The files that are most like a name, and how much they are."""
+        found: dict[str, _Likeness] = {}
+        for base in {_base(name), _stem(name)}:
+            for file in self._alike.get(base, ()):
+                likeness = None if is_taken(file) else self._likeness(name, file)
+                if likeness is not None:
+                    found[file] = likeness
+        most = max(found.values(), default=(False, 0, False, False, False))
+        return most, [file for file, likeness in found.items() if likeness == most]
+
+    def _likeness(self, name: str, file: str) -> _Likeness | None:
+        """How much a file's path is like a name; None if the folder of the name is there."""
+        call = self._called[file]
+        own, other = _folders(name), _folders(call)
+        pairs = zip(reversed(own), reversed(other), strict=False)
+        shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+        ends = shared in {len(own), len(other)}
+        missing = shared < len(own) and own[-1 - shared] in self._folders
+        if own != other and (missing or self._aside(file)):
+            return None
+        # A name without a suffix may contain dots.
+        whole = _base(name) in {_base(call), _base(without_suffix(call))}
+        return own == other, shared, ends, whole, _parts(name)[-1] == _parts(call)[-1]
+
+
+def is_absolute(name: str) -> bool:
+    """Return True if a name is an absolute path, of this system or of Windows."""
+    return name.startswith(("/", "\\")) or bool(PureWindowsPath(name).drive)
+
+
+def same_spelling(name: str, other: str) -> bool:
+    """Return True if two names differ in suffix, case and Unicode form at most."""
+    return _folders(name) == _folders(other) and _stem(name) == _stem(other)
+
+
+def without_suffix(name: str) -> str:
+    """Return a name without the suffix of an image, if it ends with one."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in IMAGES else name
+
+
+def _parts(name: str) -> list[str]:
+    return [part for part in name.replace("\\", "/").split("/") if part not in {"", "."}]
+
+
+def _folders(name: str) -> list[str]:
+    return [_fold(part) for part in _parts(name)[:-1]]
+
+
+def _base(name: str) -> str:
+    """The base name of a path, in one case and Unicode form."""
+    return _fold("".join(_parts(name)[-1:]))
+
+
+def _stem(name: str) -> str:
+    """The base name of a path without any suffix, in one case and Unicode form."""
+    return PurePosixPath(_base(name)).stem
+
+
+def _fold(text: str) -> str:
+    return unicodedata.normalize("NFC", text).casefold()
+
+
+def kind_of(name: str) -> str | None:
+    """Return the kind of a file by its path below the scene; None for files of no known kind.
+
+    Images are photos, unless a word in their name or in the names of their folders says otherwise.
+    """
+    path = PurePosixPath(name)
+    suffix = path.suffix.lower()
+    if suffix not in IMAGES | _ARRAYS:
+        return _BY_SUFFIX.get(suffix)
+    words = (word for part in path.parts for word in re.split("[^a-z]+", part.lower()))
+    said = next((_WORDS[word] for word in words if word in _WORDS), None)
+    if said or suffix in _ARRAYS:
+        return said
+    return COPY if any(map(_COPIES.fullmatch, path.parts[:-1])) else PHOTO

@@ -1,0 +1,252 @@
+"""The files of a scene's posed photos and of their masks, found by name."""
+
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.photos.file_names import (
+    IMAGES,
+    PHOTO,
+    FileNames,
+    Pairs,
+    is_absolute,
+    kind_of,
+    same_spelling,
+    without_suffix,
+)
+from crossgrad_core.scene.raw import RawScene
+from crossgrad_core.scene.wording import count, name_some
+from crossgrad_core.system.input_files import is_file
+
+_REDUCED = (2, 4, 8)
+_DEFAULT: Final = "masks"
+_WORD: Final = "(mask|masks|matte|alpha|seg|segmentation|silhouette)"
+_DECORATION: Final = re.compile(rf"^{_WORD}[ ._-]+|[ ._-]+{_WORD}$", re.IGNORECASE)
+
+
+class PhotoFolder:
+    """The photos below one folder, found by name.
+
+    Args:
+        path: The folder; need not be there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.names = tuple(sorted(_list_photos(path)))
+
+    def pair(self, names: Collection[str]) -> Pairs:
+        """Find the photo of each posed image; see `FileNames`.
+
+        Args:
+            names: What the poses call the photos.
+        """
+        there = {name: name for name in names if self._holds(name)}
+        rest = [name for name in names if name not in there]
+        if not rest:
+            return Pairs(there, {})
+        files = FileNames(self.names, aside=lambda name: kind_of(name) is not PHOTO)
+        pairs = files.pair(rest, there)
+        return replace(pairs, files={**there, **pairs.files})
+
+    def _holds(self, name: str) -> bool:
+        """Whether a file of that name is there, whatever its suffix says."""
+        inside = not is_absolute(name) and ".." not in PurePosixPath(name).parts
+        return inside and is_file(self.path / name)
+
+
+def find_photo_folders(images: Path) -> list[PhotoFolder]:
+    """The photo folders that are there: full size first, then `<images>_2`, `_4`, `_8`.
+
+    Raises:
+        UserError: None is there.
+    """
+    paths = [images, *(images.with_name(f"{images.name}_{n}") for n in _REDUCED)]
+    folders = [PhotoFolder(path) for path in paths if path.is_dir()]
+    if not folders:
+        beside = sorted(p.name for p in images.parent.iterdir() if p.is_dir())
+        raise UserError(
+            "the scene has no folder of photos",
+            where=images,
+            found="a file" if images.exists() else f"folders {', '.join(beside) or '(none)'}",
+            todo=f"put the photos into {images.name}/, or name their folder",
+        )
+    return folders
+
+
+def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Folders at and below a folder, then those behind its links to folders, each once.
+
+    Links behind links are not followed, nor one that leads to where the folder itself lies.
+
+    Yields:
+        The path below the folder with forward slashes (`.` for itself), the names of its folders,
+        of which those that are taken out of the list are not looked into, and of its files.
+    """
+    seen: set[str] = set()
+    links: list[Path] = []
+    for below, folders, files in _tree(folder, folder, seen):
+        yield below, folders, files
+        places = (folder / below / name for name in sorted(folders))
+        links += [place for place in places if place.is_symlink()]
+    for link in links:
+        if link.resolve() not in folder.resolve().parents:
+            yield from _tree(folder, link, seen)
+
+
+def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list[str], list[str]]]:
+    for base, folders, files in os.walk(start):
+        place = os.path.realpath(base)
+        if place in seen:
+            folders.clear()
+            continue
+        seen.add(place)
+        yield Path(base).relative_to(folder).as_posix(), folders, files
+
+
+def _list_photos(folder: Path) -> list[str]:
+    """Names of all photos below a folder, with forward slashes."""
+    names: list[str] = []
+    for below, _, files in walked(folder):
+        prefix = "" if below == "." else below + "/"
+        names += [prefix + f for f in files if os.path.splitext(f)[1].lower() in IMAGES]
+    return names
+
+
+def mask_names(name: str) -> tuple[str, ...]:
+    """What the mask of a photo may be called in a folder of masks, the first that is there.
+
+    `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
+    `aerial/0001_mask.png` (Metashape) or `aerial/0001.jpg`.
+    """
+    stem = str(PurePosixPath(name).with_suffix(""))
+    return f"{name}.png", f"{stem}.png", f"{stem}_mask.png", name
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """The mask of a photo; None where it has none."""
+    return next(filter(is_file, (folder / each for each in mask_names(name))), None)
+
+
+def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Find the mask of each photo that has one.
+
+    Names of `mask_names` come first. Then other folders, suffixes and letter cases are tried, and
+    last names with a word such as `mask` before or after the photo's name.
+
+    Args:
+        folder: The folder of the masks.
+        names: The photos.
+    """
+    masks = {name: path for name in names if (path := find_mask(folder, name)) is not None}
+    there = frozenset(PhotoFolder(folder).names) if len(masks) < len(names) else frozenset()
+    for called in (without_suffix, _undecorated):
+        files = there - {path.relative_to(folder).as_posix() for path in masks.values()}
+        pairs = FileNames(files, called).pair([name for name in names if name not in masks])
+        masks |= {name: folder / file for name, file in pairs.files.items()}
+    return masks
+
+
+def find_mask_folder(option: Path | None, root: Path) -> Path | None:
+    """The mask folder: the option's, as given or within the scene; else `<scene>/masks`, if any.
+
+    Raises:
+        UserError: The option names a folder that is not there.
+    """
+    if option is None:
+        return next(_default_folders(root), None)
+    for folder in (option, root / option):
+        if folder.is_dir():
+            return folder
+    raise UserError(
+        "the mask folder is not there",
+        where=option,
+        todo="name a folder, as it is or within the scene: --set data.masks=FOLDER",
+    )
+
+
+def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[str]) -> None:
+    """Refuse a mask folder that fits no photo; by default an empty folder is no mask folder.
+
+    Raises:
+        UserError: No photo has a mask in it.
+    """
+    there = PhotoFolder(folder).names if not found else ()
+    if found or (option is None and not there):
+        return
+    raise UserError(
+        "no photo has a mask in the mask folder",
+        where=folder,
+        expected=f"{' or '.join(dict.fromkeys(mask_names(names[0])))} for the photo {names[0]}",
+        found=name_some(there) or "no mask",
+        todo="name the masks after their photos, or leave data.masks out"
+        if option
+        else "name the masks after their photos, or rename the folder to train without masks",
+    )
+
+
+def _default_folders(root: Path) -> Iterator[Path]:
+    """`<scene>/masks`, and folders whose name differs in letter case only."""
+    if (root / _DEFAULT).is_dir():
+        yield root / _DEFAULT
+    alike = (path for path in sorted(root.iterdir()) if path.name.casefold() == _DEFAULT)
+    yield from (path for path in alike if path.is_dir())
+
+
+def _undecorated(name: str) -> str:
+    """The name of a mask without a word such as `mask` at its start or end."""
+    path = PurePosixPath(without_suffix(name))
+    stem = without_suffix(_DECORATION.sub("", path.name))
+    return str(path.with_name(stem)) if stem else str(path)
+
+
+def with_photo_names(raw: RawScene) -> RawScene:
+    """Return the scene with each posed image under the name that its photo has below `images`.
+
+    Programs write absolute paths, or paths from another folder. Spelling is left as it is: a name
+    may differ from its photo's in suffix and case.
+
+    Raises:
+        UserError: There is no photo folder, or an absolute path fits several photos.
+    """
+    names = [view.name for view in raw.views]
+    if all(not is_absolute(name) and is_file(raw.images / name) for name in names):
+        return raw
+    pairs = find_photo_folders(raw.images)[0].pair(names)
+    _check_absolute(raw, pairs.ambiguous)
+    moved = {name: file for name, file in pairs.files.items() if not same_spelling(name, file)}
+    told = (
+        (moved, "found by the end of their path", "{0} is {1}"),
+        (pairs.ambiguous, "without a photo of their own, several could be meant", "{0} ({1})"),
+    )
+    notes = [
+        f"photos: {count(len(which), 'posed image')} {what}: "
+        + name_some([form.format(name, _listed(files)) for name, files in sorted(which.items())])
+        for which, what, form in told
+        if which
+    ]
+    views = tuple(replace(view, name=moved.get(view.name, view.name)) for view in raw.views)
+    if raw.split is not None:
+        train, test = (frozenset(moved.get(name, name) for name in part) for part in raw.split)
+        raw = replace(raw, split=(train, test))
+    return replace(raw, views=views, notes=(*raw.notes, *notes))
+
+
+def _listed(files: str | Sequence[str]) -> str:
+    return files if isinstance(files, str) else " or ".join(files)
+
+
+def _check_absolute(raw: RawScene, ambiguous: Mapping[str, Sequence[str]]) -> None:
+    names = [name for name in ambiguous if is_absolute(name)]
+    if names:
+        raise UserError(
+            "an image name fits several photos",
+            where=raw.images,
+            expected="a path below the image folder, or one whose end only one photo has",
+            found=f"{names[0]}, which can be {name_some(ambiguous[names[0]])}",
+            todo="rename the image in the model, so that its folders are those of the photo",
+        )

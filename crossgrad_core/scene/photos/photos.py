@@ -1,0 +1,287 @@
+"""Photos that are decoded when they are asked for, and the memory that keeps them."""
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, Lock
+from typing import Generic, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from crossgrad_core.contract.scene import Photo
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.calibration import Calibration
+from crossgrad_core.scene.photos.decode import (
+    FULL_16_BIT,
+    Pixels,
+    blend,
+    decode_mask,
+    decode_photo,
+    resize,
+    turn,
+)
+from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
+from crossgrad_core.scene.photos.shapes import is_turned
+
+#: The smallest size that JPEG files can be decoded at: all of their data is read for it.
+SMALLEST = 8
+_OPAQUE, _HALF = 255, 128
+#: Seconds that a photo is waited for which another thread is decoding.
+_PATIENCE = 0.5
+# More than the views of one step, so that none is decoded twice in it.
+_LATEST = 16
+#: Photos of fewer pixels are decoded about as quickly as read.
+_LARGE = 2_000_000
+
+
+@dataclass(frozen=True)
+class PhotoSource:
+    """How a view's photo comes from its file.
+
+    Attributes:
+        path: The photo.
+        width: Width of the photo in the pixels that its pose refers to.
+        height: Likewise.
+        orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
+        mask: The mask file, or None.
+        alpha: Whether the file may have transparent pixels.
+        background: RGB in [0, 1] behind transparent pixels; None where they do not count.
+        distorted: The calibration to undistort with, in the size above; None for a pinhole.
+        target: (width, height) as trained.
+        reduction: What the file's width and height are divided by while it is decoded.
+        white: The value of white, if the file has 16 bits a channel.
+    """
+
+    path: Path
+    width: int
+    height: int
+    orientation: int
+    mask: Path | None
+    alpha: bool
+    background: tuple[float, float, float] | None
+    distorted: Calibration | None
+    target: tuple[int, int]
+    reduction: int = 1
+    white: int = FULL_16_BIT
+
+    @property
+    def may_mask(self) -> bool:
+        """Whether some pixels may not count."""
+        transparent = self.alpha and self.background is None
+        blank = self.distorted is not None and not self.distorted.fills_frame
+        return self.mask is not None or transparent or blank
+
+    @property
+    def undistorted_size(self) -> tuple[int, int]:
+        """(width, height) before resizing."""
+        if self.distorted is None:
+            return self.width, self.height
+        return self.distorted.pinhole.width, self.distorted.pinhole.height
+
+    @property
+    def origin(self) -> str | None:
+        """All that the pixels come from; None where decoding takes no longer than reading them."""
+        pixels = self.width * self.height * self.reduction**2
+        if pixels < _LARGE or (self.target == (self.width, self.height) and not self.distorted):
+            return None
+        files = [self.path] if self.mask is None else [self.path, self.mask]
+        try:
+            facts = [os.stat(path) for path in files]
+        except OSError:  # Decoding says what is wrong.
+            return None
+        marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
+        return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
+
+    @property
+    def decoded_bytes(self) -> int:
+        """What the decoded photo and a mask take."""
+        return 4 * self.target[0] * self.target[1]
+
+    def decode(self) -> Decoded:
+        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts.
+
+        Raises:
+            UserError: The photo or its mask is damaged or has changed its size.
+        """
+        rgb, alpha = decode_photo(self.path, self.reduction, self.white)
+        rgb = turn(rgb, self.orientation)
+        self._check_size(rgb)
+        keep = self._decode_mask()
+        if alpha is not None:
+            alpha = turn(alpha, self.orientation)
+            if self.background is not None:
+                rgb = blend(rgb, alpha, self.background)
+            else:
+                keep = _both(keep, np.where(alpha >= _HALF, _OPAQUE, 0).astype(np.uint8))
+        if self.distorted is not None:
+            keep = self._undistort_mask(self.distorted, keep)
+            rgb = self.distorted.undistort(np.ascontiguousarray(rgb))
+        image = torch.from_numpy(np.array(resize(rgb, *self.target), order="C"))
+        if keep is None or keep.min() == _OPAQUE:
+            return image, None
+        return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
+
+    def try_out(self) -> None:
+        """Finds out whether the files can be decoded, for less than `decode` takes.
+
+        Raises:
+            UserError: The photo or its mask is damaged.
+        """
+        decode_photo(self.path, SMALLEST)
+        if self.mask is not None:
+            decode_mask(self.mask)
+
+    def _check_size(self, rgb: Pixels) -> None:
+        height, width = rgb.shape[:2]
+        if (width, height) != (self.width, self.height):
+            raise UserError(
+                "the photo has changed since the scene was read",
+                where=self.path,
+                expected=f"{self.width} x {self.height} pixels",
+                found=f"{width} x {height} pixels",
+                todo="put the former photo back, or start a new run",
+            )
+
+    def _decode_mask(self) -> Pixels | None:
+        """The mask file in the photo's size, 0 or 255; the nearest pixel where sizes differ."""
+        if self.mask is None:
+            return None
+        mask = decode_mask(self.mask)
+        if is_turned(mask.shape[::-1], (self.width, self.height)):
+            mask = turn(mask, self.orientation)
+        rows = (np.arange(self.height) * mask.shape[0]) // self.height
+        columns = (np.arange(self.width) * mask.shape[1]) // self.width
+        return np.asarray(mask[rows[:, None], columns])
+
+    def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels | None:
+        """The mask in undistorted pixels; pixels that the photo does not reach do not count."""
+        if keep is not None:
+            keep = distorted.undistort(keep)
+        if distorted.fills_frame:
+            return keep
+        return _both(keep, np.where(distorted.reached(), _OPAQUE, 0).astype(np.uint8))
+
+
+#: Hashable, and equal where the outcome is.
+Key = TypeVar("Key", bound=Storable)
+
+
+class PhotoCache(Generic[Key]):
+    """Decoded photos in a bounded amount of memory; may be used from several threads.
+
+    Training walks through all photos again and again. Were the least recently used photo dropped, a
+    set a little larger than the memory would hardly ever be found in it. So what is there stays,
+    and only the latest few photos, and those that are expected, make room for new ones: of a set
+    twice as large as the memory, about half is found.
+
+    Args:
+        mib: Memory for decoded photos and masks, MiB. The latest photo is kept in any case.
+        store: Where photos are kept on disk; None decodes their files.
+    """
+
+    def __init__(self, mib: int, store: PhotoStore | None = None) -> None:
+        self.limit = mib * 2**20
+        self._store = store
+        self._used = 0
+        self._kept: OrderedDict[Key, Decoded] = OrderedDict()
+        self._latest: OrderedDict[Key, Decoded] = OrderedDict()
+        self._expected: frozenset[Key] = frozenset()
+        self._under_way: dict[Key, Event] = {}
+        self._lock = Lock()
+
+    @property
+    def used(self) -> int:
+        """Bytes of the decoded photos and masks."""
+        return self._used
+
+    def expect(self, sources: Iterable[Key]) -> None:
+        """Names the photos that will be asked for next: they are dropped last."""
+        self._expected = frozenset(sources)
+
+    def holds(self, source: Key) -> bool:
+        """Whether a photo is there, or being decoded by some thread."""
+        return source in self._kept or source in self._latest or source in self._under_way
+
+    def get(self, source: Key) -> Decoded:
+        """The decoded photo and mask of `source`; shared, so never to be written to.
+
+        A photo that another thread is decoding is waited for, but not for long: where other
+        programs have the cores, that thread, which gives way to them, may get nowhere.
+        """
+        over, waited = Event(), False
+        while True:
+            with self._lock:
+                decoded = self._kept.get(source) or self._latest.get(source)
+                if decoded is not None:
+                    return decoded
+                other = self._under_way.setdefault(source, over)
+            if other is over or waited:
+                break
+            waited = not other.wait(_PATIENCE)
+        try:
+            decoded = self._decoded(source)
+            with self._lock:
+                self._keep(source, decoded)
+            return decoded
+        finally:
+            if other is over:
+                del self._under_way[source]
+                over.set()
+
+    def prepare(self, source: Key) -> bool:
+        """Sees to it that the photo is on disk; False where none are kept: nothing was done."""
+        there = None if self._store is None else self._store.holds(source)
+        if there is False:
+            self._decoded(source)
+        return there is not None
+
+    def _decoded(self, source: Key) -> Decoded:
+        return source.decode() if self._store is None else self._store.decoded(source)
+
+    def _keep(self, source: Key, decoded: Decoded) -> None:
+        if source in self._kept or source in self._latest:
+            return
+        self._latest[source] = decoded
+        self._used += _bytes(decoded)
+        while self._used > self.limit and len(self._latest) + len(self._kept) > 1:
+            self._used -= _bytes(self._dropped())
+        if len(self._latest) > _LATEST:
+            key, decoded = self._latest.popitem(last=False)
+            self._kept[key] = decoded
+
+    def _dropped(self) -> Decoded:
+        """Takes out the oldest photo that is not expected, but never the latest one."""
+        *others, _ = self._latest
+        idle = next((key for key in others if key not in self._expected), None)
+        if idle is None and self._kept:
+            return self._kept.popitem()[1]
+        return self._latest.pop(others[0] if idle is None else idle)
+
+
+@dataclass(frozen=True, eq=False)
+class FilePhoto(Photo):
+    """A photo on disk, decoded on demand into the scene's cache."""
+
+    source: PhotoSource
+    cache: PhotoCache[PhotoSource]
+
+    @override
+    def image(self) -> Tensor:
+        return self.cache.get(self.source)[0]
+
+    @override
+    def mask(self) -> Tensor | None:
+        return self.cache.get(self.source)[1] if self.source.may_mask else None
+
+
+def _both(first: Pixels | None, second: Pixels) -> Pixels:
+    return second if first is None else np.minimum(first, second)
+
+
+def _bytes(decoded: Decoded) -> int:
+    return sum(tensor.nbytes for tensor in decoded if tensor is not None)

@@ -1,0 +1,203 @@
+"""Threads that decode photos before they are needed, and the check that decodes each once."""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from threading import Condition, Thread, get_native_id
+from time import thread_time
+
+from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.photos.photos import FilePhoto
+from crossgrad_core.scene.wording import name_some
+
+#: Photos that are decoded at once; more of them would take memory.
+AT_ONCE = 2
+#: Seconds that the end of a run waits for the photos that are being decoded beside it.
+_PATIENCE = 5.0
+_LEAST_URGENT = 19
+_LOG = logging.getLogger(__name__)
+
+
+class PhotosAhead:
+    """Decodes what the next steps will draw, and in between every photo once.
+
+    So the training clock waits for no photo where there are cores enough, and a damaged photo is
+    found early, not when it is first drawn. Which photo is decoded when changes no bit of a run.
+    """
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._expected: list[FilePhoto] = []
+        self._unseen: Iterator[View] = iter(())
+        self._report: Callable[[Exception], None] = _ignore
+        self._at_work = self._keep = False
+        self._cpu = 0.0
+
+    @contextmanager
+    def at_work(
+        self, views: Sequence[View], report: Callable[[Exception], None], *, keep: bool
+    ) -> Iterator[None]:
+        """Decodes beside the block.
+
+        Args:
+            views: All views, each of which is decoded once even where nobody asks for it.
+            report: Told the first error of those, from another thread; the others are not decoded.
+            keep: Whether there is memory for all of them; else those that are not expected go to
+                the disk, or it is only tried whether they can be decoded.
+        """
+        self._unseen, self._report, self._keep = iter(views), report, keep
+        self._at_work = True
+        threads = [Thread(target=self._work, name="crossgrad-photos", daemon=True) for _ in "ab"]
+        for thread in threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._at_work = False
+                self._changed.notify_all()
+            for thread in threads:
+                thread.join(_PATIENCE)
+
+    @property
+    def useful(self) -> bool:
+        """Whether it helps to know which views come next: not once all photos are in memory."""
+        return self._at_work
+
+    def expect(self, views: Sequence[View]) -> None:
+        """Names the views that will be drawn next, in their order; replaces those named before."""
+        photos = [view.photo for view in views if isinstance(view.photo, FilePhoto)]
+        if not photos:
+            return
+        cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
+        for photo in photos:
+            size += photo.source.decoded_bytes
+            if size <= cache.limit // 2:  # The others would drive them out again.
+                fitting.append(photo)
+        cache.expect(photo.source for photo in fitting)
+        with self._changed:
+            self._expected = [photo for photo in fitting if not cache.holds(photo.source)]
+            self._changed.notify_all()
+
+    def taken_cpu(self) -> float:
+        """CPU seconds of photos that were decoded since this was last asked."""
+        with self._changed:
+            taken, self._cpu = self._cpu, 0.0
+        return taken
+
+    def _work(self) -> None:
+        _give_way()
+        while (job := self._next()) is not None:
+            begun = thread_time()
+            job()
+            with self._changed:
+                self._cpu += thread_time() - begun
+
+    def _next(self) -> Callable[[], None] | None:
+        """What to do next; None where there is nothing any more."""
+        with self._changed:
+            while self._at_work:
+                while self._expected:
+                    photo = self._expected.pop(0)
+                    if not photo.cache.holds(photo.source):
+                        return partial(_get_quietly, photo)
+                view = next(self._unseen, None)
+                if view is not None:
+                    return partial(self._see, view)
+                if self._keep:
+                    self._at_work = False  # All are in memory.
+                    self._changed.notify_all()
+                else:
+                    self._changed.wait()
+        return None
+
+    def _see(self, view: View) -> None:
+        try:
+            decode(view, keep=self._keep)
+        except MemoryError:
+            self._unseen = iter(())  # Training needs it more.
+        except Exception as error:  # Third-party photos may raise anything.
+            self._unseen = iter(())
+            report, self._report = self._report, _ignore
+            report(error)
+
+
+def decode(view: View, *, keep: bool) -> None:
+    """Decodes a view's photo into memory, or else onto the disk, or to see whether that works.
+
+    Raises:
+        UserError: It cannot be decoded.
+    """
+    photo = view.photo
+    if keep or not isinstance(photo, FilePhoto):
+        photo.image()
+        photo.mask()
+    elif not photo.cache.prepare(photo.source):
+        photo.source.try_out()
+
+
+def _get_quietly(photo: FilePhoto) -> None:
+    with suppress(Exception):  # Who asks for it is told.
+        photo.cache.get(photo.source)
+
+
+def _ignore(error: Exception) -> None:
+    """Only the first error is reported."""
+
+
+def _give_way() -> None:
+    """Lets training have the processor, where a thread can have a priority of its own."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, get_native_id(), _LEAST_URGENT)
+
+
+def fits(scene: Scene, mib: int) -> bool:
+    """Whether all decoded photos of a scene fit into so much memory: then none is decoded twice."""
+    pixels = sum(view.camera.width * view.camera.height for view in scene.views)
+    return 4 * pixels <= mib * 2**20  # RGB and a mask
+
+
+def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> None:
+    """Decodes the photos and masks of some views.
+
+    Args:
+        views: The views.
+        keep: Whether there is room to keep what is decoded.
+        whole: Whether they are decoded whole even where there is none; else it is only tried
+            whether files can be decoded, JPEG files at an eighth of their size.
+
+    Raises:
+        UserError: Some cannot be decoded; names them.
+    """
+    if not views:
+        return
+    _LOG.info("decoding %d photos", len(views))
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        errors = [e for e in pool.map(lambda view: _error_of(view, keep, whole), views) if e]
+    if len(errors) > 1:
+        raise UserError(
+            f"{len(errors)} photos cannot be decoded",
+            where=name_some([error.where for error in errors]),
+            found=errors[0].found,
+            todo=errors[0].todo,
+        ) from errors[0]
+    if errors:
+        raise errors[0]
+
+
+def _error_of(view: View, keep: bool, whole: bool) -> UserError | None:
+    photo = view.photo
+    try:
+        if keep or whole or not isinstance(photo, FilePhoto):
+            decode(view, keep=keep)
+        else:
+            photo.source.try_out()
+    except UserError as error:
+        return error
+    return None

@@ -1,0 +1,184 @@
+"""Photo files through Pillow: which formats, how many pixels, and every fault as one error.
+
+HEIC and HEIF, the formats of phones, are read where the package pillow-heif is installed.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from io import BufferedReader
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
+
+from typing_extensions import override
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.system.input_files import open_file
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+#: More pixels are not decoded at once: as much as Pillow allows by default, 0.5 GB of RGB.
+MOST_PIXELS: Final = 178_956_970
+# What cameras and tools for masks write. Pillow knows more, among them formats that run programs.
+_FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
+_LOCK = Lock()
+_DEEP = re.compile("RGBA?;16[BLN]")
+#: What the names of such files end in.
+SUFFIXES = (".heic", ".heif", ".hif")
+#: Bytes of a file that tell.
+HEAD = 12
+_BRANDS = frozenset(
+    {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}
+)
+
+
+@contextmanager
+def opened(path: Path, what: str) -> Iterator["Image"]:
+    """A photo whose pixels are not decoded yet; what goes wrong with it inside becomes one error.
+
+    Args:
+        path: The file.
+        what: The error in words, should there be one.
+
+    Raises:
+        UserError: The file is missing, not a photo, without pixels, or damaged.
+    """
+    from PIL import UnidentifiedImageError
+
+    try:
+        with _Bounded(path) as file, _identified(file, path) as image:
+            _check_pixels(image, path)
+            yield image
+    except (UserError, MemoryError):
+        raise
+    except UnidentifiedImageError as error:
+        found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
+        raise UserError(
+            "the file is not a photo", where=path, found=found, todo="replace or remove it"
+        ) from error
+    except Exception as error:
+        # Decoders raise whatever a damaged file leads them into: KeyError, struct.error ...
+        raise UserError(
+            what,
+            where=path,
+            found=str(error) or type(error).__name__,
+            todo="copy or download it again, or remove it",
+        ) from error
+
+
+class _Bounded(BufferedReader):
+    """A file of which no more is read than there is.
+
+    A chunk may claim any length, for which `read` would set memory aside at once.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(open_file(path).detach())
+        self._size = os.fstat(self.fileno()).st_size
+
+    @override
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes; all that are left where no number is given."""
+        left = max(0, self._size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def has_alpha(image: "Image") -> bool:
+    """Whether pixels of a photo may be transparent."""
+    return "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
+
+
+def is_deep(image: "Image") -> bool:
+    """Whether a photo, not decoded yet, is grey, RGB or RGBA with 16 bits a channel."""
+    return image.mode.startswith("I") or any(map(_DEEP.fullmatch, _stored_modes(image)))
+
+
+def take_lower_bytes(image: "Image") -> None:
+    """Let a colour photo of 16 bits be decoded to its lower bytes; by default the upper are taken.
+
+    Pillow knows no colours of 16 bits. It takes the other byte where the byte order is the other.
+    """
+    other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
+    modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
+    file: Any = image  # Types of Pillow know `tile` for opened files alone.
+    file.tile = [
+        (*tile[:3], mode if isinstance(tile[3], str) else (mode, *tile[3][1:]))
+        for tile, mode in zip(file.tile, modes, strict=True)
+    ]
+
+
+def _stored_modes(image: "Image") -> list[str]:
+    """How the pixels of each part of a photo are stored, such as `RGB;16B`."""
+    arguments = (tile[3] for tile in getattr(image, "tile", ()))
+    return [str(args[0] if isinstance(args, tuple) and args else args) for args in arguments]
+
+
+def rows_of(image: "Image", top: int, end: int) -> bytes:
+    """The pixels of some rows of a photo that has been opened; decodes it if nobody has yet."""
+    image.load()
+    with _LOCK:  # Pillow looks at its bound here, too.
+        part = image.crop((0, top, image.width, end))
+    return part.tobytes()
+
+
+def _check_pixels(image: "Image", path: Path) -> None:
+    if 0 in image.size:
+        raise UserError("the photo has no pixels", where=path, todo="replace or remove it")
+
+
+def _identified(file: BinaryIO, path: Path) -> "Image":
+    """As `Image.open`, but without a bound on the size: ours depends on how it is decoded."""
+    from PIL import Image
+
+    Image.init()
+    known = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
+    file.seek(0)
+    formats = [name for name in known if name in Image.OPEN]
+    with _LOCK:  # Pillow's bound is a global, and photos are decoded in several threads.
+        bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(file, formats=formats)
+        finally:
+            Image.MAX_IMAGE_PIXELS = bound
+
+
+def admit(head: bytes, path: Path) -> bool:
+    """Whether a file is of this kind; if so, Pillow can open it from now on.
+
+    Args:
+        head: Its first bytes.
+        path: The file.
+
+    Raises:
+        UserError: It is, and the package is missing.
+    """
+    if head[4:8] != b"ftyp" or head[8:HEAD] not in _BRANDS:
+        return False
+    if not _registered():
+        raise UserError(
+            "photos in HEIC need a package that is not installed",
+            where=path,
+            expected="the package pillow-heif",
+            todo="pip install 'crossgrad[heic]', or convert the photos to JPEG",
+        )
+    return True
+
+
+@cache
+def _registered() -> bool:
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    # Photos are decoded in threads already.
+    register_heif_opener(thumbnails=False, decode_threads=1)
+    return True

@@ -1,0 +1,95 @@
+"""Sizes of photos and masks: scaled copies, turned photos, photos too large to decode.
+
+A JPEG file holds blocks of 8 x 8 frequencies, of which the decoder then takes the lowest 4 x 4, 2 x
+2 or 1 x 1: the whole photo never exists. Progressive files keep all frequencies in memory, so they
+cannot profit.
+"""
+
+from pathlib import Path
+
+from crossgrad_core.errors import UserError
+from crossgrad_core.scene.photos import pillow
+from crossgrad_core.scene.photos.headers import PhotoHeader, read_header
+from crossgrad_core.scene.wording import megapixels
+
+#: Width and height in pixels.
+Size = tuple[int, int]
+_REDUCTIONS = (8, 4, 2)
+
+
+def is_scaled(size: Size, of: Size) -> bool:
+    """Whether a size is a scaled copy of another one, each side off by at most one pixel."""
+    least = max((side - 1) / other for side, other in zip(size, of, strict=True))
+    most = min((side + 1) / other for side, other in zip(size, of, strict=True))
+    return least <= most
+
+
+def is_turned(size: Size, photo: Size) -> bool | None:
+    """Whether a mask is that of a photo turned by a quarter; None where it fits neither way."""
+    turned = photo[::-1]
+    if size in {photo, turned}:
+        return size != photo
+    return False if is_scaled(size, photo) else True if is_scaled(size, turned) else None
+
+
+def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
+    """Refuses a mask too large, or not in the proportion of its photo, perhaps of the turned one.
+
+    Raises:
+        UserError: See above; or its file is damaged.
+    """
+    header = read_header(path)
+    if header.width * header.height > pillow.MOST_PIXELS:
+        raise UserError(
+            "the mask is too large to be decoded at once",
+            where=path,
+            expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
+            found=f"{header.width} x {header.height} pixels",
+            todo="save it smaller: a mask of any size in the proportion of its photo will do",
+        )
+    turned = is_turned((header.width, header.height), photo)
+    if turned is None or (turned and not may_turn):
+        raise UserError(
+            "a mask does not have the shape of its photo",
+            where=path,
+            expected=f"{photo[0]} x {photo[1]} pixels, or in that proportion",
+            found=f"{header.width} x {header.height} pixels",
+            todo="make the mask from the photo as it is stored, in its own size",
+        )
+
+
+def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> int:
+    """By how much each side of a photo is divided while it is decoded: 1, 2, 4 or 8.
+
+    1 for all photos that can be decoded at once; else the most that keeps `max_size` pixels on the
+    longest side, or the least that is possible.
+
+    Raises:
+        UserError: The photo is too large; says what to do.
+    """
+    pixels = header.width * header.height
+    if pixels <= pillow.MOST_PIXELS:
+        return 1
+    fits = [r for r in _REDUCTIONS if pixels <= pillow.MOST_PIXELS * r * r]
+    if max_size is None or not header.reducible or not fits:
+        raise too_large(path, header)
+    enough = [r for r in fits if max(header.width, header.height) >= r * max_size]
+    return enough[0] if enough else fits[-1]
+
+
+def too_large(path: Path, header: PhotoHeader) -> UserError:
+    """The error for a photo that cannot be decoded at once."""
+    way = (
+        "--max-size N, such as --max-size 4000, decodes it at a reduced size"
+        if header.reducible
+        else "put smaller copies of all photos into <images>_2, _4 or _8 beside the image folder "
+        "and name their size with --max-size N; or save it as a JPEG file that is not progressive"
+    )
+    return UserError(
+        "the photo is too large to be decoded at once",
+        where=path,
+        expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
+        found=f"{header.width} x {header.height} pixels, "
+        f"{megapixels(header.width * header.height)}",
+        todo=way,
+    )

@@ -1,0 +1,1 @@
+"""Parts that the contract checks of several slots share."""

@@ -1,0 +1,102 @@
+"""Costs of a plugin: its state, the time of its hooks, and the memory that they keep.
+
+The size of a state may depend on the numbers of views and primitives, and on a window of the last
+steps. A state that grows with every step makes each checkpoint larger than the one before.
+"""
+
+import gc
+import tracemalloc
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import islice
+from time import perf_counter
+
+import pluggy
+from torch import Tensor
+
+from crossgrad_core.contract.blocks import PluginState
+from crossgrad_core.testing.support.contract import require
+
+#: Steps of the first look, which is enough for a state that does not grow.
+_FEW = 16
+#: Length of each of the three further windows: states with a shorter memory stop growing there.
+_WINDOW = 1000
+
+
+def size_of(state: PluginState) -> int:
+    """How many numbers, letters and names a state holds; rows of primitives count by columns."""
+    rows = sum(tensor[:1].numel() for tensor in state.per_primitive.values())
+    return _size(state.values) + sum(each.numel() for each in state.tensors.values()) + rows
+
+
+def _size(value: object) -> int:
+    if isinstance(value, str):
+        return len(value)
+    if isinstance(value, Mapping):
+        return sum(_size(name) + _size(each) for name, each in value.items())
+    if isinstance(value, list | tuple):
+        return sum(map(_size, value))
+    return 1
+
+
+def require_bounded(sizes: Iterable[int], method: str) -> None:
+    """Requires that the state of a run stops growing.
+
+    Args:
+        sizes: Size of the state after each step of a long run, measured as it is asked for.
+        method: Name of the method that returns the state.
+    """
+    steps = iter(sizes)
+    first, second = _largest(steps, _FEW // 2), _largest(steps, _FEW // 2)
+    if second <= first:
+        return
+    later = [_largest(steps, _WINDOW) for _ in range(3)]
+    require(
+        not later[0] < later[1] < later[2],
+        f"the state that {method} returns grows for ever: it holds {later[0]:,} numbers after "
+        f"{_FEW + _WINDOW:,} steps and {later[2]:,} after {_FEW + 3 * _WINDOW:,}; expected a size "
+        "that does not depend on the number of steps: keep sums, or a window of the last steps",
+    )
+
+
+def _largest(sizes: Iterator[int], steps: int) -> int:
+    return max(islice(sizes, steps))
+
+
+def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None:
+    """Writes the wall time of the fastest call of each hook into `seconds`, as calls are made."""
+    begun: list[float] = []
+
+    def before(*_: object) -> None:
+        begun.append(perf_counter())
+
+    def after(_: object, name: str, *__: object) -> None:
+        taken = perf_counter() - begun.pop()
+        seconds[name] = min(taken, seconds.get(name, taken))
+
+    manager.add_hookcall_monitoring(before, after)
+
+
+@contextmanager
+def traced_memory() -> Iterator[Callable[[], int]]:
+    """Gives a function that says how many bytes are held by Python, NumPy and tensors."""
+    traced = tracemalloc.is_tracing()
+    if not traced:
+        tracemalloc.start()
+    try:
+        yield lambda: _tensors() + tracemalloc.get_traced_memory()[0]
+    finally:
+        if not traced:
+            tracemalloc.stop()
+
+
+def _tensors() -> int:
+    """Bytes of all tensors that are alive; torch allocates them where Python does not look."""
+    gc.collect()
+    storages = {}
+    for each in gc.get_objects():
+        # Not `isinstance`, which asks objects that answer with warnings.
+        if issubclass(type(each), Tensor) and not each.is_sparse:
+            storage = each.untyped_storage()
+            storages[storage.data_ptr()] = storage.nbytes()
+    return sum(storages.values())

@@ -1,0 +1,306 @@
+"""Contract checks of rasterizers against rasterizer `torch` in float64, the readable rule set.
+
+Inputs are usual ones, cameras that look past the middle, and Gaussians at the ends of what training
+makes. A pixel may differ by a few Gaussians at the edge of their footprint, where rounding decides
+whether they are drawn, and by a multiple of what the reference itself loses in float32.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+from crossgrad_core.contract.gaussians import Gaussians, Render
+from crossgrad_core.contract.scene import Camera
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.defaults import REFERENCE_RASTERIZER
+from crossgrad_core.registry.entries import build
+from crossgrad_core.testing.fixtures import sample_camera, sample_gaussians, sample_scene
+from crossgrad_core.testing.support.contract import Check, ContractError, Make, cannot_tell, require
+
+#: Largest difference of a pixel from the reference: a few Gaussians at the edge of their footprint.
+_PIXEL = 0.02
+#: Largest mean difference of pixels, and relative difference of gradients, from the reference.
+_MEAN, _GRADIENT = 2e-4, 2e-2
+#: So many times the rounding of the reference in float32 may be that of another one.
+_ROUNDINGS = 8.0
+#: Colours of the background: no two channels alike.
+_BACKGROUND = (0.1, 0.5, 0.9)
+#: How the pixels of each output are worked out.
+_RULES = {
+    "image": "blend front to back over the background, by the common rules",
+    "alpha": "alpha is 1 minus the transmittance",
+    "depth": "depth is the sum of weight times camera depth, not divided by alpha",
+}
+
+
+def device_of(rasterizer: Rasterizer) -> torch.device:
+    """Where the checks run.
+
+    Raises:
+        SkipTest: The rasterizer needs a device that is not there.
+    """
+    if "cpu" in rasterizer.devices:
+        return torch.device("cpu")
+    if "cuda" in rasterizer.devices and torch.cuda.is_available():
+        return torch.device("cuda")
+    raise cannot_tell(f"it needs one of the devices {sorted(rasterizer.devices)}")
+
+
+def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The tensors that are given, by name."""
+    found = {each.name: getattr(gaussians, each.name) for each in fields(gaussians)}
+    return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+
+
+def moved(
+    gaussians: Gaussians, device: torch.device, dtype: torch.dtype = torch.float32
+) -> Gaussians:
+    """Copies on a device, as leaves with gradients."""
+    leaves: dict[str, Any] = {
+        name: tensor.detach().clone().to(device, dtype).requires_grad_()
+        for name, tensor in tensors_of(gaussians).items()
+    }
+    return replace(gaussians, **leaves)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """Gaussians, a camera and options to draw with.
+
+    Attributes:
+        name: What is special about it.
+        gaussians: The Gaussians, float32.
+        camera: The camera.
+        options: Options of the rasterizer.
+    """
+
+    name: str
+    gaussians: Gaussians
+    camera: Camera = field(default_factory=sample_camera)
+    options: Mapping[str, float] = field(default_factory=dict)
+
+
+def _usual() -> Iterator[_Case]:
+    for harmonics in (False, True):
+        yield _Case("usual Gaussians", sample_gaussians(harmonics=harmonics))
+    lower = replace(sample_gaussians(harmonics=True), sh_degree=1)
+    yield _Case("an active degree (sh_degree) below that of the coefficients", lower)
+
+
+def _cameras() -> Iterator[_Case]:
+    some, camera = sample_gaussians(harmonics=True), sample_camera()
+    for view in sample_scene().train_views[1::3]:
+        yield _Case(f"camera of view {view.name} (world_to_camera)", some, view.camera)
+    aside = replace(camera, cx=camera.cx + 5.0, cy=camera.cy - 3.0)
+    yield _Case("principal point (cx, cy) away from the middle", some, aside)
+    stretched = replace(camera, fx=1.4 * camera.fx, fy=0.8 * camera.fy)
+    yield _Case("two focal lengths (fx, fy)", some, stretched)
+    larger = replace(camera, width=camera.width + 17, height=camera.height + 3)
+    yield _Case("image of another size (width, height)", some, larger)
+
+
+def _extremes() -> Iterator[_Case]:
+    some = sample_gaussians()
+    ramp = torch.linspace(0.0, 1.0, len(some))
+    with torch.no_grad():
+        changed: dict[str, Mapping[str, Tensor]] = {
+            "opacities from 0 to 1": {"opacities": ramp},
+            "opaque layers, one behind the other": {"opacities": 0.95 + 0.05 * ramp},
+            "needles": {"scales": some.scales * torch.tensor([4.0, 0.02, 0.02])},
+            "Gaussians larger than the image": {"scales": 10.0 * some.scales},
+            "Gaussians far smaller than a pixel": {"scales": 1e-3 * some.scales},
+            "quaternions of other lengths": {
+                "quats": some.quats * 10.0 ** (4.0 * ramp - 2.0)[:, None]
+            },
+            "Gaussians beside and behind the camera": {"means": 8.0 * some.means},
+            "colours below 0 and above 1": {"colors": 4.0 * ramp[:, None].expand(-1, 3) - 2.0},
+        }
+    for name, tensors in changed.items():
+        fields: dict[str, Any] = dict(tensors)
+        yield _Case(name, replace(some, **fields))
+
+
+def _options() -> Iterator[_Case]:
+    some, camera = sample_gaussians(), sample_camera()
+    opaque = replace(some, opacities=torch.full_like(some.opacities, 0.95))
+    yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
+    yield _Case("option dilation = 2", some, options={"dilation": 2.0})
+    depths = _depths(some, camera).sort().values
+    # In the widest gap, so that rounding leaves every centre on its side.
+    inner = slice(len(depths) // 4, 3 * len(depths) // 4)
+    gaps = depths.diff()[inner]
+    widest = int(gaps.argmax()) + len(depths) // 4
+    near = float(depths[widest : widest + 2].mean())
+    yield _Case(f"option near = {near:.3g}", some, options={"near": near})
+
+
+def _depths(gaussians: Gaussians, camera: Camera) -> Tensor:
+    pose = camera.world_to_camera.double()
+    return gaussians.means.detach().double() @ pose[2, :3] + pose[2, 3]
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The outputs and gradients of one render, float64 on the CPU.
+
+    Attributes:
+        pixels: Image, alpha and, where it provides it, depth.
+        gradients: Those by the Gaussians' tensors, and those of the screen statistics.
+    """
+
+    pixels: Mapping[str, Tensor]
+    gradients: Mapping[str, Tensor]
+
+
+def _drawn(
+    rasterizer: Rasterizer,
+    case: _Case,
+    outputs: frozenset[str],
+    dtype: torch.dtype = torch.float32,
+) -> _Drawn:
+    gaussians = moved(case.gaussians, device_of(rasterizer), dtype)
+    background = torch.tensor(_BACKGROUND, dtype=dtype, device=gaussians.means.device)
+    render = rasterizer.render(gaussians, case.camera, background, outputs)
+    _weighted(render).backward()  # type: ignore[no-untyped-call]
+    pixels = {"image": render.image, "alpha": render.alpha, "depth": render.depth}
+    gradients = {
+        f"gradient of {name}": tensor.grad for name, tensor in tensors_of(gaussians).items()
+    }
+    gradients["screen.mean_gradient"] = render.screen.mean_gradient
+    gradients["screen.abs_gradient"] = render.screen.abs_gradient
+    return _Drawn(_given(pixels), _given(gradients))
+
+
+def _given(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
+    """The tensors that are there, float64 on the CPU."""
+    return {n: t.detach().cpu().double() for n, t in tensors.items() if t is not None}
+
+
+def _weighted(render: Render) -> Tensor:
+    """A weighted sum of all channels in which no two pixels count alike."""
+    channels = [render.image, render.alpha[..., None]]
+    if render.depth is not None:
+        channels.append(render.depth[..., None])
+    whole = torch.cat(channels, -1)
+    weights = torch.linspace(0.5, 1.5, whole.numel(), dtype=whole.dtype, device=whole.device)
+    return (whole * weights.reshape(whole.shape)).sum()
+
+
+def _require_same(rasterizer: Rasterizer, case: _Case) -> None:
+    """Requires image, alpha, depth, gradients and statistics of the reference."""
+    shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
+    reference = build(Rasterizer, REFERENCE_RASTERIZER, shared)
+    outputs = rasterizer.provides & {"depth", "abs_gradient"}
+    exact = _drawn(reference, case, outputs, torch.float64)
+    rounded = _drawn(reference, case, outputs)
+    found = _drawn(rasterizer, case, outputs)
+    for name, expected in exact.pixels.items():
+        _require_pixels(case.name, name, found.pixels, expected, rounded.pixels[name])
+    for name, expected in exact.gradients.items():
+        _require_gradient(case.name, name, found.gradients, expected, rounded.gradients[name])
+
+
+def _require_pixels(
+    case: str, name: str, drawn: Mapping[str, Tensor], expected: Tensor, rounded: Tensor
+) -> None:
+    require(name in drawn, f"{case}: render gives no {name}")
+    error, lost = (drawn[name] - expected).abs(), (rounded - expected).abs()
+    # The depth of a Gaussian at the edge counts as much as its distance.
+    size = max(1.0, float(expected.abs().max()))
+    most = _PIXEL * size + _ROUNDINGS * float(lost.max())
+    mean = _MEAN * size + _ROUNDINGS * float(lost.mean())
+    require(
+        error.max() < most and error.mean() < mean,
+        f"{case}: {name} of render differs from rasterizer {REFERENCE_RASTERIZER} by up to "
+        f"{float(error.max()):.2g}, {float(error.mean()):.2g} in the mean; expected at most "
+        f"{most:.2g} and {mean:.2g}: {_RULES[name]} (docs/rasterizers.md)",
+    )
+
+
+def _require_gradient(
+    case: str, name: str, drawn: Mapping[str, Tensor], expected: Tensor, rounded: Tensor
+) -> None:
+    size = float(expected.norm())
+    if size == 0.0:
+        return
+    require(name in drawn, f"{case}: the {name} is missing")
+    error = float((drawn[name] - expected).norm()) / size
+    most = _GRADIENT + _ROUNDINGS * float((rounded - expected).norm()) / size
+    require(
+        error < most,
+        f"{case}: the {name} is {error:.2g} of its length off that of rasterizer "
+        f"{REFERENCE_RASTERIZER}; expected at most {most:.2g}: image, alpha and depth are "
+        "differentiable in every tensor of the Gaussians",
+    )
+
+
+def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
+    """Image, alpha, depth, gradients and statistics agree with rasterizer `torch` in float64."""
+    _require_all(make(), _usual)
+
+
+def the_camera_is_heeded(make: Make[Rasterizer]) -> None:
+    """Pose, focal lengths, principal point and size of the camera are those that it is given."""
+    _require_all(make(), _cameras)
+
+
+def extreme_gaussians_are_drawn_alike(make: Make[Rasterizer]) -> None:
+    """Opaque, transparent, thin, huge and tiny Gaussians are drawn as the reference draws them."""
+    _require_all(make(), _extremes)
+
+
+def _require_all(rasterizer: Rasterizer, cases: Callable[[], Iterator[_Case]]) -> None:
+    for case in cases():
+        _require_same(rasterizer, case)
+
+
+def its_options_are_heeded(make: Make[Rasterizer]) -> None:
+    """`max_alpha`, `near` and `dilation` change what is drawn as the rules say, or are fixed."""
+    rasterizer, tried = make(), 0
+    for case in _options():
+        try:
+            changed = type(rasterizer).model_validate({**rasterizer.model_dump(), **case.options})
+        except ValidationError:
+            continue  # It has one value and says so.
+        tried += 1
+        _require_same(changed, case)
+    if not tried:
+        raise cannot_tell("it has one value of max_alpha, near and dilation and no other")
+
+
+def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
+    """`render_views` gives what `render` gives of each view, with its own background."""
+    rasterizer = make()
+    device = device_of(rasterizer)
+    some = [moved(sample_gaussians(number), device) for number in (30, 30, 12)]
+    cameras = [view.camera for view in sample_scene().train_views[:3]]
+    backgrounds = [torch.full((3,), level, device=device) for level in (0.0, 0.5, 1.0)]
+    views = list(zip(some, cameras, strict=True))
+    with torch.no_grad():
+        together = rasterizer.render_views(views, backgrounds)
+        alone = [
+            rasterizer.render(*view, behind)
+            for view, behind in zip(views, backgrounds, strict=True)
+        ]
+    if len(together) != len(alone):
+        raise ContractError(f"render_views gives {len(together)} renders of {len(alone)} views")
+    for number, (one, other) in enumerate(zip(together, alone, strict=True), 1):
+        error = float((one.image - other.image).abs().max())
+        require(
+            error < _PIXEL,
+            f"view {number} of {len(alone)}: the image of render_views differs from that of render "
+            f"by up to {error:.2g}; expected the same image",
+        )
+
+
+REFERENCE_CHECKS: tuple[Check[Rasterizer], ...] = (
+    the_reference_draws_the_same,
+    the_camera_is_heeded,
+    its_options_are_heeded,
+    extreme_gaussians_are_drawn_alike,
+    views_drawn_together_are_the_same,
+)

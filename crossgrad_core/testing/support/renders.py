@@ -1,0 +1,108 @@
+"""Contexts of hooks without a run: parameters, Gaussians, renders on request, records of views.
+
+A run brings rows of some tensors up to date only when a hook reads them, so its objects are no
+plain dictionaries and Gaussians.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.contract.blocks import AdamState
+from crossgrad_core.contract.contexts import RenderOnRequest, RequestedRender, ViewRecord
+from crossgrad_core.contract.gaussians import Gaussians, OnDemand, Screen
+from crossgrad_core.contract.scene import Scene, View
+from crossgrad_core.contract.schedule import Phase
+from crossgrad_core.contract.slots.backbone import Backbone
+from crossgrad_core.contract.slots.loss import Loss
+from crossgrad_core.contract.slots.rasterizer import Rasterizer
+from crossgrad_core.defaults import LOSS
+from crossgrad_core.registry.entries import build
+from crossgrad_core.training.scaled_photos import reduced
+from crossgrad_core.training.state import TrainState
+from crossgrad_core.training.views import camera_at
+
+
+def renders_of(
+    scene: Scene,
+    phase: Phase,
+    backbone: Backbone,
+    rasterizer: Rasterizer,
+    parameters: Mapping[str, Tensor],
+) -> RenderOnRequest:
+    """What a context offers as `render`, over black, without an exposure, with the usual loss."""
+    loss = build(Loss, LOSS, {})
+
+    def render(
+        view: int,
+        scale: float = 1.0,
+        outputs: frozenset[str] = frozenset(),
+        background: Tensor | None = None,
+    ) -> RequestedRender:
+        shown = scene.train_views[view]
+        camera = camera_at(shown.camera, scale)
+        pair = shown.photo.image(), shown.photo.mask()
+        photo, mask = pair if scale == 1.0 else reduced(*pair, camera.width, camera.height)
+        gaussians = backbone.decode(parameters, camera, phase)
+        behind = torch.zeros(3) if background is None else background
+        drawn = rasterizer.render(gaussians, camera, behind, outputs)
+        return RequestedRender(
+            view=shown,
+            camera=camera,
+            scale=scale,
+            gaussians=gaussians,
+            render=drawn,
+            screen=drawn.screen,
+            image=drawn.image,
+            photo=photo,
+            mask=mask,
+            measure=lambda: loss.loss(drawn.image, photo, mask, None),
+        )
+
+    return render
+
+
+def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """The same tensors in the mapping that a context of a run holds."""
+    return TrainState(tensors=dict(parameters), moments=AdamState(), rngs={}).current
+
+
+def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
+    """The same Gaussians, whose tensors that the backbone passes on are brought when they are read.
+
+    Nothing is late here, so bringing rows does nothing.
+    """
+    fields = frozenset(f for f in backbone.passthrough if getattr(gaussians, f) is not None)
+    return replace(gaussians, on_demand=OnDemand(fields, lambda _: None)).whole()
+
+
+def view_record(
+    view: View, gaussians: Gaussians, screen: Screen, index: int = 0, scale: float = 1.0
+) -> ViewRecord:
+    """The record of a view that was drawn with these statistics, over black, beside a black photo.
+
+    Args:
+        view: The view.
+        gaussians: What was drawn.
+        screen: Its statistics in pixels of the render, gradients included.
+        index: Position of the view in `scene.train_views`.
+        scale: Sides of the render over those of the photo.
+    """
+    camera = camera_at(view.camera, scale)
+    image = torch.zeros(camera.height, camera.width, 3)
+    return ViewRecord(
+        index=index,
+        view=view,
+        label=None,
+        loss=0.1,
+        gaussians=gaussians,
+        screen=screen,
+        background=torch.zeros(3),
+        camera=camera,
+        scale=scale,
+        image=image,
+        photo=image.to(torch.uint8),
+        mask=None,
+    )

@@ -1,0 +1,128 @@
+"""Short runs on the sample scene: refused before training with the reasons, or trained."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from crossgrad_core.config import RunConfig
+from crossgrad_core.contract.contexts import StepRecord
+from crossgrad_core.contract.slots.observer import Observer
+from crossgrad_core.numerics.threads import on_one_thread
+from crossgrad_core.registry.entries import build
+from crossgrad_core.run.assemble import assemble, reasons_against
+from crossgrad_core.run.decisions import with_decisions
+from crossgrad_core.run.select import select
+from crossgrad_core.testing.fixtures import sample_scene
+from crossgrad_core.testing.support.contract import require
+from crossgrad_core.training.loop import timed_step
+from crossgrad_core.training.setup import Setup
+from crossgrad_core.training.start import first_state
+from crossgrad_core.wording import listed
+
+#: Losses of images in [0, 1] are far below it.
+_LARGEST_LOSS = 10.0
+
+
+@dataclass(frozen=True)
+class ShortRun:
+    """The parameters and records of a few steps.
+
+    Attributes:
+        before: Parameters before the first step.
+        early: Parameters after it.
+        after: Parameters at the end.
+        records: The record of each step.
+    """
+
+    before: Mapping[str, Tensor]
+    early: Mapping[str, Tensor]
+    after: Mapping[str, Tensor]
+    records: tuple[StepRecord, ...]
+
+    @property
+    def losses(self) -> list[float]:
+        """The losses of all views of all steps."""
+        return [loss for record in self.records for loss in record.losses]
+
+
+def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
+    """The reasons for which a run is refused before training; empty where it is not.
+
+    A combination is refused if a component objects (`crossgrad_validate_selection`), or if what
+    its components declare does not fit: numbers of views, tensors, statistics, devices.
+    """
+    config, *_ = with_decisions(config, sample_scene())
+    selection, _ = select(config, sample_scene(), "none")
+    # What the manager would gather; registering with it would take most of the time.
+    observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
+    plugins = (*selection.plugins.values(), *observers)
+    asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
+    answers = [ask(selection) for ask in asked if ask is not None]
+    return reasons_against(config, selection, [each for each in answers if each])
+
+
+def setup_of(config: RunConfig) -> Setup:
+    """The run of a configuration on the sample scene.
+
+    Raises:
+        IncompatibleSelectionError: It is refused.
+    """
+    return assemble(config, sample_scene(), "none")
+
+
+def train(setup: Setup, steps: int) -> ShortRun:
+    """Takes the first steps of a run, from its beginning."""
+    state = first_state(setup)
+    stages, records = [_copied(state.parameters)], []
+    for _ in range(steps):
+        records.append(timed_step(setup, state))
+        if len(records) in {1, steps}:
+            stages.append(_copied(state.parameters))
+    return ShortRun(stages[0], stages[1], stages[-1], tuple(records))
+
+
+def _copied(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in parameters.items()}
+
+
+def require_sound(run: ShortRun) -> None:
+    """Requires that losses and parameters are finite, and that the first step changes something."""
+    for step, record in enumerate(run.records, 1):
+        good = all(0.0 <= loss < _LARGEST_LOSS for loss in record.losses)
+        require(good, f"step {step}: the losses are {record.losses}; expected 0 to 10")
+    for name, tensor in run.after.items():
+        require(tensor.isfinite().all(), f"the parameters {name} are not finite after training")
+    moved = any(not torch.equal(tensor, run.early[name]) for name, tensor in run.before.items())
+    require(moved, "the first step changes no parameter")
+
+
+def require_repeated(run: ShortRun, again: ShortRun) -> None:
+    """Requires that two runs with one seed are the same to the bit."""
+    for step, (one, other) in enumerate(zip(run.records, again.records, strict=True), 1):
+        for what in ("views", "losses", "counts"):
+            found = getattr(one, what), getattr(other, what)
+            same = found[0] == found[1]
+            require(
+                same,
+                f"step {step}: two runs with one seed have the {what} {listed(map(str, found))}",
+            )
+    require(run.after.keys() == again.after.keys(), "two runs with one seed have other tensors")
+    for name, tensor in run.after.items():
+        require(torch.equal(tensor, again.after[name]), f"two runs with one seed differ in {name}")
+
+
+def try_out(config: RunConfig, steps: int) -> None:
+    """Trains a run for some steps, twice, and looks at what is left.
+
+    Raises:
+        ContractError: A loss or parameter is not finite, nothing is trained, or the runs differ.
+        UserError: The run cannot begin, or a plugin gives a wrong answer.
+    """
+    setup = setup_of(config)
+    with on_one_thread():
+        run = train(setup, steps)
+        require_sound(run)
+        if setup.rasterizer.deterministic:
+            require_repeated(run, train(setup, steps))

@@ -1,0 +1,357 @@
+"""Checks of runs that are compared: their scenes, metrics and machines must agree."""
+
+import re
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, Final
+
+from crossgrad_core.commands import UserError
+from crossgrad_plugins.compare.quantity import (
+    COSTS,
+    CPU_SECONDS,
+    SECONDS,
+    ClockChoice,
+    Cost,
+    Quantity,
+)
+from crossgrad_plugins.compare.run import Run
+
+#: The note on the photos' sizes that every run writes.
+_SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
+_MOST_SHOWN: Final = 3
+#: The definition that holds for every metric: how renders are compared at all.
+_RENDERS: Final = "renders"
+#: What makes a machine, and beyond it a way to use it.
+_MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
+_SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
+#: Rate of the calibration -> how much it may differ: on the clock, and in CPU time, of which other
+#: processes on the same core and cache take some even where they do not take the core.
+_SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
+#: Load above the number of cores from which on a machine is busy with other things.
+_BUSY: Final = 0.5
+#: Beside seconds of CPU, which may be compared all the same.
+_CLOCK: Final = "seconds of the clock"
+_NEVER_RECORDED: Final = "no run recorded them"
+
+
+def check_scenes(runs: Sequence[Run]) -> list[str]:
+    """Refuses runs of one scene that differ in split, photos, sizes or resize filter.
+
+    Returns:
+        Notes: of which runs photos cannot be compared, and of which scenes the regimes differ, so
+        that only overall figures are compared.
+
+    Raises:
+        UserError: Figures of these runs do not compare, with the reason.
+    """
+    for scene in dict.fromkeys(run.scene for run in runs):
+        own = [run for run in runs if run.scene == scene]
+        for question in (_check_held_out, _check_photos, _check_sizes, _check_trained):
+            question(scene, own)
+    unknown = [run.name for run in runs if run.results.scene_marks is None]
+    notes = []
+    if unknown and len(runs) > 1:
+        shown = ", ".join(unknown[:_MOST_SHOWN])
+        notes.append(
+            f"{len(unknown)} without scene.json, so that nobody can tell which photos they had: "
+            f"{shown}"
+        )
+    return notes + [
+        f"regimes are not compared on {scene}: its runs label the held-out views differently"
+        for scene in differing_regimes(runs)
+    ]
+
+
+def differing_regimes(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Scenes of which runs give the same held-out views different regimes."""
+    seen: dict[str, set[Hashable]] = {}
+    for run in runs:
+        labels = frozenset((view.name, view.regime) for view in run.results.views)
+        seen.setdefault(run.scene, set()).add(labels)
+    return tuple(scene for scene, labels in seen.items() if len(labels) > 1)
+
+
+def _check_held_out(scene: str, runs: Sequence[Run]) -> None:
+    found = _odd_one(runs, _held_out)
+    if found is not None:
+        first, second = found
+        raise UserError(
+            f"runs of {scene} were measured on different held-out views",
+            where=f"{first.name}, {second.name}",
+            expected="the same views in per_view.csv",
+            found=_difference(_held_out(first), _held_out(second)),
+            todo="compare runs with the same --split, --test-every and scene folder only",
+        )
+
+
+def _check_photos(scene: str, runs: Sequence[Run]) -> None:
+    found = _odd_one([run for run in runs if run.results.scene_marks], _photos)
+    if found is not None:
+        raise UserError(
+            f"runs of {scene} were measured against different photos",
+            where=f"{found[0].name}, {found[1].name}",
+            expected="the same photo files in scene.json",
+            found="photos of the same name with other bytes, or other masks",
+            todo="compare runs on one state of the scene's folder; another scene of the same name "
+            "needs a comparison of its own",
+        )
+
+
+def _check_sizes(scene: str, runs: Sequence[Run]) -> None:
+    found = _odd_one([run for run in runs if _sizes(run)], _sizes)
+    if found is not None:
+        raise UserError(
+            f"runs of {scene} have photos of different sizes or resize filters",
+            where=f"{found[0].name}, {found[1].name}",
+            expected="one size: PSNR falls with the size of the photos",
+            found=" against ".join(_sizes(run) for run in found),
+            todo="compare runs with the same --max-size and images folder only",
+        )
+
+
+def _check_trained(scene: str, runs: Sequence[Run]) -> None:
+    found = _odd_one([run for run in runs if run.results.scene_marks], _trained)
+    if found is not None:
+        first, second = found
+        raise UserError(
+            f"runs of {scene} were trained on different photos",
+            where=f"{first.name}, {second.name}",
+            expected="the same split in scene.json",
+            found=_difference(_trained(first), _trained(second)),
+            todo="compare runs with the same --split and --test-every only",
+        )
+
+
+def _odd_one(runs: Sequence[Run], mark: Callable[[Run], Hashable]) -> tuple[Run, Run] | None:
+    """The first run, and the first one that has another mark."""
+    return next(((runs[0], run) for run in runs if mark(run) != mark(runs[0])), None)
+
+
+def _held_out(run: Run) -> frozenset[str]:
+    return frozenset(view.name for view in run.results.views)
+
+
+def _views(run: Run) -> Mapping[str, Any]:
+    views = (run.results.scene_marks or {}).get("views")
+    return views if isinstance(views, Mapping) else {}
+
+
+def _trained(run: Run) -> frozenset[str]:
+    return frozenset(name for name, view in _views(run).items() if view.get("trained"))
+
+
+def _photos(run: Run) -> str:
+    views = _views(run).items()
+    return repr(sorted((n, _mark(v.get("photo")), _mark(v.get("mask"))) for n, v in views))
+
+
+def _mark(file: object) -> object:
+    """Return what a file is known by: its size and the digest of its ends."""
+    return [file.get("bytes"), file.get("sha256")] if isinstance(file, dict) else file
+
+
+def _sizes(run: Run) -> str:
+    """Sizes and filter, as the run noted them; empty where it did not."""
+    for note in run.summary.get("notes") or ():
+        if found := _SIZES.match(str(note)):
+            return f"{found['sizes']}, {found['how']}"
+    return ""
+
+
+def _difference(first: frozenset[str], second: frozenset[str]) -> str:
+    sides = (("only in the first", first - second), ("only in the second", second - first))
+    return "; ".join(
+        f"{len(names)} {side}: {', '.join(sorted(names)[:_MOST_SHOWN])}"
+        for side, names in sides
+        if names
+    )
+
+
+def quantities_of(
+    runs: Sequence[Run], name: str, margin: float | None
+) -> tuple[tuple[Quantity, ...], list[str]]:
+    """The figures that can be compared, the main one first, and notes on those that cannot.
+
+    Args:
+        runs: The runs.
+        name: Name of the main figure.
+        margin: Its margin; by default the usual one.
+
+    Raises:
+        UserError: No run has the main figure, or runs define it, or how renders are compared,
+            differently.
+    """
+    offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
+    measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
+    if not measured:
+        raise UserError(
+            "no run has a figure: none of them held a photo out",
+            where=runs[0].name,
+            todo="repeat the runs without --split none, and with more photos where there are few",
+        )
+    if name not in measured:
+        raise UserError(
+            "no run has this figure",
+            where="--metric",
+            expected=f"one of {', '.join(measured)}",
+            found=name,
+            todo="choose another one, or repeat the runs with it: crossgrad run --metrics NAME",
+        )
+    for key in (_RENDERS, name):
+        _check_definition(runs, key)
+    notes, kept = [], [name]
+    for key in measured:
+        if key == name:
+            continue
+        if len(_definitions(runs, key)) > 1:
+            notes.append(f"{key} is not compared: runs define it differently")
+        elif lacking := [run.name for run in runs if key not in _overall(run)]:
+            notes.append(f"{key} is not compared: {lacking[0]} and others did not measure it"
+                         if len(lacking) > 1 else
+                         f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
+        else:
+            kept.append(key)
+    falling = {str(key) for run in runs for key in run.summary.get("falling") or ()}
+    found = (
+        Quantity.of(key, margin if key == name else None, falls=key in falling) for key in kept
+    )
+    return tuple(found), notes
+
+
+def _check_definition(runs: Sequence[Run], key: str) -> None:
+    found = _definitions(runs, key)
+    if len(found) > 1:
+        (first, one), (second, other), *_ = ((text, run) for text, run in found.items())
+        raise UserError(
+            f"runs define {key} differently"
+            if key != _RENDERS
+            else "runs compare renders by different rules",
+            where=f"{one}, {other}",
+            expected="one definition in summary.json",
+            found=f"{first!r} against {second!r}",
+            todo="compare runs of one version, or repeat those of the other one",
+        )
+
+
+def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
+    """Definition -> the first run that has it; runs that do not state one agree with all."""
+    found: dict[str, str] = {}
+    for run in runs:
+        text = (run.summary.get("definitions") or {}).get(key)
+        if text is not None:
+            found.setdefault(str(text), run.name)
+    return found
+
+
+def _overall(run: Run) -> dict[str, Any]:
+    return dict(run.summary.get("overall") or {})
+
+
+def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cost, ...], list[str]]:
+    """What runs spend that can be compared, and notes on what cannot.
+
+    Args:
+        runs: The runs.
+        clock: The seconds that are wanted: by default those of the clock where they compare, else
+            those of the processor, else none.
+
+    Raises:
+        UserError: The wanted seconds do not compare, with the reason.
+    """
+    reasons = {SECONDS: _why_no_wall(runs), CPU_SECONDS: _why_no_cpu(runs)}
+    wanted = {ClockChoice.WALL: SECONDS, ClockChoice.CPU: CPU_SECONDS}.get(clock)
+    if wanted is not None and reasons[wanted]:
+        raise UserError(
+            f"{wanted.title} of these runs do not compare",
+            where=f"--clock {clock}",
+            found=reasons[wanted],
+            todo="leave --clock out: quality at equal steps and views is compared then"
+            + ("" if reasons[CPU_SECONDS] else "; --clock cpu compares CPU seconds"),
+        )
+    left_out = {cost for cost, reason in reasons.items() if reason}
+    if clock is not ClockChoice.AUTO:
+        left_out |= {SECONDS, CPU_SECONDS} - {wanted}
+    notes = [
+        f"{_CLOCK if cost is SECONDS else cost.title} are not compared: {reason}"
+        for cost, reason in reasons.items()
+        if reason and clock is ClockChoice.AUTO and reason != _NEVER_RECORDED
+    ]
+    return tuple(cost for cost in COSTS if cost not in left_out), notes
+
+
+def _why_no_wall(runs: Sequence[Run]) -> str:
+    """Why seconds of the clock do not compare; empty where they do."""
+    return (
+        _other_machine(runs, {**_MACHINE, **_SHARE})
+        or _busy(runs)
+        or _other_speed(runs, "rate")
+        or _unrecorded(runs, SECONDS)
+    )
+
+
+def _why_no_cpu(runs: Sequence[Run]) -> str:
+    return (
+        _unrecorded(runs, CPU_SECONDS)
+        or _other_machine(runs, _MACHINE)
+        or _threads(runs)
+        or _other_speed(runs, "cpu_rate")
+    )
+
+
+def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
+    first = runs[0]
+    for run in runs[1:]:
+        for field, words in fields.items():
+            one, other = _environment(first).get(field), _environment(run).get(field)
+            if one != other:
+                return f"{words} {one} of {first.name}, {other} of {run.name}"
+    return ""
+
+
+def _other_speed(runs: Sequence[Run], name: str) -> str:
+    """Whether the machine itself ran at another speed, as its calibration tells."""
+    known = [(run.number("environment", "calibration", name), run) for run in runs]
+    rates = [(rate, run) for rate, run in known if rate is not None]
+    if len(rates) < len(runs):
+        return ""
+    (low, slow), (high, fast) = min(rates, key=_first), max(rates, key=_first)
+    if high <= (1.0 + _SAME_SPEED[name]) * low:
+        return ""
+    return (
+        f"the machine's calibration was {high / low - 1.0:.0%} faster at {fast.name} "
+        f"than at {slow.name}"
+    )
+
+
+def _first(pair: tuple[float, Run]) -> float:
+    return pair[0]
+
+
+def _busy(runs: Sequence[Run]) -> str:
+    for run in runs:
+        load, cores = (
+            run.number("environment", "load", "mean"),
+            run.number("environment", "cpu_cores"),
+        )
+        if load is not None and cores is not None and load > cores + _BUSY:
+            return f"the machine was busy: a load of {load:.1f} on {cores:g} cores at {run.name}"
+    return ""
+
+
+def _threads(runs: Sequence[Run]) -> str:
+    """Threads that wait spin: their CPU seconds count, but nothing comes of them."""
+    for run in runs:
+        threads = run.number("environment", "torch_threads")
+        if threads is not None and threads > 1:
+            return f"they only compare with one thread, and {run.name} has {threads:g}"
+    return ""
+
+
+def _unrecorded(runs: Sequence[Run], cost: Cost) -> str:
+    lacking = [run.name for run in runs if run.spent(cost) is None]
+    if not lacking:
+        return ""
+    return _NEVER_RECORDED if len(lacking) == len(runs) else f"{lacking[0]} did not record them"
+
+
+def _environment(run: Run) -> dict[str, Any]:
+    return dict(run.summary.get("environment") or {})

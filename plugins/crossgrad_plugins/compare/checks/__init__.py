@@ -1,1 +1,0 @@
-"""Checks of runs that are compared: scenes, metrics, machines must agree, code should."""

@@ -1,0 +1,365 @@
+"""How sure a difference between arms is: estimates, intervals, p-values, verdicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from math import ceil, inf, isnan, nan, sqrt
+from typing import Final, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+DRAWS: Final = 2000
+_TWO: Final = 2
+_SEED: Final = 20_150_101
+#: From so many pairs on the interval comes from the bootstrap.
+BOOTSTRAP_FROM: Final = 10
+#: Levels of the interval that shows a difference and of the one that shows equivalence.
+WIDE, NARROW = 0.95, 0.90
+MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
+_UNKNOWN = (-inf, inf)
+Interval: TypeAlias = tuple[float, float]
+#: Nobody trains more pairs than this for one comparison.
+MOST_PAIRS: Final = 1000
+#: Up to so many comparisons are judged one by one.
+UNCORRECTED: Final = 5
+
+
+def iqm(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean of the middle half along the last axis.
+
+    A value on the border of the middle half counts with the share that is inside. Two values give
+    their mean; three give the middle value a weight of 2/3. (`scipy.stats.trim_mean` cuts whole
+    values.)
+
+    Args:
+        values: [..., n] numbers, n >= 1.
+
+    Returns:
+        [...] means.
+    """
+    count = values.shape[-1]
+    first = np.arange(count, dtype=np.float64)
+    weights = np.minimum(first + 1.0, 0.75 * count) - np.maximum(first, 0.25 * count)
+    weights = np.clip(weights, 0.0, None)
+    means: NDArray[np.float64] = np.sort(values, axis=-1) @ (weights / weights.sum())
+    return means
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """The estimates of many resampled sets of pairs.
+
+    Attributes:
+        draws: [DRAWS] estimates, sorted.
+        freedom: Degrees of freedom of the variance within scenes.
+    """
+
+    draws: NDArray[np.float64]
+    freedom: int
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64], scenes: Sequence[str]) -> "Bootstrap":
+        """Resample pairs within their scenes; scenes with a single pair are resampled together.
+
+        Args:
+            values: [n] differences, n >= 2.
+            scenes: The scene of each.
+        """
+        rng = np.random.default_rng(_SEED)
+        strata = _strata(scenes)
+        stretched, resampled = np.empty(len(values)), np.empty((DRAWS, len(values)))
+        of_two = [each for each in strata if len(each) == _TWO]
+        pool = _deviations(values, of_two)
+        for stratum in strata:
+            own, count = values[stratum], len(stratum)
+            stretch = sqrt(count / (count - 1)) if count > 1 else 1.0
+            stretched[stratum] = own.mean() + stretch * (own - own.mean())
+            source = own.mean() + pool if count == _TWO else stretched[stratum]
+            drawn = rng.integers(0, len(source), (DRAWS, count))
+            resampled[:, stratum] = source[drawn]
+        draws = iqm(resampled) + (iqm(values) - iqm(stretched))
+        freedom = max(1, len(values) - len(strata))
+        return cls(np.sort(draws), freedom)
+
+    def interval(self, level: float) -> tuple[float, float]:
+        """Return the two-sided interval of a level such as 0.95."""
+        from scipy.special import ndtr, stdtrit
+
+        tail = float(ndtr(-stdtrit(self.freedom, 0.5 + level / 2.0)))
+        low, high = np.quantile(self.draws, [tail, 1.0 - tail])
+        return float(low), float(high)
+
+    def cdf(self, border: float) -> float:
+        """Return the p-value of an estimate of at most `border`."""
+        return self._tail(_share(self.draws, border), float(np.median(self.draws)) - border)
+
+    def sf(self, border: float) -> float:
+        """Return the p-value of an estimate of at least `border`."""
+        return self._tail(1.0 - _share(self.draws, border), border - float(np.median(self.draws)))
+
+    def _tail(self, share: float, distance: float) -> float:
+        """Return the p-value of a share of the draws, given that the intervals are expanded.
+
+        If a border is beyond all draws, its distance from their median in standard deviations
+        counts, so that the number of draws limits no p-value.
+        """
+        from scipy.special import ndtri, stdtr
+
+        least = 0.5 / DRAWS
+        place = float(ndtri(min(max(share, least), 1.0 - least)))
+        if share < least:
+            spread = float(self.draws.std())
+            place = min(place, -distance / spread) if spread > 0.0 else -inf
+        return float(stdtr(self.freedom, place))
+
+
+def _deviations(
+    values: NDArray[np.float64], strata: Sequence[NDArray[np.intp]]
+) -> NDArray[np.float64]:
+    """Return the stretched deviations of scenes with two pairs from the means of their scenes."""
+    deviations = [sqrt(_TWO) * (values[each] - values[each].mean()) for each in strata]
+    return np.concatenate(deviations) if deviations else np.zeros(0)
+
+
+def _share(draws: NDArray[np.float64], border: float) -> float:
+    """Return the share of sorted draws below a border; draws on the border count half."""
+    below = int(np.searchsorted(draws, border))
+    up_to = int(np.searchsorted(draws, border, side="right"))
+    return (below + up_to) / (2 * len(draws))
+
+
+def _strata(scenes: Sequence[str]) -> list[NDArray[np.intp]]:
+    names = np.asarray(scenes)
+    strata = [np.flatnonzero(names == name) for name in dict.fromkeys(scenes)]
+    single = [each for each in strata if len(each) == 1]
+    several = [each for each in strata if len(each) > 1]
+    return [*several, np.concatenate(single)] if single else several
+
+
+@dataclass(frozen=True)
+class SceneEstimate:
+    """The mean difference on one scene, from two pairs of it or more.
+
+    Attributes:
+        scene: Its name.
+        center: The mean.
+        wide: The 95 % interval by Student's t.
+    """
+
+    scene: str
+    center: float
+    wide: Interval
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A difference with its uncertainty.
+
+    Attributes:
+        pairs: Number of pairs.
+        scenes: Number of scenes that they come from.
+        margin: What counts as no difference in practice.
+        center: The estimate: the mean below 10 pairs, the interquartile mean from there on.
+        method: Which of the two, and where the interval comes from.
+        wide: The 95 % interval; it shows a difference where it excludes zero.
+        narrow: The 90 % interval; it shows equivalence where it lies within the margin.
+        deviation: Standard deviation of the pairs' differences; NaN for a single pair.
+        p_different: Two-sided p-value of no difference.
+        p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
+        p_above: p-value of a difference of at least the margin upwards (a one-sided test).
+        needed: Pairs after which the 90 % interval is as narrow as the margin, if it gets narrower
+            as usual; None where that cannot be told. More than there are where it is not so yet.
+        by_scene: The scenes by themselves; empty where all pairs are of one. The interquartile
+            mean leaves out a scene that is unlike the others.
+    """
+
+    pairs: int
+    scenes: int
+    margin: float
+    center: float
+    method: str
+    wide: Interval = _UNKNOWN
+    narrow: Interval = _UNKNOWN
+    deviation: float = nan
+    p_different: float = nan
+    p_equivalent: float = nan
+    p_above: float = nan
+    needed: int | None = None
+    by_scene: tuple[SceneEstimate, ...] = ()
+
+    @property
+    def differs(self) -> bool:
+        """Whether the 95 % interval excludes zero."""
+        return self.wide[0] > 0.0 or self.wide[1] < 0.0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the 90 % interval lies within the margin."""
+        return -self.margin < self.narrow[0] and self.narrow[1] < self.margin
+
+
+class Law(Protocol):
+    """The law of an estimate: SciPy's Student's t, or a bootstrap."""
+
+    def interval(self, level: float) -> Interval:
+        """Return the two-sided interval of a level such as 0.95."""
+
+    def cdf(self, border: float) -> float:
+        """Return the p-value of an estimate of at most `border`."""
+
+    def sf(self, border: float) -> float:
+        """Return the p-value of an estimate of at least `border`."""
+
+
+def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float) -> Estimate:
+    """Estimate a difference from pairs of runs.
+
+    Args:
+        differences: One per pair, all finite; at least one.
+        scenes: The scene of each pair.
+        margin: What counts as no difference in practice.
+    """
+    values = np.asarray(differences, dtype=np.float64)
+    by_bootstrap = len(values) >= BOOTSTRAP_FROM
+    common = Estimate(
+        pairs=len(values),
+        scenes=len(set(scenes)),
+        margin=margin,
+        center=float(iqm(values) if by_bootstrap else values.mean()),
+        method=IQM if by_bootstrap else MEAN,
+        by_scene=_by_scene(values, scenes),
+    )
+    if len(values) == 1:
+        return common
+    law: Law = Bootstrap.of(values, scenes) if by_bootstrap else student(values)
+    deviation, narrow = float(values.std(ddof=1)), _floats(law.interval(NARROW))
+    above, below = float(law.sf(margin)), float(law.cdf(-margin))
+    return replace(
+        common,
+        wide=_floats(law.interval(WIDE)),
+        narrow=narrow,
+        deviation=deviation,
+        p_different=min(1.0, 2.0 * float(min(law.sf(0.0), law.cdf(0.0)))),
+        p_equivalent=max(above, below),
+        p_above=above,
+        needed=_wider(narrow, len(values), margin)
+        if by_bootstrap
+        else pairs_needed(deviation, margin),
+    )
+
+
+def student(values: NDArray[np.float64]) -> Law:
+    """Return Student's law of the mean of two values or more."""
+    from scipy.stats import t
+
+    error = float(values.std(ddof=1)) / sqrt(len(values))
+    if error == 0.0:
+        return Bootstrap(values[:1], len(values) - 1)  # SciPy takes no scale of 0.
+    law: Law = t(len(values) - 1, loc=values.mean(), scale=error)
+    return law
+
+
+def pairs_needed(deviation: float, margin: float) -> int | None:
+    """Return how many pairs make the 90 % interval of a mean at most as wide as the margins.
+
+    Args:
+        deviation: Standard deviation of the pairs' differences.
+        margin: The margin, above 0.
+
+    Returns:
+        The number; None if it is above 1,000.
+    """
+    from scipy.special import stdtrit
+
+    pairs = np.arange(2, MOST_PAIRS + 1)
+    enough = pairs[stdtrit(pairs - 1, 0.5 + NARROW / 2.0) * deviation <= margin * np.sqrt(pairs)]
+    return int(enough[0]) if len(enough) else None
+
+
+def _wider(narrow: Interval, pairs: int, margin: float) -> int | None:
+    """Return the same for an interquartile mean, from the interval that it has with these pairs."""
+    needed = pairs * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
+    return max(2, ceil(needed)) if needed <= MOST_PAIRS else None
+
+
+def _by_scene(values: NDArray[np.float64], scenes: Sequence[str]) -> tuple[SceneEstimate, ...]:
+    names = np.asarray(scenes)
+    of_scene = {scene: values[names == scene] for scene in dict.fromkeys(scenes)}
+    return tuple(
+        SceneEstimate(scene, float(own.mean()), _floats(student(own).interval(WIDE)))
+        for scene, own in of_scene.items()
+        if 1 < len(own) < len(values)
+    )
+
+
+def _floats(interval: Interval) -> Interval:
+    return float(interval[0]), float(interval[1])
+
+
+class Verdict(StrEnum):
+    """The verdict on a difference."""
+
+    DIFFERENT = "different"
+    EQUIVALENT = "equivalent"
+    INCONCLUSIVE = "inconclusive"
+
+
+def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
+    """The verdict on each of the comparisons that are shown together.
+
+    Different where the 95 % interval excludes zero, else equivalent where the 90 % interval lies
+    within the margin. Of more than five comparisons it takes the p-values of either test, corrected
+    with Holm's method, too.
+    """
+    if len(family) <= UNCORRECTED:
+        return [_verdict(each.differs, each.is_small) for each in family]
+    different = corrected([each.p_different for each in family])
+    equivalent = corrected([each.p_equivalent for each in family])
+    return [
+        _verdict(each.differs and p < 1.0 - WIDE, each.is_small and q < (1.0 - NARROW) / 2.0)
+        for each, p, q in zip(family, different, equivalent, strict=True)
+    ]
+
+
+def corrected(values: Sequence[float]) -> list[float]:
+    """The p-values of one test of comparisons that are shown together: Holm's above five."""
+    return holm(values) if len(values) > UNCORRECTED else list(values)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted by Holm's method (Scandinavian Journal of Statistics 6, 1979).
+
+    NaN is the p-value of a test that was not made: it stays NaN and is not counted.
+    """
+    known = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
+    adjusted, largest = list(values), 0.0
+    for rank, (value, index) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * value))
+        adjusted[index] = largest
+    return adjusted
+
+
+def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
+    """The scenes that surely contradict a verdict on all of them, by their own 95 % intervals.
+
+    Of a difference those that differ the other way, of equivalence those beyond the margin.
+    """
+    if verdict is Verdict.INCONCLUSIVE:
+        return ()
+    sign = 1.0 if found.center > 0.0 else -1.0
+    return tuple(
+        each
+        for each in found.by_scene
+        if (
+            max(sign * limit for limit in each.wide) < 0.0
+            if verdict is Verdict.DIFFERENT
+            else each.wide[0] > margin or each.wide[1] < -margin
+        )
+    )
+
+
+def _verdict(differs: bool, is_small: bool) -> Verdict:
+    if differs:
+        return Verdict.DIFFERENT
+    return Verdict.EQUIVALENT if is_small else Verdict.INCONCLUSIVE

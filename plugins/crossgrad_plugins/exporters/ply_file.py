@@ -1,0 +1,330 @@
+"""Standard 3DGS PLY files (Inria property order), as the usual viewers read them.
+
+Source: 3DGS; the order `x y z nx ny nz f_dc f_rest opacity scale rot`, float32 little-endian.
+`f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
+"""
+
+import re
+from collections.abc import Collection, Sequence
+from math import floor, log10
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.raster_constants import COEFFICIENTS
+from crossgrad_core.plugin import (
+    COORDINATES_TAG,
+    Rounding,
+    Similarity,
+    UserError,
+    atomic_file,
+    read_vertices,
+    vertex_properties,
+)
+from crossgrad_plugins.exporters.ply_cloud import REST, RenderMode, SplatCloud
+
+#: Property names in the order in which they are written.
+PROPERTIES = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(3 * REST)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+_NEEDED = tuple(name for name in PROPERTIES if not name.startswith(("n", "f_rest_")))
+#: Rounding of positions to float32 may move a Gaussian by this much, in local units.
+POSITION_TOLERANCE = 1e-6
+
+_OFFSET_TAG = "crossgrad_offset:"
+_MODE_TAG = "SplatRenderMode:"
+_CHUNK = 65_536
+_LARGEST = float(np.finfo(np.float32).max)
+#: Natural logarithm of the largest size; float32 ends at e^88.
+_LARGEST_LOG_SCALE = 80.0
+#: Lengths of a rotation whose square float32 can hold.
+_ROTATION_LENGTHS = (1e-18, 1e18)
+_OFFSET = re.compile(r"\s+".join([r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"] * 3))
+_IDENTITY = Similarity(np.zeros(3), 1.0)
+
+
+def write_ply(
+    path: Path,
+    cloud: SplatCloud,
+    similarity: Similarity = _IDENTITY,
+    comments: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Writes a cloud of the local frame in input coordinates; the file appears complete.
+
+    Where the input coordinates are so large (UTM, ECEF) that float32 would move Gaussians by more
+    than 1e-6 local units, positions are written relative to a rounded offset, which stands in a
+    comment `crossgrad_offset: x y z` and is applied by `read_ply`.
+
+    Args:
+        path: The file.
+        cloud: Gaussians in the local frame.
+        similarity: Maps the local frame back to the input frame.
+        comments: Further lines for the header, plain text.
+
+    Returns:
+        What the user should know about the file, one sentence each; usually nothing.
+
+    Raises:
+        UserError: The disk is full or the folder may not be written to.
+    """
+    notes = []
+    offset = position_offset(similarity)
+    moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
+    valid = _representable(moved)
+    if not valid.all():
+        moved = moved.selected(valid)
+        notes.append(f"{path.name}: {np.sum(~valid):,} Gaussians that are not finite left out")
+    tags = [f"{_MODE_TAG} {cloud.render_mode}"]
+    if offset.any():
+        text = " ".join(_plain(value) for value in offset)
+        tags.append(f"{_OFFSET_TAG} {text}")
+        notes.append(f"{path.name}: coordinates are relative to {text} (float32 is too coarse)")
+    header = _header(len(moved), [*tags, *comments])
+    with atomic_file(path, len(header) + 4 * len(PROPERTIES) * len(moved)) as file:
+        file.write(header)
+        for start in range(0, len(moved), _CHUNK):
+            file.write(_rows(moved, slice(start, start + _CHUNK)).tobytes())
+    return tuple(notes)
+
+
+def position_rounding(cloud: SplatCloud, similarity: Similarity) -> Rounding:
+    """How `write_ply` keeps the positions of a cloud."""
+    offset = position_offset(similarity)
+    moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
+    means = moved.selected(_representable(moved)).means
+    off = np.abs(means.astype(np.float32) - means)
+    return Rounding(offset, float(off.max(initial=0.0)))
+
+
+def position_offset(similarity: Similarity) -> NDArray[np.float64]:
+    """[3] what to subtract from input coordinates before they are rounded to float32.
+
+    Zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`; else the centre
+    of the scene, rounded to a power of ten of at most one local unit.
+    """
+    largest = np.float32(np.abs(similarity.offset).max())
+    error = 0.5 * float(np.spacing(largest)) * similarity.scale  # local units
+    if error <= POSITION_TOLERANCE:
+        return np.zeros(3)
+    exponent = floor(log10(1.0 / similarity.scale))
+    offset: NDArray[np.float64] = np.round(similarity.offset, -exponent) + 0.0  # no negative zeros
+    return offset
+
+
+def read_ply(path: Path) -> SplatCloud:
+    """Reads Gaussians by property name: any order and types, with or without normals, degree 0-3.
+
+    Returns:
+        The cloud in the frame of the file, its `crossgrad_offset` applied.
+
+    Raises:
+        UserError: Not a PLY file, no Gaussians in it, ends too early, holds non-finite numbers, or
+            is in other coordinates than a scene's input.
+    """
+    vertices = read_vertices(path)
+    _check_coordinates(vertices.comments, path)
+    _require_properties(vertices.columns, path)
+    rest = _rest_names(vertices.columns, path)
+    _require_gaussians(len(vertices.columns["x"]), path)
+    for name in (*_NEEDED, *rest):
+        top = _LARGEST_LOG_SCALE if name.startswith("scale_") else _LARGEST
+        _check_finite(vertices.columns[name], name, path, top)
+
+    def stacked(names: Sequence[str]) -> NDArray[np.float32]:
+        return np.stack([vertices.columns[name] for name in names], axis=1, dtype=np.float32)
+
+    quats = stacked([f"rot_{i}" for i in range(4)])
+    _check_rotations(quats, path)
+    means = np.stack([vertices.columns[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+    sh_rest = np.zeros((len(means), REST, 3), dtype=np.float32)
+    if rest:
+        bands = stacked(rest).reshape(len(means), 3, len(rest) // 3)  # channel-major
+        sh_rest[:, : bands.shape[2]] = bands.transpose(0, 2, 1)
+    return SplatCloud(
+        means=means + _offset(vertices.comments, path),
+        log_scales=stacked([f"scale_{i}" for i in range(3)]),
+        quats=quats,
+        logit_opacities=stacked(["opacity"])[:, 0],
+        sh_dc=stacked([f"f_dc_{i}" for i in range(3)]),
+        sh_rest=sh_rest,
+        render_mode=_render_mode(vertices.comments, path),
+    )
+
+
+def sh_degree_of(path: Path) -> int:
+    """The SH degree that a PLY of Gaussians holds, from its header alone.
+
+    Raises:
+        UserError: Not a PLY file, no Gaussians in it, or an unusual number of coefficients.
+    """
+    properties = vertex_properties(path)
+    _require_properties(properties, path)
+    return COEFFICIENTS.index(1 + len(_rest_names(properties, path)) // 3)
+
+
+def _plain(value: float) -> str:
+    """A number without exponent or needless digits; float(text) gives the same bits."""
+    return np.format_float_positional(value, trim="-")
+
+
+def _header(count: int, comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {' '.join(text.split())}" for text in comments]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in PROPERTIES)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", errors="replace")
+
+
+def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
+    """[N] Gaussians whose every number is finite in float32."""
+    valid = (np.abs(cloud.means) <= np.finfo(np.float32).max).all(axis=1)
+    valid &= np.isfinite(cloud.logit_opacities)
+    for array in (cloud.log_scales, cloud.quats, cloud.sh_dc, cloud.sh_rest):
+        valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    return valid
+
+
+def _rows(cloud: SplatCloud, part: slice) -> NDArray[np.float32]:
+    """[n, 62] little-endian rows of the table."""
+    means = cloud.means[part]
+    count = len(means)
+    columns = (
+        means,
+        np.zeros((count, 3)),
+        cloud.sh_dc[part],
+        cloud.sh_rest[part].transpose(0, 2, 1).reshape(count, 3 * REST),
+        cloud.logit_opacities[part, None],
+        cloud.log_scales[part],
+        cloud.quats[part],
+    )
+    return np.concatenate([column.astype("<f4") for column in columns], axis=1)
+
+
+def _rest_names(columns: Collection[str], path: Path) -> list[str]:
+    count = sum(name.startswith("f_rest_") for name in columns)
+    names = [f"f_rest_{i}" for i in range(count)]
+    if count not in (0, 9, 24, 45) or any(name not in columns for name in names):
+        raise UserError(
+            "PLY file with an unusual number of spherical harmonics",
+            where=path,
+            expected="0, 9, 24 or 45 properties f_rest_0, f_rest_1 ...",
+            found=f"{count}",
+            todo="export the file again with whole bands of spherical harmonics",
+        )
+    return names
+
+
+def _require_gaussians(count: int, path: Path) -> None:
+    if count == 0:
+        raise UserError(
+            "PLY file without Gaussians",
+            where=path,
+            expected="at least one vertex",
+            found="0 vertices",
+            todo="export the Gaussians again, or start from the SfM points (--init points)",
+        )
+
+
+def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
+    lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
+    shortest, longest = _ROTATION_LENGTHS
+    wrong = (lengths < shortest) | (lengths > longest)
+    if wrong.any():
+        raise UserError(
+            "PLY file with a rotation of length zero or of no length that float32 can square",
+            where=path,
+            expected=f"quaternions rot_0 ... rot_3 of length {shortest:g} to {longest:g}",
+            found=f"{int(wrong.sum()):,} of {len(quats):,} out of this range",
+            todo="remove these Gaussians, or export the file again",
+        )
+
+
+def _require_properties(names: Collection[str], path: Path) -> None:
+    missing = [name for name in _NEEDED if name not in names]
+    if not missing:
+        return
+    packed, points = "packed_position" in names, {"x", "y", "z"} <= set(names)
+    todo = (
+        "decompress it, e.g. with splat-transform"
+        if packed
+        else f"--points {path} starts from its points; --init takes a file of Gaussians"
+        if points
+        else "export the Gaussians, not the sparse points or a mesh"
+    )
+    raise UserError(
+        "compressed PLY file" if packed else "PLY file without Gaussians",
+        where=path,
+        expected="the properties of a standard 3DGS PLY file",
+        found=f"no {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}",  # noqa: PLR2004
+        todo=todo,
+    )
+
+
+def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float) -> None:
+    # More than float32 can work with counts as infinite; NaN fails the comparison too.
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        numbers = column.astype(np.float64)
+    valid = (numbers >= -_LARGEST) & (numbers <= top)
+    if not valid.all():
+        raise UserError(
+            "PLY file with numbers that are not finite",
+            where=path,
+            found=f"{np.sum(~valid):,} of {len(column):,} values of {name}",
+            todo="remove these Gaussians, or export the file again",
+        )
+
+
+def _tagged(comments: Sequence[str], tag: str) -> str | None:
+    for comment in comments:
+        if comment.startswith(tag):
+            return comment.removeprefix(tag).strip()
+    return None
+
+
+def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
+    text = _tagged(comments, _OFFSET_TAG)
+    if text is None:
+        return np.zeros(3)
+    match = _OFFSET.fullmatch(text)
+    offset = np.array([float(word) for word in match.groups()] if match else [np.nan] * 3)
+    if not (np.abs(offset) <= _LARGEST).all():
+        raise UserError(
+            "PLY file with an unreadable offset",
+            where=path,
+            expected="three numbers",
+            found=text,
+            todo=f"repair or remove the comment that starts with {_OFFSET_TAG}",
+        )
+    return offset
+
+
+def _check_coordinates(comments: Sequence[str], path: Path) -> None:
+    found = _tagged(comments, COORDINATES_TAG)
+    if found is not None:
+        raise UserError(
+            "PLY file in other coordinates than the scene's",
+            where=path,
+            expected="the coordinates of the scene's input",
+            found=found,
+            todo="export it again with --coordinates input",
+        )
+
+
+def _render_mode(comments: Sequence[str], path: Path) -> RenderMode:
+    text = _tagged(comments, _MODE_TAG)
+    if text is None or text == "default":
+        return "default"
+    if text == "mip":
+        return "mip"
+    raise UserError(
+        "PLY file for another renderer",
+        where=path,
+        expected=f"{_MODE_TAG} default or mip",
+        found=text,
+        todo=f"remove the comment if its Gaussians are meant to be drawn as in {_MODE_TAG} default",
+    )

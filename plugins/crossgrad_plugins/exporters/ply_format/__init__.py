@@ -1,1 +1,0 @@
-"""Gaussians in PLY files."""

@@ -1,0 +1,191 @@
+"""The distance of two images by the features of a network, and its files of weights."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from crossgrad_core.plugin import UserError
+from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
+
+#: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as LPIPS has them.
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+#: Keeps the length of a vector of features away from 0.
+_LEAST = 1e-8
+#: Packages that bring the published heads, and where in them.
+_PACKAGES = (
+    ("torchmetrics", ("functional", "image", "lpips_models")),
+    ("lpips", ("weights", "v0.1")),
+)
+_SAFETENSORS = ".safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """All that LPIPS with one trunk needs.
+
+    Attributes:
+        trunk: (weights [O, I, H, W], biases [O]) of its convolutions in order.
+        heads: [1, C, 1, 1] of those that are compared.
+        source: Which files they are, for summary.json.
+    """
+
+    trunk: tuple[tuple[Tensor, Tensor], ...]
+    heads: tuple[Tensor, ...]
+    source: str
+
+
+def distance(net: Trunk, weights: Weights, first: Tensor, second: Tensor) -> float:
+    """LPIPS of two images [H, W, 3]; those in [-1, 1] are scaled as the method wants it.
+
+    Source: Zhang et al. 2018, The Unreasonable Effectiveness of Deep Features as a Perceptual
+    Metric, version 0.1: features of unit length, squared differences, weighted by channel, mean
+    over the pixels, sum over the layers.
+    """
+    with torch.no_grad():
+        pairs = zip(_features(net, weights, first), _features(net, weights, second), strict=True)
+        total = 0.0
+        for (one, other), head in zip(pairs, weights.heads, strict=True):
+            difference = (_unit(one) - _unit(other)).square()
+            total += float(functional.conv2d(difference, head).mean())
+        return total
+
+
+def _features(net: Trunk, weights: Weights, image: Tensor) -> Iterator[Tensor]:
+    """[1, C, h, w] what each compared convolution gives, after its ReLU."""
+    shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
+    x = ((image - shift) / scale).permute(2, 0, 1)[None]
+    for layer, (weight, bias) in zip(net.layers, weights.trunk, strict=True):
+        if layer.pools:
+            x = functional.max_pool2d(x, net.window, 2)
+        x = functional.relu(functional.conv2d(x, weight, bias, layer.stride, layer.padding))
+        if layer.compared:
+            yield x
+
+
+def _unit(features: Tensor) -> Tensor:
+    """The features of each pixel at length 1."""
+    return features / (_LEAST + features.square().sum(dim=1, keepdim=True)).sqrt()
+
+
+def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> Weights:
+    """Reads and checks the weights.
+
+    Args:
+        net: The network.
+        trunk: File with its pretrained weights.
+        heads: File with the linear heads; by default those of an installed package.
+        setting: How the user sets them, such as `metrics.lpips`.
+
+    Raises:
+        UserError: A file is missing, is none of weights, or holds those of another network.
+    """
+    of_trunk = _read_trunk(net, trunk, f"{setting}.trunk")
+    file, whose = (heads, heads.name) if heads is not None else _installed(net, setting)
+    of_heads = _read_heads(net, file, f"{setting}.heads")
+    return Weights(of_trunk, of_heads, f"{_described(net, trunk)}, linear heads of {whose}")
+
+
+def _read_trunk(net: Trunk, path: Path, setting: str) -> tuple[tuple[Tensor, Tensor], ...]:
+    todo = f"--set {setting}=FILE names torchvision's {net.model}, such as {net.published}"
+    found = {name.removeprefix("features."): tensor for name, tensor in _read(path, todo).items()}
+    pairs = []
+    for layer in net.layers:
+        weight, bias = (_name(layer, part) for part in ("weight", "bias"))
+        _check(path, found, {weight: layer.shape, bias: layer.shape[:1]}, todo)
+        pairs.append((found[weight].float(), found[bias].float()))
+    return tuple(pairs)
+
+
+def _name(layer: Convolution, part: str) -> str:
+    return f"{layer.layer}.{part}"
+
+
+def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
+    todo = f"--set {setting}=FILE names the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
+    found = _read(path, todo)
+    shapes: dict[str, tuple[int, ...]] = {
+        f"lin{place}.model.1.weight": (1, layer.shape[0], 1, 1)
+        for place, layer in enumerate(net.compared)
+    }
+    _check(path, found, shapes, todo)
+    return tuple(found[name].float() for name in shapes)
+
+
+def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
+    """The heads that an installed package brings, and its name; it is not imported."""
+    for package, folders in _PACKAGES:
+        spec = find_spec(package)
+        for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+            file = Path(place, *folders, net.heads)
+            if file.is_file():
+                return file, package
+    raise UserError(
+        f"there are no linear heads of LPIPS for {net.name}",
+        where=setting,
+        expected=f"a package that brings them ({', '.join(name for name, _ in _PACKAGES)})",
+        todo=f"pip install torchmetrics, or name the file: --set {setting}.heads={net.heads}",
+    )
+
+
+def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
+    """The tensors of a file by name; nothing in it is executed."""
+    if not path.is_file():
+        raise UserError("there is no file of weights", where=path, todo=todo)
+    try:
+        if path.suffix == _SAFETENSORS:
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        # Files that were written on a GPU are read without one.
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # What a damaged file raises is documented nowhere.
+        # Not in torch's words, which end in the advice to execute what is in the file.
+        raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error
+    if not isinstance(found, Mapping):
+        raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
+    return {name: tensor for name, tensor in found.items() if isinstance(tensor, Tensor)}
+
+
+def _unreadable(path: Path, found: str, todo: str) -> UserError:
+    return UserError(
+        "the file of weights cannot be read",
+        where=path,
+        expected="tensors by name, as .pth (a state dict) or .safetensors",
+        found=found,
+        todo=todo,
+    )
+
+
+def _check(
+    path: Path, found: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
+) -> None:
+    """Refuses weights of another network, or that are not finite."""
+    for name, shape in shapes.items():
+        tensor = found.get(name)
+        if tensor is None or tuple(tensor.shape) != shape:
+            told = "nothing of that name" if tensor is None else f"shape {list(tensor.shape)}"
+        elif not bool(torch.isfinite(tensor).all()):
+            told = "numbers that are not finite"
+        else:
+            continue
+        raise UserError(
+            "the file holds the weights of another network",
+            where=f"{path}: {name}",
+            expected=f"shape {list(shape)}",
+            found=told,
+            todo=todo,
+        )
+
+
+def _described(net: Trunk, path: Path) -> str:
+    """Which file of weights it is: figures of different ones do not compare."""
+    digest = sha256(path.read_bytes()).hexdigest()
+    published = "" if digest.startswith(net.digest) else "not "
+    return f"{path.name} (SHA-256 {digest[:16]}, {published}the file that torchvision publishes)"

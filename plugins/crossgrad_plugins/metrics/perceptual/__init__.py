@@ -1,1 +1,0 @@
-"""LPIPS: the networks, their weights and the distance."""

@@ -1,0 +1,1 @@
+"""Kernels over the pixels of tiles: forward, backward, and what both count."""

@@ -1,0 +1,260 @@
+"""A tile's patches, and the states of their pixels in the backward passes."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crossgrad_core.numerics.simd import (
+    LANES,
+    WIDE,
+    Lanes,
+    first_half,
+    fnma,
+    joined,
+    last_half,
+    load,
+    load_triples,
+    load_wide,
+    picking,
+    splat,
+    splat_wide,
+    store,
+    where,
+)
+from crossgrad_plugins.rasterizers.numba_kernels.jit import device
+from crossgrad_plugins.rasterizers.numba_kernels.layout import (
+    COLUMNS,
+    FINISHED,
+    ONE,
+    PATCHES,
+    SIDE,
+    STOPPED,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+
+_PLACES = [(x, y) for x in range(SIDE) for y in range(SIDE)]
+# Of two rows of eight pixels, then two more: the patch on the left and the one on the right.
+_left_patch, _right_patch = (
+    picking([y * LANES + start + x for x, y in _PLACES]) for start in (0, SIDE)
+)
+# Of the patch on the left and the one on the right: the first and the last two rows of pixels.
+_first_rows, _last_rows = (
+    picking([x // SIDE * WIDE + x % SIDE * SIDE + y for y in rows for x in range(LANES)])
+    for rows in ((0, 1), (2, 3))
+)
+
+
+@device
+def row_of(patch: int) -> int:
+    """Returns the first row of pixels of a patch."""
+    return (patch // COLUMNS) * SIDE
+
+
+@device
+def column_of(patch: int) -> int:
+    """Returns the column of patches."""
+    return patch & (COLUMNS - 1)
+
+
+@device
+def place_of(x: int, y: int) -> tuple[int, int]:
+    """Returns the patch of pixel (x, y) of a tile, and its lane there."""
+    return (y // SIDE) * COLUMNS + x // SIDE, (x % SIDE) * SIDE + y % SIDE
+
+
+@device
+def two_patches(a: Lanes, b: Lanes, c: Lanes, d: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns two patches, side by side, of four rows of eight pixels."""
+    above, below = joined(a, b), joined(c, d)
+    return _left_patch(above, below), _right_patch(above, below)
+
+
+@device
+def four_rows(left: Lanes, right: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Returns the four rows of eight pixels of two patches side by side."""
+    above, below = _first_rows(left, right), _last_rows(left, right)
+    return first_half(above), last_half(above), first_half(below), last_half(below)
+
+
+#: State of a patch, WIDE numbers each: transmittance (negative once finished), the part
+#: S of the loss' linear form still to come (see `backward`), gradient of the three channels.
+PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE, 4 * WIDE
+STATE = 5 * WIDE
+#: The gradients of the depths of all patches follow the states of all patches.
+DEPTHS = PATCHES * STATE
+#: Eight pixels: S, gradient of the three channels, gradient of the depth.
+_Eight = tuple[Lanes, Lanes, Lanes, Lanes, Lanes]
+
+
+@device
+def _eight(
+    pixel: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> _Eight:
+    """Returns what the state of eight pixels begins with, from a flat index on."""
+    r, g, b = load_triples(image, 3 * pixel)
+    red, green, blue = load_triples(v_image, 3 * pixel)
+    rest = red * r + green * g + blue * b
+    if v_alpha is not None:
+        rest = rest - load(v_alpha, pixel) * (splat(np.float32(1.0)) - load(alpha, pixel))
+    v_z = splat(np.float32(0.0))
+    if depth is not None and v_depth is not None:
+        v_z = load(v_depth, pixel)
+        rest = rest + v_z * load(depth, pixel)
+    return rest, red, green, blue, v_z
+
+
+@device
+def _store_two(
+    state: NDArray[np.float32], at: int, ahead: int, a: Lanes, b: Lanes, c: Lanes, d: Lanes
+) -> None:
+    """Writes four rows of eight pixels to a patch and to the next one, `ahead` of it."""
+    left, right = two_patches(a, b, c, d)
+    store(state, at, left)
+    store(state, at + ahead, right)
+
+
+@device
+def _start_two(
+    state: NDArray[np.float32],
+    patch: int,
+    pixel: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the states of a patch and the one on its right, from a flat index of pixels on."""
+    at, width = patch * STATE, image.shape[1]
+    a = _eight(pixel, image, alpha, depth, v_image, v_alpha, v_depth)
+    b = _eight(pixel + width, image, alpha, depth, v_image, v_alpha, v_depth)
+    c = _eight(pixel + 2 * width, image, alpha, depth, v_image, v_alpha, v_depth)
+    d = _eight(pixel + 3 * width, image, alpha, depth, v_image, v_alpha, v_depth)
+    one = splat(np.float32(1.0))
+    _store_two(state, at + PASSED, STATE, one, one, one, one)
+    _store_two(state, at + REST, STATE, a[0], b[0], c[0], d[0])
+    _store_two(state, at + V_RED, STATE, a[1], b[1], c[1], d[1])
+    _store_two(state, at + V_GREEN, STATE, a[2], b[2], c[2], d[2])
+    _store_two(state, at + V_BLUE, STATE, a[3], b[3], c[3], d[3])
+    if v_depth is not None:
+        _store_two(state, DEPTHS + patch * WIDE, WIDE, a[4], b[4], c[4], d[4])
+
+
+@device
+def _start_pixel(
+    state: NDArray[np.float32],
+    patch: int,
+    lane: int,
+    i: int,
+    j: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the state of a lane of a patch, which is pixel (i, j) of the image."""
+    at = patch * STATE + lane
+    red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
+    rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
+    if v_alpha is not None:
+        rest -= v_alpha[i, j] * (np.float32(1.0) - alpha[i, j])
+    if depth is not None and v_depth is not None:
+        rest += v_depth[i, j] * depth[i, j]
+        state[DEPTHS + patch * WIDE + lane] = v_depth[i, j]
+    state[at + PASSED] = np.float32(1.0)
+    state[at + REST] = rest
+    state[at + V_RED] = red
+    state[at + V_GREEN] = green
+    state[at + V_BLUE] = blue
+
+
+@device
+def start_tile(
+    state: NDArray[np.float32],
+    top: int,
+    left: int,
+    image: NDArray[np.float32],
+    alpha: NDArray[np.float32],
+    depth: NDArray[np.float32] | None,
+    v_image: NDArray[np.float32],
+    v_alpha: NDArray[np.float32] | None,
+    v_depth: NDArray[np.float32] | None,
+) -> None:
+    """Fills the state of a tile."""
+    width = image.shape[1]
+    high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
+    if high < TILE_HEIGHT or wide < TILE_WIDTH:
+        state[:] = np.float32(0.0)
+        for patch in range(PATCHES):
+            store(state, patch * STATE + PASSED, splat_wide(np.float32(-1.0)))
+    # Two patches side by side where all of their pixels are there, then single pixels.
+    whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
+    for y in range(0, whole_high, SIDE):
+        for x in range(0, whole_wide, LANES):
+            patch, _ = place_of(x, y)
+            pixel = (top + y) * width + left + x
+            _start_two(state, patch, pixel, image, alpha, depth, v_image, v_alpha, v_depth)
+    for y in range(high):
+        for x in range(whole_wide if y < whole_high else 0, wide):
+            patch, lane = place_of(x, y)
+            _start_pixel(
+                state, patch, lane, top + y, left + x,
+                image, alpha, depth, v_image, v_alpha, v_depth,
+            )  # fmt: skip
+
+
+@device
+def odds_of(alpha: Lanes, constants: NDArray[np.float32]) -> Lanes:
+    """Returns alpha / (1 - alpha)."""
+    return alpha / (load_wide(constants, ONE) - alpha)
+
+
+@device
+def blend(
+    alpha: Lanes,
+    odds: Lanes,
+    capped: NDArray[np.float32] | None,
+    weighted_color: Lanes,
+    state: NDArray[np.float32],
+    at: int,
+    constants: NDArray[np.float32],
+) -> tuple[Lanes, Lanes]:
+    """Blends a Gaussian into the pixels of a patch.
+
+    Args:
+        alpha: The Gaussian's opacity in the pixels, at most the largest; 0 where it is not drawn.
+        odds: alpha / (1 - alpha); negative where alpha does not depend on the parameters, since it
+            is capped.
+        capped: None says that no odds are negative.
+        weighted_color: The gradients of the pixels times the colour of the Gaussian.
+        state: State of the tile.
+        at: Where that of the patch begins.
+        constants: From `vector_constants`.
+
+    Returns:
+        The weights of the Gaussian in the pixels, and alpha times the loss' gradient by alpha: the
+        gradient by the exponent and by the logarithm of the opacity.
+    """
+    zero = splat_wide(np.float32(0.0))
+    before = load_wide(state, at + PASSED)
+    weight = alpha * before
+    after = before - weight
+    blended = after >= load_wide(constants, STOPPED)
+    store(state, at + PASSED, where(blended, after, load_wide(constants, FINISHED)))
+    weight = where(blended, weight, zero)
+    own = weight * weighted_color
+    rest = load_wide(state, at + REST) - own
+    store(state, at + REST, rest)
+    s = fnma(rest, odds, own)
+    if capped is not None:
+        blended = blended & (odds >= zero)
+    return weight, where(blended, s, zero)

@@ -1,0 +1,125 @@
+"""Where a scene folder keeps its COLMAP model."""
+
+import difflib
+import re
+from pathlib import Path
+
+from crossgrad_core.plugin import UserError
+from crossgrad_plugins.readers.colmap_files.model import count_images, has_model
+
+_PARENTS = ("sparse", "colmap/sparse")
+
+
+def find_models(scene: Path) -> list[Path]:
+    """Folders of the models of a scene: `sparse/0`, `sparse/1` ..., `sparse`, or the scene's own.
+
+    Also those in `colmap/sparse`. In the order of their numbers.
+    """
+    found = []
+    for parent in (scene / name for name in _PARENTS):
+        if parent.is_dir():
+            below = sorted((p for p in parent.iterdir() if p.is_dir()), key=_by_number)
+            found += [folder for folder in (*below, parent) if has_model(folder)]
+    return found or ([scene] if has_model(scene) else [])
+
+
+def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
+    """The model to read and a note on the others, if any.
+
+    Args:
+        scene: The scene's folder.
+        wanted: Folder of the model within the scene; None for the one with most images.
+
+    Raises:
+        UserError: There is no model, or not the wanted one.
+    """
+    if wanted is not None:
+        if has_model(scene / wanted):
+            return scene / wanted, []
+        raise UserError(
+            "the COLMAP model asked for is not there",
+            where=scene / wanted,
+            expected="cameras and images, as .bin or .txt",
+            found=", ".join(str(p.relative_to(scene)) for p in find_models(scene)) or "no model",
+            todo="name one of those that were found, or leave reader.model out",
+        )
+    models = find_models(scene)
+    if not models:
+        raise _no_model(scene)
+    counts = {model: count_images(model) for model in models}
+    best = max(models, key=lambda model: counts[model])
+    if len(models) == 1:
+        return best, []
+    others = ", ".join(f"{m.relative_to(scene)} {counts[m]}" for m in models if m != best)
+    return best, [
+        f"COLMAP: {best.relative_to(scene)} is taken, it has most images ({counts[best]}); left "
+        f"out: {others}"
+    ]
+
+
+def check_scene_folder(scene: Path) -> None:
+    """Refuses what is not a readable folder, and the model's folder in place of the scene's.
+
+    Raises:
+        UserError: The path is not there, is a file, may not be listed or lies within `sparse`.
+    """
+    try:
+        if scene.is_dir():
+            next(scene.iterdir(), None)
+            _check_not_within_sparse(scene)
+            return
+        if scene.exists():
+            raise UserError(
+                "a scene is a folder, not a file", where=scene, todo=f"try {scene.parent}"
+            )
+        near = _similar_folder(scene)
+    except OSError as error:
+        raise UserError(
+            "the scene cannot be read",
+            where=scene,
+            found=str(error),
+            todo="check the permissions of the folder",
+        ) from error
+    check = "check the path (of a run that goes on: `scene:` in its config.yaml)"
+    hint = f"did you mean {near}?" if near else check
+    raise UserError("the scene folder is not there", where=scene, todo=hint)
+
+
+def _check_not_within_sparse(scene: Path) -> None:
+    place = scene.absolute()
+    within = [parent for parent in (place, place.parent) if parent.name == "sparse"]
+    if within and not (scene / "images").is_dir():
+        raise UserError(
+            "the path leads into a scene",
+            where=scene,
+            expected="the folder that holds images/ and sparse/",
+            todo=f"try {within[0].parent}",
+        )
+
+
+def _similar_folder(scene: Path) -> Path | None:
+    parent = scene.absolute().parent
+    if not parent.is_dir():
+        return None
+    names = [path.name for path in parent.iterdir() if path.is_dir()]
+    near = difflib.get_close_matches(scene.name, names, n=1)
+    return scene.with_name(near[0]) if near else None
+
+
+def _no_model(scene: Path) -> UserError:
+    below = sorted(path.name for path in scene.iterdir())
+    return UserError(
+        "the scene has no COLMAP model, which says where each photo was taken from",
+        where=scene,
+        expected="images/ with the photos and sparse/0/ with cameras, images and points3D, as .bin "
+        "or .txt",
+        found=", ".join(below[:8]) or "an empty folder",
+        todo="name the folder that holds sparse/; of photos alone `crossgrad prepare PHOTOS SCENE` "
+        "makes a scene, and `crossgrad run PHOTOS --prepare` trains on it at once "
+        "(docs/prepare.md); docs/readers.md lists the other formats of poses",
+    )
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Sorts 10 behind 9."""
+    return [(int(part or 0), part) for part in re.split(r"\D+", path.name)]

@@ -1,0 +1,1 @@
+"""The place of a scene on Earth, and where its photos were taken."""

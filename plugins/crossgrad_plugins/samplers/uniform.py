@@ -1,0 +1,64 @@
+"""Samplers that treat all training views alike: random views, and epochs."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from pydantic import Field
+from typing_extensions import override
+
+from crossgrad_core.plugin import (
+    PluginState,
+    SampleContext,
+    Sampler,
+    Selection,
+    ViewCounts,
+    ViewSample,
+)
+from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, drawn, training_views
+
+
+class Random(Sampler):
+    """K uniform training views, independent of each other and of the steps before.
+
+    Source: the paper, `r2view`; its Proposition 2 assumes independent draws, hence the default.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 2
+    reads_groups: ClassVar[bool] = False
+
+    distinct: bool = Field(False, description="draw K different views, not K independent ones")
+
+    def unused_options(self, selection: Selection) -> Mapping[str, str]:
+        """See `HasUnusedOptions`."""
+        if selection.views_per_step > 1:
+            return {}
+        return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        order: Order = "distinct" if self.distinct else "iid"
+        pool = training_views(context)
+        views, _ = draw(pool, context.views_per_step, order, EpochOrder(), context.rng)
+        return drawn(views, context), state
+
+
+class Epoch(Sampler):
+    """Every training view once per epoch, in an order that is shuffled anew each time.
+
+    The K views of a step are different; K at most the number of training views.
+
+    Source: 3DGS pops a random element of the remaining views and refills the list when it is empty;
+    a shuffled epoch has the same distribution.
+    """
+
+    views: ClassVar[ViewCounts] = ViewCounts()
+    default_views: ClassVar[int] = 1
+    reads_groups: ClassVar[bool] = False
+
+    @override
+    def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
+        epoch_order = EpochOrder.from_json(state.values.get("deck"))
+        pool = training_views(context)
+        views, epoch_order = draw(pool, context.views_per_step, "epoch", epoch_order, context.rng)
+        return drawn(views, context), PluginState({"deck": epoch_order.to_json()})
