@@ -231,7 +231,7 @@ class RunConfig(BaseModel):
         description="decay of Adam's second moment; if it is set, rates are those of runs that "
         "show photos often",
     )
-    hurried_rates: bool | None = Field(
+    few_pass_rates: bool | None = Field(
         None, description="blocks learn at the rates for runs that show each photo a few times"
     )
     step_order: Literal["optimize-first", "densify-first"] | None = Field(

@@ -66,7 +66,7 @@ def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
     return torch.cat([middle, torch.stack([logs.mean(), inverse, z.min(), z.max()])])
 
 
-def told_apart(scale: Tensor) -> bool:
+def distinguished(scale: Tensor) -> bool:
     """Whether distances differ on a scale of `fitted_scale`."""
     return bool(scale[4] > 0)
 
@@ -170,7 +170,7 @@ class DistanceConditioned(Vanilla):
         weights = []
         for each in self._conditioned():
             base = plain[each.base]
-            rate = LearningRate(self.lr_share * base.lr.initial, hurried=base.lr.hurried)
+            rate = LearningRate(self.lr_share * base.lr.initial, few_passes=base.lr.few_passes)
             weights.append(Block(each.weights, (each.weights,), True, base.kind, rate))
         scale = Block(SCALE, (SCALE,), False, "neutral", LearningRate(0.0))
         return (*plain.values(), *weights, scale)
@@ -179,7 +179,7 @@ class DistanceConditioned(Vanilla):
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
         """Leaves conditions out where all training cameras are equally far from their mean."""
         backbone, notes = super().fitted_to(scene)
-        if told_apart(_scale_of(scene)):
+        if distinguished(_scale_of(scene)):
             return backbone, notes
         names = ("condition_scales", "condition_opacities", "condition_colors")
         free = {name: False for name in names if name not in self.model_fields_set}

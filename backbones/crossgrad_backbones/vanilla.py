@@ -71,7 +71,7 @@ class Vanilla(Backbone):
 
     def _scales_lr(self) -> LearningRate:
         # Measured by us (docs/schedules.md).
-        return LearningRate(self.lr_scales, hurried=2.0)
+        return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:
         return LearningRate(self.lr_means, self.lr_means_final)

@@ -22,7 +22,7 @@ class LearningRate:
     Attributes:
         initial: At the first step.
         final: At the end of the schedule; None: `initial`.
-        hurried: What it is multiplied by, beside all others of the backbone, in a run that shows
+        few_passes: What it is multiplied by, beside all others of the backbone, in a run that shows
             each photo a few times (docs/schedules.md); positive.
 
     Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
@@ -30,22 +30,22 @@ class LearningRate:
 
     initial: float
     final: float | None = None
-    hurried: float = 1.0
+    few_passes: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuses rates that no schedule can follow.
 
         Raises:
             ValueError: A rate is negative or not finite, or fades to 0, which no logarithm has; or
-                `hurried` is no positive number.
+                `few_passes` is no positive number.
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
         if not all(0.0 <= rate < inf for rate in rates):
             raise ValueError(f"learning rates are finite and not negative; found {rates}")
         if self.initial > 0.0 and self.final == 0.0:
             raise ValueError("a learning rate cannot fade to 0 log-linearly; name a small one")
-        if not 0.0 < self.hurried < inf:
-            raise ValueError(f"`hurried` is a positive number; found {self.hurried}")
+        if not 0.0 < self.few_passes < inf:
+            raise ValueError(f"`few_passes` is a positive number; found {self.few_passes}")
 
     @property
     def decays(self) -> bool:

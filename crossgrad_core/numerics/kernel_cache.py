@@ -44,7 +44,7 @@ _LISTENERS: list[Listener] = []
 
 
 @contextmanager
-def told_of_missing(listener: Listener) -> Iterator[None]:
+def notes_on_missing(listener: Listener) -> Iterator[None]:
     """Calls the listener before each kernel that is not on disk, and is compiled."""
     _LISTENERS.append(listener)
     try:

@@ -24,7 +24,7 @@ DECIDED: Final = (
         "resolution",
     ),
     *("schedule_unit", "growth", "max_gaussians", "min_refinements", "reset_every", "sh_start"),
-    *("position_lr", "rate_factor", "hurried_rates", "beta1", "beta2", "step_order"),
+    *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
 #: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.

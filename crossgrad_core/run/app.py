@@ -70,7 +70,7 @@ from crossgrad_core.training.loop import Stopper
 from crossgrad_core.training.per_image_params import known_starts
 from crossgrad_core.training.schedules import notes_on_length, schedule_of
 from crossgrad_core.training.setup import Setup
-from crossgrad_core.training.start import first_state, initial_bytes, told_of_start, warm_up
+from crossgrad_core.training.start import first_state, initial_bytes, start_notes, warm_up
 from crossgrad_core.training.state import NonFiniteError, TrainingFailedError, TrainState
 from crossgrad_core.training.step import check_largest_draw
 from crossgrad_core.wording import listed, one_line
@@ -247,7 +247,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     state = first_state(setup)
     if setup.config.max_gaussians == AUTO:
         setup = redecided(setup, setup.schedule.total, state.primitives(setup))
-    setup = replace(setup, notes=(*setup.notes, *told_of_start(setup, state)))
+    setup = replace(setup, notes=(*setup.notes, *start_notes(setup, state)))
     state.clock.load, state.clock.compile = load_seconds + remark_seconds, compile_seconds
     with _new_folder(setup, state) as folder:
         setup = replace(setup, config=resolved(setup))

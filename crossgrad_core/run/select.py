@@ -221,7 +221,7 @@ def _grouping_choice(
     if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
     # Labels that the sampler makes up leave a grouping nothing to do.
-    of_operator = None if sampler.own_labels else operator.usual_grouping
+    of_operator = None if sampler.own_labels else operator.resolved_grouping
     name = sampler.default_grouping or of_operator
     if name is not None:
         return _or_default(config.grouping, name)
@@ -252,7 +252,7 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
         return config.view_plan, ""
     sampler = build(Sampler, config.sampler.name, config.sampler.options)
     operator, _ = operator_of(config)
-    usual = sampler.usual_views
+    usual = sampler.resolved_views
     of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
     both = [k for k in of_sampler if operator.views.admits(k)]
     # Who names no operator expects no more than a sum of one gradient.

@@ -218,7 +218,7 @@ class SamplerRun:
             scene=self.scene,
             states={},
             rng=self.rng,
-            views_per_step=self.views_per_step or self.sampler.usual_views,
+            views_per_step=self.views_per_step or self.sampler.resolved_views,
             groups=self.groups,
             centers=np.stack(centers) if centers else np.zeros((0, 3)),
             last=self.last,

@@ -45,12 +45,12 @@ def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
     return SamplerRun(sampler, sample_scene(), groups, views, losses=losses)
 
 
-def usual_views_are_admitted(make: Make[Sampler]) -> None:
+def default_views_are_admitted(make: Make[Sampler]) -> None:
     """K where the user names none is one that the sampler has a meaning for."""
     sampler = make()
     require(
-        sampler.view_counts.admits(sampler.usual_views),
-        f"the usual K is {sampler.usual_views}, but the sampler needs {sampler.view_counts}",
+        sampler.view_counts.admits(sampler.resolved_views),
+        f"the usual K is {sampler.resolved_views}, but the sampler needs {sampler.view_counts}",
     )
 
 
@@ -154,7 +154,7 @@ def states_stay_bounded(make: Make[Sampler]) -> None:
 
 SAMPLER_CHECKS: tuple[Check[Sampler], ...] = (
     *COMPONENT_CHECKS,
-    usual_views_are_admitted,
+    default_views_are_admitted,
     draws_are_training_views,
     draws_hand_on_the_groups,
     every_view_comes,

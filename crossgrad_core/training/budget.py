@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Protocol
 
 from crossgrad_core.contract.schedule import Schedule
-from crossgrad_core.numerics.kernel_cache import told_of_missing
+from crossgrad_core.numerics.kernel_cache import notes_on_missing
 from crossgrad_core.training.growth_budget import most_after, started_with
 from crossgrad_core.training.loop import timed_step
 from crossgrad_core.training.schedules import growth_note, notes_on_length, schedule_of
@@ -177,7 +177,7 @@ def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float
         compiled = True
 
     start, count, taken = state.clock.copy(), 0, 0.0
-    with told_of_missing(begin_again):
+    with notes_on_missing(begin_again):
         while count < PROBE_STEPS or taken < PROBE_SHARE * seconds:
             state.step = step + count % PROBE_STEPS
             timed_step(setup, state)

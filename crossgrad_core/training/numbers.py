@@ -14,7 +14,7 @@ class Numbers:
     """The settings of a run that a recipe decides, each described in `RunConfig`."""
 
     rate_factor: float
-    hurried_rates: bool
+    few_pass_rates: bool
     beta1: float
     beta2: float
     position_lr: Literal["extent", "per-axis"]

@@ -60,7 +60,7 @@ def means_rate_at(setup: Setup, step: int) -> float:
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
     """A learning rate of the backbone in a step: of the schedule, times what the run asks for."""
     numbers, schedule = setup.numbers, setup.schedule
-    factor = numbers.rate_factor * (rate.hurried if numbers.hurried_rates else 1.0)
+    factor = numbers.rate_factor * (rate.few_passes if numbers.few_pass_rates else 1.0)
     factor *= rate_factor(setup, rate, step)
     if setup.config.batch_rule == "sqrt":
         factor *= sqrt(schedule.pace.at(step))

@@ -30,7 +30,7 @@ from crossgrad_core.contract.slots.loss import Loss
 from crossgrad_core.defaults import EXPORTER
 from crossgrad_core.errors import UserError
 from crossgrad_core.gradients.sparse_rows import sparse_rows
-from crossgrad_core.numerics.kernel_cache import told_of_missing
+from crossgrad_core.numerics.kernel_cache import notes_on_missing
 from crossgrad_core.registry.entries import build
 from crossgrad_core.registry.manager import make_manager
 from crossgrad_core.system.checksums import warn_if_changed
@@ -71,7 +71,7 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
         processes.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
 
     try:
-        with told_of_missing(start):
+        with notes_on_missing(start):
             yield
         for process in processes:
             # One that hangs, in a plugin's import perhaps, keeps no run from training.
@@ -263,7 +263,7 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
     return scene.with_points(np.sort(np.concatenate([np.flatnonzero(added), own])))
 
 
-def told_of_start(setup: Setup, state: TrainState) -> tuple[str, ...]:
+def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
     """What to say of a start with fewer primitives than there were, or with more than asked for."""
     kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:

@@ -60,7 +60,7 @@ def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
 
 def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
     """The grouping that the first of them needs that needs one."""
-    return next(filter(None, (each.usual_grouping for each in operators)), None)
+    return next(filter(None, (each.resolved_grouping for each in operators)), None)
 
 
 def inner_state(state: PluginState, key: str) -> PluginState:

@@ -52,7 +52,7 @@ class Chain(GramianOperator):
 
     @property
     @override
-    def usual_grouping(self) -> str | None:
+    def resolved_grouping(self) -> str | None:
         return first_grouping(self.links)
 
     @override

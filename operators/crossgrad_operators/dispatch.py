@@ -86,7 +86,7 @@ class Dispatch(GramianOperator):
 
     @property
     @override
-    def usual_grouping(self) -> str | None:
+    def resolved_grouping(self) -> str | None:
         return first_grouping(self._operators().values())
 
     @override

@@ -339,7 +339,7 @@ def test_a_plugin_of_another_slot_is_pointed_to(ran):
     assert "one among the samplers" in err
 
 
-def test_a_bad_value_is_told_without_the_words_of_a_library(ran):
+def test_a_bad_value_is_reported_without_the_words_of_a_library(ran):
     for given in (("run", "--steps", "1e3"), ("render", "x", "--split", "foo")):
         code, _, err = ran(*given)
         assert code == 2

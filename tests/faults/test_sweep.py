@@ -149,7 +149,7 @@ def undisturbed(grid, folder):
     """Id -> folder of each run of a grid, carried out by itself in this process."""
     folder.mkdir()
     found = {}
-    for job in Sweep(Request(grid, folder), looks_only=True).plan.jobs:
+    for job in Sweep(Request(grid, folder), read_only=True).plan.jobs:
         settings = folder / f"{job.id}.yaml"
         write_settings(settings, job.settings)
         found[job.id] = folder / job.id

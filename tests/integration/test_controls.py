@@ -33,7 +33,7 @@ def assembled(**settings):
     return assemble(parsed({"steps": 40, **settings}), sample_scene(), "none")
 
 
-def told_of(setup, setting):
+def messages_about(setup, setting):
     """The line of a decision, if the terminal shows it."""
     return [line for line in short_lines(setup.decisions) if line.startswith(f"{setting} ")]
 
@@ -100,7 +100,7 @@ def test_a_shorter_run_has_larger_rates(settings, factor):
     for name, own in (("opacities", 1.0), ("scales", sizes), ("f_rest", 1.0)):
         rate = own * factor * published[name].at(0)
         assert rates_at(setup, 1)[name] == pytest.approx(rate, rel=1e-9)
-    told = told_of(setup, "rate_factor")
+    told = messages_about(setup, "rate_factor")
     assert len(told) == (factor != 1.0 and "rate_factor" not in settings)
     assert all(f"rate_factor {factor:.3g}: " in line for line in told)
 
@@ -129,8 +129,8 @@ PASSES = 360
         ({"steps": 2_000, "beta2": 0.999}, 0),
     ],
 )
-def test_harmonics_come_when_half_of_a_short_run_in_a_hurry_is_over(settings, wait, monkeypatch):
-    monkeypatch.setattr(auto, "HURRY", 10_000)
+def test_harmonics_come_when_half_of_a_short_run_of_few_passes_is_over(settings, wait, monkeypatch):
+    monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(**settings)
     schedule = setup.schedule
     assert schedule.sh_wait == pytest.approx(wait, abs=1)
@@ -156,7 +156,7 @@ def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
 
 @pytest.mark.parametrize("settings", [{"backbone": {"name": "scaffold"}}, {"sh_from": 3}])
 def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
-    monkeypatch.setattr(auto, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(sh_start=0.5, steps=2_000, **settings)
     with pytest.raises(UserError, match="sh_start"):
         refuse_settings_for_nothing(setup.config, setup)
@@ -194,11 +194,11 @@ def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, be
     assert len(setup.train_views) == 9
     first = 0.9 if {"recipe", "schedule"} & settings.keys() else 0.7
     assert all(rule_at(setup, step) == AdamRule((first, beta2)) for step in (1, length // views))
-    told = told_of(setup, "beta2")
+    told = messages_about(setup, "beta2")
     assert len(told) == (beta2 == 0.98)
     assert all("fewer than 40 views of each photo" in line for line in told)
     own = beta2 == 0.98 and "rate_factor" not in settings
-    assert len(told_of(setup, "hurried_rates")) == own
+    assert len(messages_about(setup, "few_pass_rates")) == own
     plain = setup.numbers.rate_factor * 5e-3
     assert rates_at(setup, 1)["scales"] == pytest.approx((2.0 if own else 1.0) * plain, rel=1e-9)
 
@@ -230,7 +230,7 @@ def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, be
     setup = assembled(**{"views": 1, **settings})
     for step in (1, 5):
         assert rule_at(setup, step).betas[0] == pytest.approx(beta1, abs=1e-4)
-    told = told_of(setup, "beta1")
+    told = messages_about(setup, "beta1")
     ours = "beta1" not in settings and "batch_rule" not in settings and beta1 < 0.9
     assert len(told) == ours
     assert all(f"beta1 {beta1:.3g}: " in each and "=0.9)" in each for each in told)
@@ -241,7 +241,7 @@ def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, be
 def test_under_the_batch_rule_the_second_moment_averages_over_as_many_steps(
     steps, views, monkeypatch
 ):
-    monkeypatch.setattr(auto, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(steps=steps, views=views, batch_rule="sqrt")
     first, second = rule_at(setup, 1).betas
     if steps * views < 30_000:
@@ -264,7 +264,7 @@ def test_the_rule_that_a_run_was_planned_with_stays_when_the_clock_changes_it(
 
 
 def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(monkeypatch):
-    monkeypatch.setattr(auto, "HURRY", 10_000)
+    monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     for steps, memory in ((2_000, 50), (5_000, 100), (29_999, 599.98), (30_000, 1_000)):
         setup = assembled(steps=steps)
         assert rule_at(setup, 1).betas[1] == pytest.approx(1 - 1 / memory, abs=1e-12)
@@ -279,9 +279,9 @@ def test_where_the_clock_decides_the_rates_follow_its_plan():
     planned = redecided(setup, 3_750)
     published, now = (rates_at(each, 1)["opacities"] for each in (setup, planned))
     assert now == pytest.approx(EIGHTH * published)
-    assert told_of(planned, "rate_factor")
+    assert messages_about(planned, "rate_factor")
     own = redecided(assembled(steps=None, seconds=60.0, rate_factor=2.0), 3_750)
-    assert own.numbers.rate_factor == 2.0 and not told_of(own, "rate_factor")
+    assert own.numbers.rate_factor == 2.0 and not messages_about(own, "rate_factor")
 
 
 def test_a_first_step_goes_as_much_farther():

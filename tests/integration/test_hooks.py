@@ -265,7 +265,7 @@ def test_without_an_exposure_nothing_is_kept_per_photo(scene, tmp_path):
     assert "photos" not in load(latest(tmp_path / "run")).plugins
 
 
-def test_training_seconds_are_told_by_phase(scene, tmp_path):
+def test_training_seconds_are_reported_by_phase(scene, tmp_path):
     assert resumed(scene, tmp_path / "run", **ALTOGETHER) == 0
     seconds = json.loads((tmp_path / "run" / "summary.json").read_text())["seconds"]
     assert list(seconds["phases"]) == list(PHASES)

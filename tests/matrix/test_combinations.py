@@ -54,7 +54,7 @@ def setup(row):
     return setup_of(config_of(row))
 
 
-def usual_densifier(backbone):
+def default_densifier_of(backbone):
     return load("backbones", backbone).default_densifier
 
 
@@ -119,7 +119,7 @@ def test_every_two_components_repeat(row):
 def test_density_control_acts_within_these_few_steps(densifier):
     rows = [row for row in DESIGN if row[SLOTS.index("densifier")] == densifier]
     # On its own backbone where there is one: others may leave it nothing to do in five steps.
-    own = [row for row in rows if usual_densifier(row[SLOTS.index("backbone")]) == densifier]
+    own = [row for row in rows if default_densifier_of(row[SLOTS.index("backbone")]) == densifier]
     row = [*own, *rows][0]
     records = train(setup(row), STEPS).records
     edits = [key for record in records for key, count in record.counts.items() if count]

@@ -46,7 +46,7 @@ class Operator(Component):
             cls.sparse_rows = False
 
     @property
-    def usual_grouping(self) -> str | None:
+    def resolved_grouping(self) -> str | None:
         """The grouping it needs with its options as they are, where the user names none."""
         return self.default_grouping
 

@@ -37,7 +37,7 @@ class Sampler(Component):
         return self.views
 
     @property
-    def usual_views(self) -> int:
+    def resolved_views(self) -> int:
         """K where the user names none."""
         return self.default_views
 

@@ -248,13 +248,13 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
 def gradvac(question: Question) -> Vector:
     """GradVac with the operator's random order and remembered targets."""
     rows = [
-        _vaccinated(question, i, partners)
+        _aligned(question, i, partners)
         for i, partners in enumerate(partners_of(question, shuffled=True))
     ]
     return column_sums(rows)
 
 
-def _vaccinated(question: Question, i: int, partners: Sequence[int]) -> Vector:
+def _aligned(question: Question, i: int, partners: Sequence[int]) -> Vector:
     mp, beta, limit = require_mpmath().mp, number(question.options["beta"]), number("0.999")
     norms = lengths(question.gramian)
     row = _Combination(question.gramian, norms, i)

@@ -116,14 +116,14 @@ class Facts:
         return total / max(self.length / unit, 1.0)
 
 
-def usual_bound(facts: Facts) -> float:
+def default_bound(facts: Facts) -> float:
     """Eight, or where the weighted sum alone may lose more, that and two for the weights."""
     return max(PROMISED, facts.partial + 2.0)
 
 
 def pairwise_bound(facts: Facts) -> float:
     """Twice that in float64, where the Gramians of pairs are as coarse as the gradients."""
-    return usual_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
+    return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
 def views_bound(facts: Facts) -> float:
@@ -187,7 +187,7 @@ class Promise:
     factor_words: str
     factor: Callable[[int], float]
     inside: Callable[[Facts], bool] = determined
-    bound: Callable[[Facts], float] = usual_bound
+    bound: Callable[[Facts], float] = default_bound
     continuous: Callable[[Facts], bool] = everywhere
 
 

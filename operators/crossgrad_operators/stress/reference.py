@@ -116,7 +116,7 @@ class Views:
     seed: int
 
 
-def usual_views(count: int, seed: int = 0) -> Views:
+def sample_views(count: int, seed: int = 0) -> Views:
     """Near and far views in turn, at distances around the reference."""
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(0.5 + 0.25 * k for k in range(count)), seed)

@@ -20,7 +20,7 @@ from crossgrad_core.plugin import (
 from crossgrad_operators.stress.cases import Case
 from crossgrad_operators.stress.oracles import Oracle
 from crossgrad_operators.stress.promises import ALL, Promise
-from crossgrad_operators.stress.reference import Answer, Views, answer, usual_views
+from crossgrad_operators.stress.reference import Answer, Views, answer, sample_views
 from crossgrad_operators.stress.solvers import UnprovenError
 from crossgrad_operators.stress.verdict import ElementRule, ExactCase, Finding, judge
 
@@ -75,7 +75,7 @@ def run_case(name: str, operator: Operator, exact: ExactCase, reference: Referen
         return Cell(name, case.name, Finding("refused"))
     finding, times = judged(operator, exact, reference)
     if times and case.size <= REPEATED:
-        times += [timed(operator, case, usual_views(case.views))[2] for _ in range(3)]
+        times += [timed(operator, case, sample_views(case.views))[2] for _ in range(3)]
     return Cell(name, case.name, finding, 1e6 * min(times, default=float("nan")))
 
 
@@ -83,7 +83,7 @@ def judged(
     operator: Operator,
     exact: ExactCase,
     reference: Reference,
-    views_of: Callable[[int, int], Views] = usual_views,
+    views_of: Callable[[int, int], Views] = sample_views,
 ) -> tuple[Finding, list[float]]:
     """The worst finding of the steps of an operator, and their seconds; none if it failed.
 

@@ -16,7 +16,7 @@ from crossgrad_core.plugin import EMPTY_STATE, Block, LearningRate, MatrixOperat
 from crossgrad_operators.stress.cases import Case, short
 from crossgrad_operators.stress.exact import DIGITS, require_mpmath
 from crossgrad_operators.stress.promises import PROMISED, Promise, promise_of
-from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chained, usual_views
+from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chained, sample_views
 from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
 from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 
@@ -41,7 +41,7 @@ def _rows(views: int) -> Case:
 
 
 def _result(operator: Operator, case: Case, views: Views | None = None) -> Tensor:
-    gradient, _, _ = timed(operator, case, views or usual_views(case.views))
+    gradient, _, _ = timed(operator, case, views or sample_views(case.views))
     if gradient is None:
         raise RuntimeError("no gradient where all views have one")
     return gradient.double()
@@ -74,7 +74,7 @@ def permutation(operator: Operator) -> float | None:
     """The order of two views, with their labels and distances, does not matter."""
     if not operator.views.admits(2):
         return None
-    case, views = _rows(2), usual_views(2)
+    case, views = _rows(2), sample_views(2)
     turned = replace(case, head=case.head[::-1].copy())
     turned_views = Views(views.labels[::-1], views.ratios[::-1], views.seed)
     found = _result(operator, turned, turned_views)
@@ -110,7 +110,7 @@ def block_independence(operator: Operator) -> float | None:
     if not isinstance(operator, MatrixOperator):
         return None
     for views in _counts(operator):
-        case, circumstances = _rows(views), usual_views(views)
+        case, circumstances = _rows(views), sample_views(views)
         other = Block("scales", ("scales",), False, "geometry", LearningRate(1.0))
         gradients = [{"means": g, "scales": _reversed(g)} for g in case.gradients()]
         context = context_of(gradients, (other, BLOCK), circumstances)

@@ -162,7 +162,7 @@ def _names(
         return {key: _of_one(runs[0]) for key, runs in groups.items()}
     chosen: list[int] = []
     for index in range(len(keys)):
-        if _told_apart(groups, [*chosen, index]) > _told_apart(groups, chosen):
+        if _distinguished(groups, [*chosen, index]) > _distinguished(groups, chosen):
             chosen.append(index)
     return {key: _name(keys, key, chosen) for key in groups}
 
@@ -173,7 +173,7 @@ def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -
     return ", ".join(_part(keys[index], values[index]) for index in known or chosen)
 
 
-def _told_apart(groups: Iterable[tuple[str, ...]], chosen: Sequence[int]) -> int:
+def _distinguished(groups: Iterable[tuple[str, ...]], chosen: Sequence[int]) -> int:
     return len({tuple(key[index] for index in chosen) for key in groups})
 
 

@@ -69,9 +69,9 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     stops, by = _filled(np.array([found.get(name, np.nan) for name in names]), scene.train_views)
     stops -= stops.mean()
     messages = [] if tracks is None else [f"exposure: {tracks.evidence}"]
-    messages += _told_by("EXIF", [name for name in of_exif if name not in of_tracks])
+    messages += _reported_by("EXIF", [name for name in of_exif if name not in of_tracks])
     if start != "none":
-        messages += _told_by(f"{by}, for want of usable tracks and EXIF", rest)
+        messages += _reported_by(f"{by}, for want of usable tracks and EXIF", rest)
     messages += outliers(names, stops)
     if scene.test_views and neighbours_of(scene).tell(stops[:, None]):
         near, regime = neighbours_of(scene).errors(stops[:, None])
@@ -112,7 +112,7 @@ def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[
     return filled, of_regime
 
 
-def _told_by(source: str, names: Sequence[str]) -> Iterable[str]:
+def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
     if names:
         yield f"exposure: {len(names)} photos start from {source} ({_some(names)})"
 

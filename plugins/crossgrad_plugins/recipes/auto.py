@@ -23,22 +23,22 @@ MANY_PHOTOS: Final = 100
 SHORTNESS: Final = 0.45
 #: The largest factor, which runs of some 1,000 steps have.
 MOST: Final = 4.5
-#: A run that shows each training photo fewer times than this, in the mean, is hurried: it ends long
-#: before it overfits.
-HURRY: Final = 40
-#: Power and largest factor of the rates of hurried runs.
-HURRIED_SHORTNESS, HURRIED_MOST = 0.65, 6.3
-#: Adam's second moment averages over this share of the steps of a hurried run, and over this many
-#: steps at least. Gradients of the first steps are much larger than later ones, and hold later
-#: steps back for the 1,000 steps of the published average.
+#: A run that renders each training photo fewer times than this, on average, has few passes: it
+#: ends long before it overfits.
+FEW_PASSES: Final = 40
+#: Power and largest factor of the rates of runs with few passes.
+FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
+#: In a run with few passes, Adam's second moment averages over this share of the steps, and over
+#: this many steps at least. The first gradients are much larger than later ones, and with the
+#: published average they would slow down the next 1,000 steps.
 MEMORY, LEAST_MEMORY = 1 / 50, 50
 #: Decay of the first moment in short runs, which averages over 3 steps instead of 10.
 SHORT_BETA1: Final = 0.7
 #: Largest standard deviation, as a share of the distance to the nearest camera at whose side a
 #: Gaussian is.
 SCALE_RATIO: Final = 0.5
-#: Share of a hurried short run before SH bands above the first are drawn: until then they cost time
-#: and gain little.
+#: Share of a short run with few passes before SH bands above the first are rendered: until then
+#: they cost time and gain little.
 SH_START: Final = 0.5
 #: The highest SH degree.
 MOST_DEGREES: Final = 3
@@ -89,26 +89,26 @@ class Choice:
         return bool(backbone.axes) and backbone.response == "plain"
 
     @cached_property
-    def hurried(self) -> bool:
+    def few_passes(self) -> bool:
         """Whether the run shows each training photo only a few times."""
         views = self.facts.views
         if views is None or "beta2" in self.given:
             return False
-        return views < min(REFERENCE, HURRY * self.facts.photos)
+        return views < min(REFERENCE, FEW_PASSES * self.facts.photos)
 
     @cached_property
     def densifier_name(self) -> str:
         """Name of the densifier."""
         named = self.given.get("densifier")
-        return self._usual_densifier if named is None else str(named.name)
+        return self._default_densifier if named is None else str(named.name)
 
     @cached_property
-    def _usual_densifier(self) -> str:
+    def _default_densifier(self) -> str:
         facts = self.facts
         usual = facts.backbone.default_densifier
         suits = usual == DENSIFIER and self.is_plain and facts.photos >= MANY_PHOTOS
         here = suits and facts.short and facts.device == "cpu"
-        if not here or self.usual_growth(budgeted=True) == "unbounded":
+        if not here or self.default_growth(budgeted=True) == "unbounded":
             return usual
         needs = facts.densifier(SHORT_DENSIFIER).needs
         return SHORT_DENSIFIER if needs <= facts.provides else usual
@@ -118,7 +118,7 @@ class Choice:
         """The densifier."""
         return self.facts.densifier(self.densifier_name)
 
-    def usual_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
+    def default_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
         """How primitives grow in a run of any length, as was set or as suits the densifier."""
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
@@ -136,7 +136,7 @@ class Choice:
     @cached_property
     def growth(self) -> Literal["unbounded", "budget"]:
         """How primitives grow in this run: there is no budget at the published length."""
-        usual = self.usual_growth(budgeted=self.densifier.budgeted)
+        usual = self.default_growth(budgeted=self.densifier.budgeted)
         return usual if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
@@ -151,7 +151,7 @@ def components(choice: Choice) -> list[Decision]:
     usual = facts.backbone.default_densifier
     swapped = name != usual
     budgeted = choice.densifier.budgeted
-    led = not choice.densifier.edits or choice.usual_growth(budgeted=budgeted) == "budget"
+    led = not choice.densifier.edits or choice.default_growth(budgeted=budgeted) == "budget"
     first = led and choice.is_plain and facts.device == "cpu" and facts.short
     start = INITIALIZER if facts.own_points else POINTS_ONLY
     return [
@@ -202,7 +202,7 @@ def growth(choice: Choice) -> list[Decision]:
     """Return the rows of density control."""
     facts, led = choice.facts, choice.led
     schedule = facts.schedule(facts.unit)
-    usual = choice.usual_growth(budgeted=choice.densifier.budgeted)
+    usual = choice.default_growth(budgeted=choice.densifier.budgeted)
     long = (
         facts.unit == "views" and not facts.published and choice.length >= SHORTEST_RUN_WITH_EDITS
     )
@@ -246,7 +246,7 @@ def _budget(choice: Choice) -> Decision:
         return Decision("max_gaussians", 0, "growth is unbounded", SCHEDULES)
     most: int | str = "auto"
     if facts.start is not None:
-        most = budget.budget(facts.start, choice.length, facts.pixels, hurried=choice.hurried)
+        most = budget.budget(facts.start, choice.length, facts.pixels, few_passes=choice.few_passes)
     return Decision(
         "max_gaussians",
         most,
@@ -259,12 +259,12 @@ def _budget(choice: Choice) -> Decision:
 def rates(choice: Choice) -> list[Decision]:
     """Return the rows of learning rates and of Adam."""
     if choice.facts.steps is None:
-        values = {"rate_factor": 1.0, "hurried_rates": False, "beta1": BETA1, "beta2": BETA2}
+        values = {"rate_factor": 1.0, "few_pass_rates": False, "beta1": BETA1, "beta2": BETA2}
         return [Decision(name, value, UNKNOWN, SCHEDULES) for name, value in values.items()]
-    factor, hurried = _rate_factor(choice), choice.hurried
-    own = hurried and "rate_factor" not in choice.given
+    factor, few_passes = _rate_factor(choice), choice.few_passes
+    own = few_passes and "rate_factor" not in choice.given
     beta1, beta2 = _beta1(choice), _beta2(choice)
-    few = f"fewer than {HURRY} views of each photo"
+    few = f"fewer than {FEW_PASSES} views of each photo"
     return [
         Decision(
             "rate_factor",
@@ -274,11 +274,11 @@ def rates(choice: Choice) -> list[Decision]:
             "--rate-factor 1" if factor != 1.0 else "",
         ),
         Decision(
-            "hurried_rates",
+            "few_pass_rates",
             own,
             few if own else "one factor for all blocks",
             SCHEDULES,
-            "--set hurried_rates=false" if own else "",
+            "--set few_pass_rates=false" if own else "",
         ),
         Decision(
             "beta1",
@@ -290,7 +290,7 @@ def rates(choice: Choice) -> list[Decision]:
         Decision(
             "beta2",
             beta2,
-            few if hurried else "as published",
+            few if few_passes else "as published",
             SCHEDULES,
             f"--set beta2={BETA2}" if f"{beta2:.3g}" != f"{BETA2:.3g}" else "",
         ),
@@ -303,7 +303,9 @@ def _rate_factor(choice: Choice) -> float:
     steps = facts.total if facts.mode == "scaled" else schedule.step_of(schedule.length)
     if schedule.pace.views(steps) >= REFERENCE:
         return 1.0
-    power, most = (HURRIED_SHORTNESS, HURRIED_MOST) if choice.hurried else (SHORTNESS, MOST)
+    power, most = (
+        (FEW_PASSES_SHORTNESS, FEW_PASSES_MOST) if choice.few_passes else (SHORTNESS, MOST)
+    )
     return min(max(1.0, float((REFERENCE / steps) ** power)), most)
 
 
@@ -317,7 +319,7 @@ def _beta1(choice: Choice) -> float:
 
 def _beta2(choice: Choice) -> float:
     facts = choice.facts
-    if not choice.hurried or facts.steps is None or facts.views is None:
+    if not choice.few_passes or facts.steps is None or facts.views is None:
         return BETA2
     memory = max(LEAST_MEMORY, MEMORY * facts.steps)
     if facts.batched:
@@ -363,7 +365,7 @@ def steps(choice: Choice) -> list[Decision]:
 def _sh_start(choice: Choice) -> float:
     """Return the share of the run before the SH degree grows, as a whole number of views."""
     facts = choice.facts
-    if not choice.hurried or facts.unit != "views" or facts.published:
+    if not choice.few_passes or facts.unit != "views" or facts.published:
         return 0.0
     schedule = facts.schedule(facts.unit)
     # Another schedule than the run's own may be longer than the run.

@@ -20,7 +20,7 @@ VALUES: Final[Mapping[str, Any]] = {
     "sh_start": 0.0,
     "position_lr": "extent",
     "rate_factor": 1.0,
-    "hurried_rates": False,
+    "few_pass_rates": False,
     "beta1": 0.9,
     "beta2": 0.999,
     "step_order": "densify-first",

@@ -50,7 +50,7 @@ class NearFar(Sampler):
 
     @property
     @override
-    def usual_views(self) -> int:
+    def resolved_views(self) -> int:
         return 1 if self.alternating else self.default_views
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:

@@ -101,19 +101,19 @@ class Sweep:
 
     Args:
         request: What the user asked for.
-        looks_only: Whether nothing is going to be run.
+        read_only: Whether nothing is going to be run.
 
     Raises:
         UserError: The grid is bad, this machine is too small, or another sweep is under way in the
             folder.
     """
 
-    def __init__(self, request: Request, *, looks_only: bool = False) -> None:
+    def __init__(self, request: Request, *, read_only: bool = False) -> None:
         self.request = request
         check_options(request.engine, (key for key, _ in request.options))
         grid = _grid(request)
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
-        if not looks_only:  # Before the work of planning; the lock itself comes after it.
+        if not read_only:  # Before the work of planning; the lock itself comes after it.
             _refuse_a_second(self.layout.out)
             _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)

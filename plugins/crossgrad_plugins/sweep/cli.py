@@ -91,8 +91,8 @@ def sweep(given: Options) -> None:
         raise UserError(
             f"{' and '.join(asked)} do not go together", todo="leave all but one of them out"
         )
-    looks_only = bool(asked)
-    announce(quiet=looks_only)
+    read_only = bool(asked)
+    announce(quiet=read_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
     from crossgrad_plugins.sweep.engines import ENGINES
 
@@ -116,7 +116,7 @@ def sweep(given: Options) -> None:
             engine=given.engine,
             options=[_option(each) for each in given.engine_option or ()],
         ),
-        looks_only=looks_only,
+        read_only=read_only,
     )
     if given.list_runs:
         raise typer.Exit(found.tell())

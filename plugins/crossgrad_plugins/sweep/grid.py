@@ -106,7 +106,7 @@ class Metric(_Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _usual_goal(cls, given: object) -> object:
+    def _default_goal(cls, given: object) -> object:
         if isinstance(given, Mapping) and str(given.get("name")).startswith("lpips"):
             return {"goal": "minimize", **given}
         return given

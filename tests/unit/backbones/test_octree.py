@@ -246,7 +246,7 @@ def test_a_tensor_of_the_run_says_all_that_decoding_needs():
 
 
 @pytest.mark.parametrize("backbone", [Octree(), Scaffold()])
-def test_no_visible_gaussian_to_start_from_is_told(backbone):
+def test_no_visible_gaussian_to_start_from_is_reported(backbone):
     scene = sample_scene()
     faint = Vanilla().bake(
         Vanilla().create(scene, np.random.default_rng(0)), EVALUATION, [sample_camera()]
@@ -268,7 +268,7 @@ def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_roun
             assemble(RunConfig.model_validate(config), sample_scene(), "none")
 
 
-def test_what_is_left_out_is_told():
+def test_what_is_left_out_is_reported():
     assert "plant_everywhere=true" in Octree().fitted_to(sample_scene())[1][0]
     assert Octree(plant_everywhere=True).fitted_to(sample_scene())[1] == ()
 

@@ -72,7 +72,7 @@ def test_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
     assert len(found.runs) == 1 and list(found.left_out) == ["2"]
 
 
-def test_a_missing_scene_file_is_told(tmp_path):
+def test_a_missing_scene_file_is_reported(tmp_path):
     for number in (1, 2):
         folder = RunFolder(views_per_step=number).write(tmp_path / str(number))
     assert not any("scene.json" in note for note in comparison(tmp_path).notes)

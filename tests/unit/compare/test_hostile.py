@@ -219,7 +219,7 @@ def test_a_figure_that_one_run_did_not_measure_is_not_compared(tmp_path):
     assert len(found.arms) == 2
 
 
-def test_figures_of_views_that_are_gone_are_told(folder):
+def test_figures_of_views_that_are_gone_are_reported(folder):
     (folder / "1-1" / "per_view.csv").unlink()
     with pytest.raises(UserError) as error:
         read_runs([folder], skip_broken=False)

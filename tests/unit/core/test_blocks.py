@@ -12,9 +12,9 @@ def test_rates_are_finite_and_not_negative(rates):
 
 
 @pytest.mark.parametrize("factor", [0.0, -2.0, float("nan"), float("inf")])
-def test_a_rate_in_a_hurry_is_a_positive_part_of_itself(factor):
-    with pytest.raises(ValueError, match="`hurried` is a positive number"):
-        LearningRate(1e-3, hurried=factor)
+def test_a_rate_of_few_passes_is_a_positive_part_of_itself(factor):
+    with pytest.raises(ValueError, match="`few_passes` is a positive number"):
+        LearningRate(1e-3, few_passes=factor)
 
 
 def test_no_rate_fades_to_nothing():

@@ -220,7 +220,7 @@ def test_a_broken_plugin_breaks_only_runs_that_ask_for_it(good):
     assert registry.build("groupings", "good", {})
 
 
-def test_an_error_of_many_lines_is_told_in_one(install):
+def test_an_error_of_many_lines_is_reported_in_one(install):
     source = 'raise RuntimeError("first\\n  second")'
     install("made-up", {"observers": {"noisy": "made_up_noisy:A"}}, {"made_up_noisy": source})
     assert refusal("observers", "noisy").found == "RuntimeError: first second"

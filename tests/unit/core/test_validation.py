@@ -55,7 +55,7 @@ def test_words_of_a_validator_are_kept():
     assert error.found == "'red' (str)"
 
 
-def test_a_value_that_is_no_group_of_settings_is_told_with_its_type():
+def test_a_value_that_is_no_group_of_settings_is_reported_with_its_type():
     error = explained(Outer, {"inner": 3})
     assert error.where == "inner"
     assert error.found == "3 (int)"
@@ -79,7 +79,7 @@ class Unions(BaseModel):
     inner: Inner | None = None
 
 
-def test_a_value_that_fits_no_branch_of_a_union_is_told_once_with_what_each_would_take():
+def test_a_value_that_fits_no_branch_of_a_union_is_reported_once_with_what_each_would_take():
     error = explained(Unions, {"count": 0})
     assert error.where == "count"
     assert error.what == "option count of a run is not valid"
@@ -87,7 +87,7 @@ def test_a_value_that_fits_no_branch_of_a_union_is_told_once_with_what_each_woul
     assert error.todo == "read the help"
 
 
-def test_a_place_inside_a_branch_is_told_without_the_branch():
+def test_a_place_inside_a_branch_is_reported_without_the_branch():
     error = explained(Unions, {"up": (0, "x", 0), "count": "many"})
     assert error.where == "count"
     assert error.todo == "also wrong: up, up.1; read the help"

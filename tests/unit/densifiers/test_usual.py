@@ -71,17 +71,17 @@ def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
         assert setup.selection.names["densifier"] == expected
 
 
-def usual_of(**settings):
+def default_of(**settings):
     return table_of(configured(settings), sample_scene())["densifier"].value
 
 
 @pytest.mark.parametrize("name", ["auto", "numba"])
 def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, monkeypatch):
     given = {"steps": 2000, "rasterizer": {"name": name}}
-    assert usual_of(**given) == "absgrad"
+    assert default_of(**given) == "absgrad"
     numba = load(Rasterizer, "numba")
     monkeypatch.setattr(numba, "provides", numba.provides - {"abs_gradient"})
-    assert usual_of(**given) == "adc"
+    assert default_of(**given) == "adc"
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
     assert (setup.selection.names["rasterizer"], setup.selection.names["densifier"]) == (
         "numba",
@@ -90,4 +90,4 @@ def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, 
 
 
 def test_a_gpu_has_the_published_one_also_where_there_is_none():
-    assert usual_of(steps=2000, device="cuda") == "adc"
+    assert default_of(steps=2000, device="cuda") == "adc"

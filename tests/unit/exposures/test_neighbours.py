@@ -108,7 +108,7 @@ def test_photos_that_nothing_tells_of_start_as_their_neighbours(monkeypatch):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
-def test_photos_of_one_place_and_one_direction_are_told_by_finite_numbers(count):
+def test_photos_of_one_place_and_one_direction_are_reported_by_finite_numbers(count):
     views = [posed_view((0, 0, 0), f"{n}.png") for n in range(count)]
     scene = posed_scene([*views, posed_view((0, 0, 0), "held out.png")], test=(count,))
     stops = torch.linspace(-1, 1, count)

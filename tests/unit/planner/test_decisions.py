@@ -244,7 +244,7 @@ def test_pairs_bring_two_views():
 
 
 @pytest.mark.parametrize("name", ["backward", "batch_rule", "densify_views"])
-def test_the_views_of_pairs_are_told_whatever_else_was_set(name):
+def test_the_views_of_pairs_are_reported_whatever_else_was_set(name):
     value = {"backward": "joint", "batch_rule": "sqrt", "densify_views": "one"}[name]
     evidence = evidence_of("city_hybrid", PAIRS_PAY, **{name: value})
     assert grouping.views_per_step(evidence).choice == "2"

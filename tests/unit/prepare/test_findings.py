@@ -44,7 +44,7 @@ def test_a_ramp_is_asked_for_between_the_heights_of_two_models():
     assert bridge.heights == (5.0, 40.0)
 
 
-def test_without_heights_it_is_told_in_ratios():
+def test_without_heights_it_is_reported_in_ratios():
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), {})
     assert "between aerial and street" in bridge.advice
     assert bridge.heights is None
@@ -62,7 +62,7 @@ def test_one_bridge_leads_to_all_pieces_of_a_folder():
     assert bridge.photos == 3
 
 
-def test_a_folder_that_falls_apart_is_told_so():
+def test_a_folder_that_falls_apart_is_reported_so():
     pieces = [frozenset(AERIAL[:2]), frozenset(AERIAL[2:])]
     (bridge,) = bridges_of(plan_of(*map(photo, AERIAL)), [], pieces, {})
     assert "aerial: the photos fall apart" in bridge.advice
@@ -121,7 +121,7 @@ def test_reasons_why_a_photo_is_lost(changed, features, links, why):
     assert why in lost.why
 
 
-def test_a_photo_of_another_model_is_told_so():
+def test_a_photo_of_another_model_is_reported_so():
     counts = dict.fromkeys(AERIAL + STREET, 1000)
     lost = lost_photos(PLAN, counts, [], list(zip(MODELS, [True, False], strict=True)), {})
     assert [each.name for each in lost] == STREET
@@ -129,7 +129,7 @@ def test_a_photo_of_another_model_is_told_so():
     assert not lost_photos(PLAN, counts, [], list(zip(MODELS, [True, True], strict=True)), {})
 
 
-def test_a_photo_that_was_taken_out_is_told_by_what():
+def test_a_photo_that_was_taken_out_is_reported_by_what():
     counts = dict.fromkeys(AERIAL + STREET, 1000)
     models = [(frozenset(AERIAL + STREET[1:]), True)]
     (lost,) = lost_photos(PLAN, counts, [], models, {STREET[0]: (40, 310)})

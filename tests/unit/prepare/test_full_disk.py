@@ -82,7 +82,7 @@ def plan_of(model, root, **changed):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_models_that_are_cut_short_or_incomplete_are_told(model, name, tmp_path):
+def test_models_that_are_cut_short_or_incomplete_are_reported(model, name, tmp_path):
     folder = written(model, tmp_path / "0")
     assert is_whole(folder)
     size = (folder / name).stat().st_size

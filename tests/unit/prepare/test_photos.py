@@ -133,7 +133,7 @@ def test_a_folder_of_masks_that_is_named_has_to_be_there(tmp_path):
         found(tmp_path, masks=str(tmp_path / "gone"))
 
 
-def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_told(tmp_path):
+def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_reported(tmp_path):
     """Most files of `a/masks` are named after photos; `b/masks` holds photos of carnival masks."""
     shot = ("a/1.jpg", "a/2.jpg", "b/1.jpg", "b/masks/7.jpg", "b/masks/8.jpg", "c/3.jpg")
     drawn = ("c/masks/3.png", "a/masks/1.jpg.png", "a/masks/2.png", "a/masks/gone.png")
@@ -153,7 +153,7 @@ def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_told(tmp_path)
     }
 
 
-def test_masks_of_no_photo_are_told(tmp_path):
+def test_masks_of_no_photo_are_reported(tmp_path):
     for name in (
         "1.jpg",
         "2.jpg",

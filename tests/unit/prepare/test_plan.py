@@ -61,7 +61,7 @@ def test_the_same_photos_in_another_folder_are_gone_on_with(layout):
         ),
     ],
 )
-def test_what_differs_is_told_with_the_way_out(photos, settings, told, layout):
+def test_what_differs_is_reported_with_the_way_out(photos, settings, told, layout):
     first = agreed(layout, plan(*BEGUN))
     with pytest.raises(UserError, match="begun otherwise") as caught:
         agreed(layout, plan(*photos, **settings))

@@ -163,7 +163,7 @@ def parameters_after(path, reader):
         scene=path,
         steps=STEPS,
         # Steps by size are up to five times as long, and so is what rounding makes of them, those
-        # of sizes in a hurry twice; a first moment of few steps averages less of it.
+        # of sizes in runs with few passes twice; a first moment of few steps averages less of it.
         backbone={"name": "vanilla", "lr_scales": 0.0025},
         position_lr="extent",
         beta1=0.9,

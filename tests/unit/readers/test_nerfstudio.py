@@ -222,7 +222,7 @@ def test_an_applied_transform_is_undone(tmp_path):
     np.testing.assert_allclose(placed[1], original, atol=1e-8)
 
 
-def test_a_crop_that_is_left_out_is_told(tmp_path):
+def test_a_crop_that_is_left_out_is_reported(tmp_path):
     path = write(tmp_path, camera_model="OPENCV_FISHEYE", fisheye_crop_radius=10, **LENS)
     assert "fisheye_crop_radius is left out" in "\n".join(read(path).notes)
 

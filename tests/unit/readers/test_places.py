@@ -140,7 +140,7 @@ def without(*keys):
         (lambda tags: tags_of(ORIGIN), "all at one place"),
     ],
 )
-def test_what_is_missing_is_told(scene, change, why):
+def test_what_is_missing_is_reported(scene, change, why):
     found = read(edited(scene, dict.fromkeys(range(10), change)))
     assert isinstance(found.georeference, Unplaced)
     notes = [note for note in found.notes if note.startswith("not georeferenced")]
@@ -482,7 +482,7 @@ def test_a_list_of_other_suffixes_and_case_is_of_these_photos(scene):
     assert "geo.txt, 10 of 10" in read(scene).georeference.note
 
 
-def test_a_list_of_other_photos_is_told(scene):
+def test_a_list_of_other_photos_is_reported(scene):
     (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
     found = read(scene)
     assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note

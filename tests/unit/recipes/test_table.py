@@ -48,7 +48,7 @@ def test_a_run_is_repeated_bit_for_bit_after_the_constants_of_the_recipe_changed
     finished, tmp_path, monkeypatch
 ):
     changed = {name for name, value in vars(auto).items() if type(value) in {int, float}}
-    assert {"SHORTNESS", "HURRY", "LR_TAIL", "SCALE_RATIO"} <= changed
+    assert {"SHORTNESS", "FEW_PASSES", "LR_TAIL", "SCALE_RATIO"} <= changed
     # A half of this one is no decay that Adam accepts.
     monkeypatch.setattr(auto, "BETA2", 0.95)
     for name in changed - {"REFERENCE", "BETA2"}:

@@ -55,7 +55,7 @@ def test_results_are_never_overwritten(tmp_path: Path):
         create_run_folder(NAME, out=tmp_path)
 
 
-def test_who_writes_into_the_folder_is_told(tmp_path: Path):
+def test_who_writes_into_the_folder_is_reported(tmp_path: Path):
     (tmp_path / "metrics.csv").write_text("precious")
     with (
         locked(tmp_path, "training"),

@@ -90,7 +90,7 @@ class FullDisk(io.FileIO):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_is_told_once(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_once(tmp_path, monkeypatch):
     def opened(descriptor, mode, buffering=-1):
         file = FullDisk(descriptor, mode)
         return file if buffering == 0 else io.BufferedRandom(file)

@@ -14,7 +14,7 @@ def rows_of(*figures):
     ]
 
 
-def test_what_was_better_is_told_with_its_step_and_time():
+def test_what_was_better_is_reported_with_its_step_and_time():
     (line,) = overdone(rows_of(18.0, 19.07, 18.12))
     assert line.startswith("the last evaluation is 0.95 dB below that of step 200, 19.07 dB after ")
     assert "25 s of training" in line and "--max-views" in line

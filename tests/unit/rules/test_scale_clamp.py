@@ -131,7 +131,7 @@ def test_nothing_is_too_long():
         assert torch.equal(scales, torch.full_like(scales, size))
 
 
-def test_a_run_within_seconds_is_told_once_its_length_is_planned(tmp_path, capsys):
+def test_a_run_within_seconds_is_reported_once_its_length_is_planned(tmp_path, capsys):
     command = ("run", "--seconds", 1, "--max-size", 48, "--threads", 1, "--out", tmp_path / "run")
     assert ended(*command) == 0
     assert (

@@ -50,12 +50,12 @@ def test_other_numbers_of_views_are_refused_with_the_reason(name):
 @pytest.mark.parametrize("name", ADMITTED)
 def test_the_usual_number_of_views_is_admitted(name):
     sampler = build("samplers", name, {})
-    assert sampler.view_counts.admits(sampler.usual_views)
+    assert sampler.view_counts.admits(sampler.resolved_views)
 
 
 def test_alternating_takes_one_view_only():
     sampler = NearFar(alternating=True)
-    assert sampler.usual_views == 1
+    assert sampler.resolved_views == 1
     assert not objections(sampler, "near-far", 1)
     assert objections(sampler, "near-far", 2)
 

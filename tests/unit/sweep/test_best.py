@@ -127,7 +127,7 @@ def test_a_file_that_is_there_is_kept(tmp_path):
     path.write_text(f"scenes: [{scene}]\nbase: {{steps: 9}}\n")
     best.write_text("mine")
     with pytest.raises(UserError, match="the file is there already"):
-        Sweep(Request(path, out=tmp_path / "out"), looks_only=True).write_best(best)
+        Sweep(Request(path, out=tmp_path / "out"), read_only=True).write_best(best)
     assert best.read_text() == "mine"
 
 

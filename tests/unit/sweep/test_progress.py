@@ -116,7 +116,7 @@ def test_the_table_has_means_over_seeds_and_marks_the_best():
     assert list(table(jobs, found, Metric(goal="minimize")))[1].endswith("*")
 
 
-def test_a_metric_that_no_run_has_is_told_with_those_they_have():
+def test_a_metric_that_no_run_has_is_reported_with_those_they_have():
     jobs, overall = JOBS[:2], {"psnr": 20.0, "lpips": None, "ssim": 0.5}
     found = [Standing(job, "finished", summary={"overall": overall}) for job in jobs]
     told = list(table(jobs, found, Metric(name="psnr_street")))[-1]

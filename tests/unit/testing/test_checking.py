@@ -102,7 +102,7 @@ def test_a_densifier_is_tried_on_a_backbone_of_crossgrad(installed):
         assert type(backbone).__module__.startswith("crossgrad_backbones")
 
 
-def test_a_misspelt_default_densifier_is_told(installed):
+def test_a_misspelt_default_densifier_is_reported(installed):
     installed(BACKBONE, backbones={"aaa": "made_up_check:Misspelt"})
     assert list(failures("backbones", "aaa")) == ["the default densifier is there"]
     assert "'adx'" in failures("backbones", "aaa")["the default densifier is there"]

@@ -914,7 +914,7 @@ DEFECTS = [
     (operators.scales_with_the_gradients, AbsoluteThreshold),
     (operators.what_it_reads_is_declared, FarViewsCountTwice),
     (operators.what_it_reads_is_declared, SaysItReadsNoGramians),
-    (samplers.usual_views_are_admitted, UsualViewsRefused),
+    (samplers.default_views_are_admitted, UsualViewsRefused),
     (samplers.draws_are_training_views, OneViewTooFew),
     (samplers.draws_are_training_views, NumpyPositions),
     (samplers.draws_are_training_views, BeyondTheEnd),

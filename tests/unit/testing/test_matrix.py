@@ -8,7 +8,7 @@ import pytest
 from crossgrad_core.commands import UserError
 from crossgrad_core.registry.entries import load
 from crossgrad_plugins.authoring.matrix import report
-from crossgrad_plugins.authoring.matrix.combinations import usual_row
+from crossgrad_plugins.authoring.matrix.combinations import default_row
 from crossgrad_plugins.authoring.matrix.members import Members, members_of
 
 NAMES = {
@@ -76,10 +76,10 @@ def test_a_package_that_is_not_installed_names_those_that_are():
 def test_a_usual_row_has_the_densifier_of_its_backbone():
     slots = tuple(NAMES)
     assert (
-        usual_row({"backbone": "scaffold"}, slots)[3]
+        default_row({"backbone": "scaffold"}, slots)[3]
         == load("backbones", "scaffold").default_densifier
     )
-    assert usual_row({"densifier": "none"}, slots)[3] == "none"
+    assert default_row({"densifier": "none"}, slots)[3] == "none"
 
 
 def run_pytest(folder, *arguments):

@@ -32,7 +32,7 @@ from crossgrad_core.training.growth_budget import curve
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.schedules import growth_note
 from crossgrad_core.training.state import Clock
-from crossgrad_plugins.recipes.budget import budget as usual_budget
+from crossgrad_plugins.recipes.budget import budget as default_budget
 
 
 class Hook:
@@ -170,7 +170,7 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
     run, crowd = along_the_curve(1000, 30_000)
     camera = run.train_views[0].camera
     empty = camera.width * camera.height / 8.0
-    budget = usual_budget(30_000, 2000)
+    budget = default_budget(30_000, 2000)
     ends = [*run.schedule.edit_steps(), 1000]
     edits = run.schedule.edits()
     assert edits == len(ends) - 1 > 5
@@ -297,7 +297,7 @@ def test_notes_that_the_clock_overtakes_are_withdrawn():
 
 
 @pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
-def test_the_user_is_told_once_that_density_control_takes_place_after_all(length):
+def test_the_user_is_reported_once_that_density_control_takes_place_after_all(length):
     run, state = noted(setup(steps=935)), reached(0)
     while state.step < run.schedule.total:
         state.step += 1
@@ -309,13 +309,13 @@ def test_the_user_is_told_once_that_density_control_takes_place_after_all(length
     assert text.startswith("density control after all: in ") and "from step 500 to step" in text
 
 
-def test_the_user_is_told_where_density_control_is_left_out_later():
+def test_the_user_is_reported_where_density_control_is_left_out_later():
     run = noted(setup(steps=3000))
     Planned(((20, 900),)).revised(run, reached(20))
     assert run.hook.texts == list(growth_note(setup(steps=900)))
 
 
-def test_the_user_is_told_of_no_step_behind_the_end():
+def test_the_user_is_reported_of_no_step_behind_the_end():
     run = noted(setup(steps=550, mode="absolute"))
     Planned(((20, 700),)).revised(run, reached(20))
     assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")

@@ -73,7 +73,7 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
     return said
 
 
-def test_the_default_length_is_told_in_hours_once_with_a_way_out():
+def test_the_default_length_is_reported_in_hours_once_with_a_way_out():
     ((step, text),) = texts(0.1, 30_000, wait=60.0)  # a slow first step is not taken for the rest
     hours = (30_000 - step) * 0.1 * (1.0 + COST_PER_EDIT * COUNTED_EDITS) / 3600
     assert 1.6 < hours < 1.7

@@ -23,10 +23,10 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.training import growth_budget
 from crossgrad_core.training.growth_budget import curve
 from crossgrad_core.training.loop import timed_step
-from crossgrad_core.training.start import first_state, thinned, told_of_start
+from crossgrad_core.training.start import first_state, start_notes, thinned
 from crossgrad_plugins.recipes import auto
 from crossgrad_plugins.recipes import budget as budgets
-from crossgrad_plugins.recipes.budget import budget as usual_budget
+from crossgrad_plugins.recipes.budget import budget as default_budget
 
 #: Densifiers that want more than any curve gives them, and their backbones.
 GREEDY = {
@@ -183,16 +183,16 @@ def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
     about = 0 if name not in BACKBONES else 3
     assert found[0] == pytest.approx(2 * bound / 3, abs=0.5 + about)
     assert found[-1] == bound == max(found)
-    (told,) = told_of_start(setup, first_state(setup))
+    (told,) = start_notes(setup, first_state(setup))
     assert f"{found[0]:,} primitives instead of {whole:,}" in told
     for enough in (whole, whole + 1, "auto", None):
         state = first_state(setup := setup_of(name, max_gaussians=enough))
-        assert state.primitives(setup) == whole and told_of_start(setup, state) == ()
+        assert state.primitives(setup) == whole and start_notes(setup, state) == ()
 
 
-def test_a_start_that_is_taken_as_it_is_is_told_where_it_is_above_the_bound():
+def test_a_start_that_is_taken_as_it_is_is_reported_where_it_is_above_the_bound():
     state = first_state(setup_of("adc"))
-    (told,) = told_of_start(setup_of("adc", max_gaussians=30), state)
+    (told,) = start_notes(setup_of("adc", max_gaussians=30), state)
     assert "more than --max-gaussians 30: a PLY is taken as it is" in told
 
 
@@ -271,32 +271,44 @@ def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
 
 
 def test_budgets_by_length():
-    assert [usual_budget(20_000, length) for length in (1, 300, 1_000)] == [30_001, 30_303, 31_034]
-    assert usual_budget(20_000, 10_000) == 150_000
+    assert [default_budget(20_000, length) for length in (1, 300, 1_000)] == [
+        30_001,
+        30_303,
+        31_034,
+    ]
+    assert default_budget(20_000, 10_000) == 150_000
     starts = (0, 5_000, 7_000, 15_000, 16_000, 30_000, 31_000)
-    budgets = [usual_budget(start, 0) for start in starts]
+    budgets = [default_budget(start, 0) for start in starts]
     assert budgets == [10_000, 10_000, 14_000, 30_000, 30_000, 30_000, 31_000]
-    assert usual_budget(90_000, 1_000) == 93_103
-    assert usual_budget(90_000, 10_000) == 450_000
+    assert default_budget(90_000, 1_000) == 93_103
+    assert default_budget(90_000, 10_000) == 450_000
     # Towards the published length, which has no bound, the budget stays a number of Gaussians.
-    assert usual_budget(20_000, 27_000) < usual_budget(20_000, 29_999) < 2_000_000
-    assert usual_budget(20_000, 30_000) == 0
+    assert default_budget(20_000, 27_000) < default_budget(20_000, 29_999) < 2_000_000
+    assert default_budget(20_000, 30_000) == 0
     # Photos of up to 400 x 300 pixels have the same; a scene with few points has no time for more.
-    assert usual_budget(90_000, 1_000, 119_000) == usual_budget(90_000, 1_000, 120_000) == 93_103
-    assert usual_budget(90_000, 1_000, 480_000) == pytest.approx(90_000 * 30 / 29 * 4**0.4, abs=1)
-    assert usual_budget(20_000, 1_000, 480_000) == pytest.approx(30_000 * 30 / 29 * 4**0.4, abs=1)
-    assert usual_budget(14_000, 1_000, 480_000) == usual_budget(14_000, 1_000)
+    assert (
+        default_budget(90_000, 1_000, 119_000) == default_budget(90_000, 1_000, 120_000) == 93_103
+    )
+    assert default_budget(90_000, 1_000, 480_000) == pytest.approx(90_000 * 30 / 29 * 4**0.4, abs=1)
+    assert default_budget(20_000, 1_000, 480_000) == pytest.approx(30_000 * 30 / 29 * 4**0.4, abs=1)
+    assert default_budget(14_000, 1_000, 480_000) == default_budget(14_000, 1_000)
     # In longer runs less, by the logarithm of the length.
-    finer = [usual_budget(90_000, n, 480_000) / usual_budget(90_000, n) for n in (9_487, 29_999)]
+    finer = [
+        default_budget(90_000, n, 480_000) / default_budget(90_000, n) for n in (9_487, 29_999)
+    ]
     assert finer == [pytest.approx(4**0.2, rel=1e-4), pytest.approx(1.0, rel=1e-4)]
-    # And more in a hurry, where large photos count as those that were measured.
-    hurried = [usual_budget(90_000, 1_000, n, hurried=True) for n in (119_000, 240_000, 480_000)]
-    assert hurried == pytest.approx([n * 90_000 * 30 / 29 for n in (1, 2**0.9, 4**0.9)], abs=1)
-    twelve = [usual_budget(90_000, 1_000, 12_000_000, hurried=each) for each in (False, True)]
+    # And more in runs with few passes, where large photos count as those that were measured.
+    few_passes = [
+        default_budget(90_000, 1_000, n, few_passes=True) for n in (119_000, 240_000, 480_000)
+    ]
+    assert few_passes == pytest.approx([n * 90_000 * 30 / 29 for n in (1, 2**0.9, 4**0.9)], abs=1)
+    twelve = [default_budget(90_000, 1_000, 12_000_000, few_passes=each) for each in (False, True)]
     assert twelve[1] == pytest.approx(twelve[0] * 2, abs=2)
     lengths = range(1_000, 27_001, 500)
-    for hurried in (False, True):
-        budgets = [usual_budget(30_000, length, 480_000, hurried=hurried) for length in lengths]
+    for few_passes in (False, True):
+        budgets = [
+            default_budget(30_000, length, 480_000, few_passes=few_passes) for length in lengths
+        ]
         assert budgets == sorted(set(budgets))
 
 
@@ -305,10 +317,10 @@ def test_a_run_that_shows_photos_a_few_times_has_more_of_large_ones(settings, mo
     monkeypatch.setattr(budgets, "SHORT_BUDGET", 50)
     setup = setup_of("adc", growth="budget", max_gaussians="auto", **settings)
     monkeypatch.setattr(budgets, "PIXELS", setup.scene.train_pixels / 4)
-    monkeypatch.setattr(budgets, "HURRIED_PIXELS", setup.scene.train_pixels)
+    monkeypatch.setattr(budgets, "FEW_PASSES_PIXELS", setup.scene.train_pixels)
     monkeypatch.setattr(budgets, "FINER", 0.0)
     assert growth_budget.most_after(setup, setup.schedule, 10, 0) == 50 * more
-    monkeypatch.setattr(auto, "HURRY", 0)
+    monkeypatch.setattr(auto, "FEW_PASSES", 0)
     assert growth_budget.most_after(setup, setup.schedule, 10, 0) == 50
 
 

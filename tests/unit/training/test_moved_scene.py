@@ -18,8 +18,8 @@ from crossgrad_core.training.start import first_state
 STEPS, RUNS = 30, 24
 TIMES = {"schedule_unit": "steps", "densify_from": 10, "densify_every": 10, "densify_until": 25}
 #: How a run steps -> how far apart in PSNR perturbed runs may end. A step by size is up to five
-#: times as long, and so is a difference of the last bit, one of sizes in a hurry twice; a first
-#: moment of few steps averages less.
+#: times as long, and so is a difference of the last bit. In runs with few passes sizes learn at
+#: twice the rate, and the first moment averages over fewer steps.
 WAYS = {"extent": 0.01, "per-axis": 0.03, "as by default": 0.05}
 SETTINGS = {
     **{

@@ -15,7 +15,7 @@ COUNTS = (
     "matrices",
     "outside",
     "usual",
-    "usual_outside",
+    "ordinary_outside",
     "unproven",
     "not_finite",
     "broken",
@@ -65,7 +65,7 @@ def failed(tally: WorstCases) -> bool:
 
 
 def _too_often_outside(tally: WorstCases) -> bool:
-    return tally.usual >= ENOUGH and tally.usual_share > SHARE
+    return tally.usual >= ENOUGH and tally.ordinary_share > SHARE
 
 
 def _line(tally: WorstCases) -> str:
@@ -75,7 +75,7 @@ def _line(tally: WorstCases) -> str:
     outside = tally.outside / tally.matrices
     return (
         f"{tally.operator:<16}{tally.precision:<9}{tally.matrices:>9}{outside:>9.2%}"
-        f"{tally.usual_share:>8.2%}{error:>10}{ratio:>10}{jump:>10}{tally.not_finite:>9}"
+        f"{tally.ordinary_share:>8.2%}{error:>10}{ratio:>10}{jump:>10}{tally.not_finite:>9}"
         f"{tally.unproven:>9}{tally.broken:>8}"
     )
 
@@ -102,7 +102,8 @@ def _failures(tallies: Sequence[WorstCases]) -> str:
         for specimen, reason in tally.failures
     ]
     lines += [
-        f"{tally.operator}, {tally.precision}: {tally.usual_share:.2%} of usual gradients outside"
+        f"{tally.operator}, {tally.precision}: {tally.ordinary_share:.2%} of ordinary gradients "
+        "outside"
         for tally in tallies
         if _too_often_outside(tally)
     ]

@@ -31,7 +31,7 @@ class WorstCases:
         matrices: Cases that were run.
         outside: Of these, cases outside the operator's set.
         usual: Cases of the family that shares are stated for.
-        usual_outside: Of these, cases outside the set.
+        ordinary_outside: Of these, cases outside the set.
         unproven: Cases without a proven reference.
         not_finite: Cases with a result that is not finite.
         broken: Cases that break a promise.
@@ -46,7 +46,7 @@ class WorstCases:
     matrices: int = 0
     outside: int = 0
     usual: int = 0
-    usual_outside: int = 0
+    ordinary_outside: int = 0
     unproven: int = 0
     not_finite: int = 0
     broken: int = 0
@@ -67,9 +67,9 @@ class WorstCases:
         return str(self.dtype).removeprefix("torch.")
 
     @property
-    def usual_share(self) -> float:
+    def ordinary_share(self) -> float:
         """Share of usual cases outside the set."""
-        return self.usual_outside / max(self.usual, 1)
+        return self.ordinary_outside / max(self.usual, 1)
 
     def add(self, batch: Batch, findings: Sequence[Finding], turn: int) -> None:
         """Counts a batch and keeps its worst cases."""
@@ -78,7 +78,7 @@ class WorstCases:
         self.outside += outside
         if batch.family == USUAL:
             self.usual += len(findings)
-            self.usual_outside += outside
+            self.ordinary_outside += outside
         errors = [severity(finding, inside=True) for finding in findings]
         self.inside_pool = _worst(self.inside_pool, batch, errors, turn)
         ratios = [severity(finding, inside=False) for finding in findings]

@@ -62,7 +62,7 @@ def every_row(names: Mapping[str, Iterable[str]]) -> tuple[Row, ...]:
     return tuple(product(*(sorted(names[slot]) for slot in SLOTS)))
 
 
-def usual_row(given: Mapping[str, str], slots: Sequence[str]) -> Row:
+def default_row(given: Mapping[str, str], slots: Sequence[str]) -> Row:
     """A combination with what a run takes by default in the slots that are not given."""
     backbone = given.get("backbone", _default("backbone"))
     usual = {"densifier": load_component(Backbone, backbone).default_densifier, **given}

@@ -11,9 +11,9 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     SLOTS,
     Factors,
     Row,
+    default_row,
     every_row,
     meetings,
-    usual_row,
 )
 
 #: Whether a combination of these slots can work.
@@ -132,7 +132,7 @@ def _few_of(
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]
 
     def usual(given: Mapping[int, str]) -> Row:
-        return usual_row({slots[place]: name for place, name in given.items()}, slots)
+        return default_row({slots[place]: name for place, name in given.items()}, slots)
 
     known: set[Row] = set()
     for place, name in ours:

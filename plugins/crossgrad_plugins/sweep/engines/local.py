@@ -14,14 +14,14 @@ OPTIONS: Final = ()
 
 def carry_out(work: Work) -> Iterator[None]:
     """Carries out runs, each in a process of its own that is pinned to its worker's cores."""
-    crew = _Crew(work)
+    crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
         yield
         sleep(PAUSE)
 
 
-class _Crew:
+class _WorkerPool:
     """The workers of this machine.
 
     Args:

@@ -27,7 +27,7 @@ def carry_out(work: Work) -> Iterator[None]:
     """Carries out runs as tasks; Ray repeats those of a machine that it has lost."""
     ray = _connected(work)
     try:
-        crew = _Crew(work, ray)
+        crew = _WorkerPool(work, ray)
         while crew.is_busy():
             crew.look()
             yield
@@ -35,7 +35,7 @@ def carry_out(work: Work) -> Iterator[None]:
         ray.shutdown()
 
 
-class _Crew:
+class _WorkerPool:
     """The tasks of a sweep.
 
     Args:

@@ -32,7 +32,7 @@ _MOST: Final = 256
 
 def carry_out(work: Work) -> Iterator[None]:
     """Carries out runs as jobs; one that Slurm preempts goes on when it is started again."""
-    crew = _Crew(work)
+    crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
         yield
@@ -87,7 +87,7 @@ class Task:
         return submitit.helpers.DelayedSubmission(self)
 
 
-class _Crew:
+class _WorkerPool:
     """The jobs of a sweep.
 
     Args:
