@@ -266,7 +266,7 @@ class RunConfig(BaseModel):
     )
     rules: Annotated[
         dict[str, dict[str, Any] | Literal[False]],
-        Flag("NAME", TRAINING, "rule", common=True),
+        Flag("NAME", TRAINING, "rule"),
         Flag("NAME", TRAINING, "no_rule"),
     ] = Field(
         {},

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from crossgrad_core.config import AUTO, ComponentChoice, RunConfig
 from crossgrad_core.contract.component import answered
@@ -11,6 +11,7 @@ from crossgrad_core.contract.decision import Decision
 from crossgrad_core.contract.slots.recipe import Facts, Recipe
 from crossgrad_core.errors import UserError
 from crossgrad_core.registry.entries import build, entries
+from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.wording import listed, plural
 
@@ -87,11 +88,16 @@ def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
     return tuple(table.values())
 
 
-def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
+def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> RunConfig:
     """Return the configuration with decided values and their reasons.
 
+    Args:
+        config: The configuration.
+        rows: The decisions.
+        planner: Name of the planner that made the rows; empty if the recipe made them.
+
     Raises:
-        UserError: A recipe names a setting that does not exist, or gives it a wrong value.
+        UserError: A row names a setting that does not exist, or gives it a wrong value.
     """
     update: dict[str, Any] = {RULES: {}, **config.model_dump(exclude_unset=True)}
     for row in sorted(rows, key=lambda row: "." in row.setting):
@@ -100,7 +106,7 @@ def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
         if name == RULES:
             update[name] = {**update[name], option: row.value}
         elif option:
-            update[name] = {"name": AUTO, **(held or {}), option: row.value}
+            update[name] = {**_settings_of(config, name), **(held or {}), option: row.value}
         elif isinstance(held, dict) and isinstance(row.value, str):
             update[name] = {**held, "name": row.value}
         else:
@@ -109,14 +115,20 @@ def applied(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
     try:
         return RunConfig.model_validate(update)
     except ValidationError as error:
-        subject = f"recipe {config.recipe.name}"
-        todo = "repair the plugin, or choose another --recipe"
+        subject = f"planner {planner}" if planner else f"recipe {config.recipe.name}"
+        todo = "repair the plugin, or choose another --recipe (--plan off leaves out the planner)"
         raise as_user_error(error, RunConfig, subject=subject, todo=todo) from error
+
+
+def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
+    """Return what an option is added to: a group of settings, or a component with its options."""
+    value = getattr(config, name, None)
+    return value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else {"name": AUTO}
 
 
 def _long_form(name: str, value: object) -> object:
     """Return the name of a component as a choice of it."""
-    component = name in {"densifier", "initializer", "exposure", "resolution", "grouping"}
+    component = plural(name) in GROUPS
     return {"name": value} if component and isinstance(value, str) else value
 
 
@@ -140,7 +152,9 @@ def without_decided(settings: dict[str, Any]) -> None:
 
 def rows_of(config: RunConfig) -> tuple[Decision, ...]:
     """Return the decisions that a configuration has written down; their evidence is not."""
-    return tuple(Decision(name, _value(config, name), why) for name, why in config.decided.items())
+    values = ((name, _value(config, name), why) for name, why in config.decided.items())
+    # The bound on the views of a run within seconds has become a number of steps.
+    return tuple(Decision(*row) for row in values if row[1] is not None)
 
 
 def _value(config: RunConfig, setting: str) -> object:
@@ -148,7 +162,9 @@ def _value(config: RunConfig, setting: str) -> object:
     value = getattr(config, name)
     if isinstance(value, ComponentChoice):
         return value.options.get(option) if option else value.name
-    return value[option] if name == RULES else value
+    if name == RULES:
+        return value[option]
+    return getattr(value, option) if option else value
 
 
 def short_lines(rows: Iterable[Decision]) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
-from typing import Any, TypeAlias, cast
+from typing import TypeAlias, cast
 
 from crossgrad_core.config import ComponentChoice, RunConfig
 from crossgrad_core.contract.decision import Decide, Decision, Length, repeats
@@ -25,7 +25,6 @@ from crossgrad_core.registry.slots import PLANNERS
 from crossgrad_core.run.devices import with_device
 from crossgrad_core.run.rasterizers import Wanted, choose_rasterizer
 from crossgrad_core.run.select import chosen, fitted_backbone, rules_of, views_per_step_of
-from crossgrad_core.run.settings import layered, parsed
 from crossgrad_core.scene.shown_points import photos_per_point
 from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
@@ -99,7 +98,7 @@ def with_decisions(
         _LOG.info("looking at what the scene needs")
         planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
         of_scene = tuple(planner(config, scene))
-        config = _planned(config, of_scene)
+        config = applied(config, of_scene, PLANNER)
     facts = facts_of(config, scene)
     rows = decide(config, facts)
 
@@ -107,16 +106,6 @@ def with_decisions(
         return decide(config, replace(facts, **vars(length)))
 
     return applied(config, rows), (*of_scene, *rows), again
-
-
-def _planned(config: RunConfig, rows: Sequence[Decision]) -> RunConfig:
-    """Return the configuration with the settings that the scene decides, and their reasons."""
-    settings: dict[str, Any] = {row.setting: row.value for row in rows}
-    if "max_views" in settings and config.seconds is not None:
-        # A layer with a length replaces the lengths of the layers before.
-        settings["seconds"] = config.seconds
-    planned = parsed(layered([config.model_dump(exclude_unset=True), settings]))
-    return planned.model_copy(update={"decided": {row.setting: row.because for row in rows}})
 
 
 def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[str, Decision]:

@@ -122,7 +122,9 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),
-        f"{module}.py": re.sub(rf"\b{model}\b", member, source),
+        f"{module}.py": re.sub(rf"\b{model}\b", member, source).replace(
+            f'"{example.stem}"', f'"{name}"'
+        ),
         f"tests/test_{module}.py": _TEST.format(**words),
     }
 

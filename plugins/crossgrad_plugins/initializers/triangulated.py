@@ -110,8 +110,8 @@ class Triangulated(Initializer):
                 where=scene.name,
                 expected=f"at least {_FEWEST} points that two photos show",
                 found=f"{len(kept)} in {len(pairs)} pairs of photos",
-                todo="check that poses and photos belong together, or start from random points "
-                "(--init random)",
+                todo="check that poses and photos belong together, or start from the points of a "
+                "file (--points FILE) or from random points (--init random)",
             )
         unknown = np.full(len(kept), np.nan)
         colors = [features[pairs[p][0]].colors[met[p].first[m]] for p, m in kept]

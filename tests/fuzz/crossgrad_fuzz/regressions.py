@@ -7,6 +7,7 @@ import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
 
+from crossgrad_core.run.checkpoint import digest
 from crossgrad_fuzz.case import Case
 from crossgrad_fuzz.targets import TARGETS
 
@@ -59,15 +60,16 @@ def _twice(seeds: Sequence[Case]) -> Case:
 
 
 def _state_without(*keys: str) -> Change:
-    """A state of before there was a digest, which lacks something."""
+    """Return a change that removes a value from the state, whose digest is made right again."""
 
     def change(seeds: Sequence[Case]) -> Case:
-        state = json.loads(seeds[2][_STATE])
+        state = json.loads(seeds[0][_STATE])
         inner = state
         for key in keys[:-1]:
             inner = inner[key]
         del inner[keys[-1]]
-        return {**seeds[2], _STATE: json.dumps(state).encode()}
+        state["state_sha256"] = digest(state)
+        return {**seeds[0], _STATE: json.dumps(state).encode()}
 
     return change
 

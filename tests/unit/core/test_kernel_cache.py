@@ -195,7 +195,7 @@ def test_every_kernel_of_ours_is_keyed_by_the_files_that_it_inlines():
     from crossgrad_plugins.losses.photometric.numba_kernels import fused
 
     names = {path.name for path in kernel_cache._sources(Path(fused.__file__))}
-    assert {"fused.py", "terms.py", "windows.py", "simd.py", "reference.py"} <= names
+    assert {"fused.py", "terms.py", "simd.py", "reference.py"} <= names
 
 
 def test_results_are_arrays_as_numba_makes_them(package):

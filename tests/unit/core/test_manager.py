@@ -179,7 +179,7 @@ def test_a_hook_gives_its_answer(answer):
 )
 def test_a_hook_that_is_not_answered_is_an_error(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
-    with pytest.raises(UserError, match="a hook must answer") as caught:
+    with pytest.raises(UserError, match="a first-result hook must answer") as caught:
         call_first_result(hook, None, DensifyResult)
     assert caught.value.where == "plugins densifier"
     assert "NO_EDIT" in caught.value.todo

@@ -54,7 +54,7 @@ def few_are_many(monkeypatch):
 @pytest.mark.parametrize("case", USUAL)
 def test_where_pixels_pull_is_asked_in_short_runs_of_plain_gaussians(case):
     settings, expected = USUAL[case]
-    given = {"steps": 2000, **settings}
+    given = {"steps": 2000, "plan": "off", **settings}
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
     assert setup.selection.names["densifier"] == expected
     told = [row for row in setup.decisions if row.setting == "densifier" and row.override]

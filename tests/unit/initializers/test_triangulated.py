@@ -59,7 +59,7 @@ def test_a_scene_with_points_starts_from_those(scene):
 
 
 def test_without_points_the_start_or_the_user_has_to_give_some(bare):
-    config = RunConfig(scene="somewhere", steps=2, threads=1)
+    config = RunConfig(scene="somewhere", steps=2, threads=1, plan="off")
     with pytest.raises(UserError, match="no SfM points") as caught:
         assemble(config, bare, "colmap")
     assert "--initializer triangulated" in caught.value.todo
