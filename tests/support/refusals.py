@@ -41,8 +41,9 @@ def from_lines(lines, rows):
     patterns = {}
     for line in lines:
         named, reason = line.split(": ", 1)
-        slots, names = zip(*(part.split("=", 1) for part in named.split()), strict=True)
-        places = tuple(map(SLOTS.index, slots))
+        parts = [part.split("=", 1) for part in named.split()]
+        places = tuple(SLOTS.index(slot) for slot, _ in parts)
+        names = tuple(name for _, name in parts)
         patterns.setdefault(places, {}).setdefault(names, []).append(reason)
     found = {}
     for row in rows:
