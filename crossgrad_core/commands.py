@@ -371,7 +371,7 @@ def available_memory() -> int | None:
 
 
 def summary_of(folder: Path) -> dict[str, Any] | None:
-    """Return the content of a run's summary.json; None if the run has not ended or it is damaged.
+    """Return the content of a run's summary.json; None if missing or damaged.
 
     Imports no torch.
     """

@@ -28,7 +28,7 @@ def outlast_readers() -> None:
 
 
 class _LastingFile(io.FileIO):
-    """A file that accepts all content, whether or not it can be written."""
+    """A file that accepts all content, even if the content cannot be written."""
 
     @override
     def write(self, content: "Buffer", /) -> int:

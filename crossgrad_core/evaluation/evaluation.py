@@ -1,4 +1,4 @@
-"""Evaluation of held-out views: every metric of each view, and means overall and per regime; PSNR.
+"""Evaluation of held-out views: metrics of each view, means overall and per regime, and PSNR.
 
 Both images are clamped to [0, 1] and rounded to 8 bits per channel before the comparison, as if the
 render had been written to a file and read back. Masked pixels do not count. Metrics are means over

@@ -139,7 +139,7 @@ class Outcome:
 
     Attributes:
         folder: The folder of its results.
-        ending: How it ended.
+        ending: Its status and, after a failure, the reason.
         signal: Number of the signal that stopped the run; None if there was no signal.
     """
 
@@ -215,7 +215,7 @@ def _end(outcome: "Outcome", way: "Way") -> int:
 
 @dataclass(frozen=True)
 class Way:
-    """How a run reports to the user.
+    """The way in which a run reports to the user.
 
     Attributes:
         verbosity: -1 quiet, 0 normal, 1 verbose.

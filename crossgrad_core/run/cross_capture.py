@@ -23,8 +23,8 @@ SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
 #: cameras, enlarged by this factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of two captures of one place are on the same surfaces. Their median distance from the
-#: run's points is at most this share of the median after each of so many random rotations about
-#: the middle of the capture.
+#: run's points is at most this share of the median after any of `TURNS` random rotations about the
+#: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
 #: Numbers of points for this test: at least, at most of the other capture, at most of the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
@@ -149,7 +149,10 @@ def _check_place(
 
 
 def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Return True if `points` are near the run's points, and would not be after a rotation."""
+    """Return True if `points` are near the run's points, and would not be after a rotation.
+
+    Return True also if there are too few points to tell.
+    """
     from scipy.spatial import cKDTree
 
     # Points outside the run's points do not count: the other capture may show more of the place.

@@ -80,7 +80,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
 def with_decisions(
     config: RunConfig, scene: Scene
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
-    """Return the configuration with all settings decided, the table, and a function to redo it.
+    """Return the decided configuration, the table, and a function that makes the table again.
 
     With `--plan auto`, the planner's rows about the scene come first. The recipe treats them as
     settings of the user.

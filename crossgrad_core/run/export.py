@@ -147,7 +147,7 @@ def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> f
 
 
 def view_named(setup: Setup, name: str, where: str = "--camera") -> View:
-    """Return the view of this name; `where` says where the user gave the name.
+    """Return the view of this name; `where` names its option in the error message.
 
     Raises:
         UserError: There is no such view.

@@ -75,7 +75,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended.
+    """The ending of a run.
 
     Attributes:
         status: `finished`, `stopped` (resumable) or `failed`.
@@ -155,7 +155,7 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    keeper.copy(state)  # No rollback goes behind the step of a new length.
+                    keeper.copy(state)  # No rollback before the step of a new length.
                 if revised.config is not self.setup.config:  # A planned length is written already.
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
@@ -308,7 +308,7 @@ WORTH_A_LINE = 60.0
 
 
 class Forecast:
-    """A length that also logs once how long the rest of the run will take.
+    """A wrapper of a length that logs once how long the rest of the run will take.
 
     Args:
         length: The length that decides about the end of the run.

@@ -147,7 +147,7 @@ class Session:
         self._saved_step = self._evaluated_step = -1
 
     def renew(self, setup: Setup, step: int) -> None:
-        """Drop the row of `step`, whose state has changed, and allow that it is saved again."""
+        """Drop the row of `step`, whose state has changed, so that it can be saved again."""
         if self.has_row(step):
             self._table = MetricsCsv.resume(self.folder, columns_of(setup), step - 1)
         self._saved_step = self._evaluated_step = -1
@@ -239,7 +239,7 @@ def columns_of(setup: Setup) -> tuple[str, ...]:
 
 
 def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
-    """Return the number of held-out views overall and per regime; evaluated views only if known."""
+    """Return the number of held-out views overall and per regime; of measured views if known."""
     if result is not None:
         regimes = {regime: means.views for regime, means in result.regimes.items()}
         return {"overall": result.overall.views, **regimes}

@@ -226,7 +226,7 @@ def _named_by_default(settings: Settings) -> Settings:
 
 
 def _with_default_name(key: str, value: object) -> object:
-    """Options without a name belong to the component that a run uses by default."""
+    """Return the choice with a name; options without a name belong to the default component."""
     if key not in CHOICES or not isinstance(value, dict) or "name" in value:
         return value
     default = RunConfig.model_fields[key].default

@@ -166,7 +166,7 @@ class Run:
             return self._opened.open(self.folder)
 
 
-def open(  # noqa: A001 - `cg.open` is the one that users see
+def open(  # noqa: A001 - users call it as `cg.open`
     folder: Path | str,
     *,
     device: str | None = None,

@@ -48,7 +48,7 @@ def finish() -> None:
 
 
 class _Startup(logging.Handler):
-    """Shows stages as lines, and compiling with its seconds so far."""
+    """A log handler that shows stages as lines, and compiling with its seconds so far."""
 
     def __init__(self, level: int) -> None:
         super().__init__(level)
@@ -77,7 +77,7 @@ class _Startup(logging.Handler):
 
 
 class _Compiling:
-    """Shows the seconds of compiling, from a thread, because one kernel may take ten seconds.
+    """A clock of compiling that runs in a thread, because one kernel may take ten seconds.
 
     On a terminal, everything is one line. Compiling a kernel may compile other kernels inside.
     """

@@ -117,9 +117,10 @@ def evaluated_file(
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
-    """Evaluate the held-out views of a run again, and rewrite per_view.csv if it is the same scene.
+    """Evaluate the held-out views of a run again, and rewrite per_view.csv.
 
-    The folder is only read if the run is training, if the folder is not writable, or if
+    The results get another file name if the scene has changed, or if summary.json describes another
+    step. The folder is only read if the run is training, if the folder is not writable, or if
     per_view.csv has values that cannot be measured here.
 
     Raises:
@@ -153,5 +154,5 @@ def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
 
 
 def _known(views: Sequence[ViewMetrics]) -> set[str]:
-    """Return the names of the metrics that some view has a value of."""
+    """Return the names of the metrics that have a value for some view."""
     return {name for view in views for name, value in view.values.items() if value is not None}

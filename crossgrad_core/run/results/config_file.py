@@ -22,7 +22,10 @@ NOTES: Final = "notes"
 
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
-    """Write the configuration that repeats the run, with notes; a clock-driven run rewrites it."""
+    """Write the configuration that repeats the run, and its first notes.
+
+    A run that follows the clock rewrites the file.
+    """
     config = config.model_copy(update={"stop_after": None})  # It concerns only one start.
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))

@@ -61,7 +61,7 @@ class RunInUseError(UserError):
 
 @contextmanager
 def locked(folder: Path, doing: str) -> Iterator[bool]:
-    """Prevent that any other process writes into a run's folder inside the block.
+    """Keep other processes from writing into a run's folder inside the block.
 
     The lock belongs to an open file, so that it ends with its process, however the process ends.
 

@@ -56,7 +56,7 @@ def calibrated(seconds: float = CALIBRATION_SECONDS) -> Calibration:
 
 
 class Machine:
-    """Records the machine's load during the steps of a session; a plugin of the run."""
+    """A recorder of the machine's load during the steps of a session; a plugin of the run."""
 
     def __init__(self) -> None:
         self._looked = 0.0

@@ -155,7 +155,7 @@ def changes(packages: Packages | None) -> dict[str, str]:
 
 
 def refuse_changed(folder: Path, packages: Packages | None) -> None:
-    """Refuse to continue a run with other versions of packages than those that trained it.
+    """Refuse to continue a run if the versions of its packages have changed.
 
     Raises:
         UserError: A package has another version, or a component comes from another package.

@@ -31,7 +31,7 @@ class Summary:
     """The contents of summary.json.
 
     Attributes:
-        status: How the run ended.
+        status: Status of the run at its end.
         scene: Name of the scene.
         totals: Steps, views, backward passes, training seconds, primitives, memory.
         result: The last evaluation; None if there was none.
