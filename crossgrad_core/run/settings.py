@@ -1,4 +1,4 @@
-"""Settings of a run from a file, from options and from `--set`, in this order of precedence.
+"""Settings of a run from a file, from options and from `--set`; later sources win.
 
 The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`, which validates
 it and finds unknown keys and values out of bounds.

@@ -1,4 +1,4 @@
-"""Ctrl-C, `kill` and a closed terminal: each ends a command with one line at any time.
+"""Handling of Ctrl-C, `kill` and a closed terminal: a command ends with one line at any time.
 
 The exit code is 128 and the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
 SIGTERM, 129 after SIGHUP. The command imports this module first, so it imports little.

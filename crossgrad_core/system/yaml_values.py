@@ -159,7 +159,7 @@ def write_yaml(settings: Mapping[str, Any]) -> str:
 
 
 class _Values:
-    """Builds plain data from nodes; aliases are copied, and every copy counts."""
+    """A builder of plain data from nodes; aliases are copied, and every copy counts."""
 
     def __init__(self) -> None:
         self._count = 0
