@@ -84,8 +84,9 @@ class AbsGradDensityControl(AxisSplit):
 
 
 def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -> dict[str, Tensor]:
-    """Return the sums [P] of g, of ga and of the renders that showed a primitive, with this step
-    added.
+    """Return the sums [P] of g, of ga and of the renders that showed a primitive.
+
+    The sums include the views of this step.
 
     Args:
         context: The step.
@@ -107,7 +108,9 @@ def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -
 
 
 def quantile(values: Tensor, share: float) -> Tensor:
-    """Return a quantile of `values` [P > 0], interpolated; torch's own takes at most 2^24 values.
+    """Return the quantile of `values` [P > 0] by linear interpolation.
+
+    `torch.quantile` accepts at most 2^24 values.
     """
     ordered = values.sort().values
     place = share * (len(ordered) - 1)

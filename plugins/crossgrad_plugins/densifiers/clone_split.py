@@ -183,9 +183,7 @@ class CloneSplit(Densifier):
     def pruned(
         self, context: DensifyContext, state: PluginState, plan: Plan, values: Mapping[str, Rows]
     ) -> Tensor:
-        """Return [M] bool, primitives of the plan to remove; by default too faint or too large
-        ones.
-        """
+        """Return [M] bool, primitives of the plan to remove; by default the too faint or large."""
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.schedule.prunes_large(context.step):

@@ -148,8 +148,7 @@ class DirectionalConsistency(CloneSplit):
 def _child(
     context: DensifyContext, parents: Tensor, position: Tensor, *, right: bool
 ) -> dict[str, Tensor]:
-    """Return new values for the left or right children of parents [S] that are cut at `position`
-    [S].
+    """Return new values for the left or right children of parents [S], cut at `position` [S].
 
     The longest axis is six standard deviations long. The left child gets the share p of the axis
     and of the opacity. Its centre is 3 (1 - p) standard deviations left of the parent's centre.

@@ -74,12 +74,12 @@ class MultiViewScore:
 
 
 class CountsMarkedPixels(Densifier, ABC):
-    """A densifier that counts the erroneous pixels of several views in which a primitive is
-    blended.
+    """A densifier that counts the erroneous pixels of each primitive over several views.
 
-    The error of a pixel is its absolute difference from the photo, averaged over channels and
-    scaled to the range of the view's errors. A pixel is erroneous if its error is above
-    `error_threshold`. Counts are in pixels of the full photo, at any scale of the render.
+    A primitive's count is the number of erroneous pixels in which it is blended. The error of a
+    pixel is its absolute difference from the photo, averaged over channels and scaled to the range
+    of the view's errors. A pixel is erroneous if its error is above `error_threshold`. Counts are
+    in pixels of the full photo, at any scale of the render.
     """
 
     count: Literal["render", "running"] = Field(
@@ -114,8 +114,7 @@ class CountsMarkedPixels(Densifier, ABC):
 
     @torch.no_grad()
     def rendered(self, context: DensifyContext) -> PluginState:
-        """Return the counts of `views` training views, rendered at the scale of this step's views.
-        """
+        """Return the counts of `views` training views, rendered at the scale of the step."""
         last = context.views[-1] if context.views else None
         scale, background = (last.scale, last.background) if last else (1.0, None)
         columns = [self._column(context, view) for view in context.scene.train_views]
@@ -201,8 +200,7 @@ def erroneous(view: RenderedView, threshold: float) -> Tensor:
 
 
 def drawn_views(columns: Sequence[int], number: int, rng: np.random.Generator) -> list[int]:
-    """Return random different views, divided as evenly as possible over all groups, at least one
-    each.
+    """Return random different views, evenly from all groups and at least one from each.
 
     Args:
         columns: The group of each view, counted from 0.
