@@ -24,14 +24,13 @@ _SMALLEST_TEMPERATURE = 1e-8
 
 
 class Active(Sampler):
-    """A uniform view, and a view of the other group chosen by the difference of their running
-    losses.
+    """A uniform view, and a view of the other group chosen by the difference in running loss.
 
-    The partner is drawn from the `top` views of the other group with the largest
-    |loss - loss of the first view|. The draw is a softmax whose temperature is the standard deviation of
-    these differences. Losses are running means per view. A running mean starts again when the octave of
-    the view's scale changes. Views that were never rendered have no running loss; they are drawn first,
-    as first view or as partner.
+    The partner is drawn from the `top` views of the other group with the largest |loss - loss of
+    the first view|. The draw is a softmax whose temperature is the standard deviation of these
+    differences. Losses are running means per view. A running mean starts again when the octave of
+    the view's scale changes. Views that were never rendered have no running loss; they are drawn
+    first, as first view or as partner.
 
     Source: the paper, active loss-disparity pairing. The values of top, temperature and decay are
     ours, because the paper does not give them.

@@ -1,4 +1,4 @@
-"""Anchor pairs: near cameras are paired with far cameras, and middle cameras with middle cameras."""
+"""Anchor pairs: near cameras are paired with far cameras, middle cameras with middle cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar

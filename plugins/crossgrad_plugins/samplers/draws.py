@@ -47,8 +47,9 @@ class EpochOrder:
         return drawn + fresh, EpochOrder(fresh + rest, missing)
 
     def to_json(self) -> dict[str, Json]:
-        """Return the state as plain data; the order is shared and not copied, because it never
-        changes.
+        """Return the state as plain data.
+
+        The order is shared and not copied, because it never changes.
         """
         return {"order": cast("list[Json]", self.order), "dealt": self.drawn_views}
 

@@ -58,8 +58,9 @@ class FarthestPoint(Sampler):
 
 
 def farthest_point_order(points: NDArray[np.float64], start: int) -> list[int]:
-    """Return all points [N, D], from `start` on, each the farthest from earlier points; ties by
-    index.
+    """Return the order of points [N, D] from `start` on, each the farthest from all earlier points.
+
+    Of equally far points, the point with the lowest index is first.
     """
     order = [start]
     nearest = np.full(len(points), np.inf)
