@@ -52,8 +52,7 @@ class Radial(Grouping):
 
 
 class Percentile(Grouping):
-    """near: distance from the mean training camera up to its q-th percentile; far: larger
-    distances.
+    """near: cameras up to the q-th percentile of the distance from the mean camera; far: the rest.
 
     Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
     is not 50, this is a different objective, not only a different variance.
@@ -121,8 +120,7 @@ class Anchors(Grouping):
 def rule_by_shares(
     scene: Scene, grouping: str, share: float, needed: Sequence[str]
 ) -> GroupingRule:
-    """Return the rule: near up to quantile `share` of the radial distance, far above quantile 1 -
-    share.
+    """Return the rule: near up to quantile `share` of the radial distance, far above 1 - share.
 
     Args:
         scene: The scene.

@@ -60,7 +60,7 @@ class Footprint(Grouping):
         known, places = own[~blind], scene.centers[~blind]
 
         def sizes(views: Sequence[View]) -> NDArray[np.float64]:
-            """Return [V] negative footprints, so that small values are near, as `halves` requires."""
+            """Return [V] negative footprints; small values are near, as `halves` requires."""
             return -_filled(_own(scene, views), views, known, places)
 
         train = sizes(scene.train_views)
@@ -87,9 +87,7 @@ def _filled(
     known: NDArray[np.float64],
     places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return [V] footprints, with NaN replaced by the value of the nearest camera at `places` [N,
-    3].
-    """
+    """Return [V] footprints; NaN becomes the value of the nearest camera at `places` [N, 3]."""
     for place, view in enumerate(views):
         if np.isnan(found[place]):
             ways = np.linalg.norm(places - centers_of((view,)), axis=1)

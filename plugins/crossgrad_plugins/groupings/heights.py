@@ -17,8 +17,7 @@ _SHORTEST_MEAN = 0.1
 
 
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [V] height of each camera along the unit axis `up` [3], relative to the mean training
-    camera.
+    """Return [V] height of each camera over the mean training camera, along the unit axis `up` [3].
 
     Rounding differences between equal heights are removed, as in `radial_distances`.
     """

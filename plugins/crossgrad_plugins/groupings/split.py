@@ -22,8 +22,7 @@ def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
 def rule_of_distances(
     scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], float | np.floating]
 ) -> GroupingRule:
-    """Return the rule: `near` for distances from the mean training camera up to a threshold, else
-    `far`.
+    """Return the rule: `near` up to a threshold of the distance from the mean training camera.
 
     Args:
         scene: The scene.
@@ -50,9 +49,7 @@ def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:
 
 
 def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
-    """Return the logarithms of the distances from the mean training camera; -inf for a distance of
-    0.
-    """
+    """Return the logarithms of the distances from the mean training camera; -inf for distance 0."""
     distances = radial_distances(scene, views)
     logs = np.full(len(distances), -np.inf)
     np.log(distances, out=logs, where=distances > 0.0)
@@ -124,7 +121,7 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [...] share of the variance of values [..., N >= 2] between both sides of Otsu's
+    """Return [...] share of the variance of values [..., N >= 2] between the sides of Otsu's
     threshold.
 
     The share is 1 for two values, and 3/4 for very many evenly spread values. It is 0 if all values
@@ -141,8 +138,8 @@ def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _between(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [..., N-1] N^2 times the variance between both sides of each cut of sorted values
-    [..., N].
+    """Return [..., N-1] N^2 times the variance between the sides of each cut of sorted values [...,
+    N].
 
     The result is -1 for a cut between equal values.
     """

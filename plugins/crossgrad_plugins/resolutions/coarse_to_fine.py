@@ -59,8 +59,7 @@ class Course:
         return self.scales[part] if part < len(self.scales) else 1.0
 
     def pixels(self, progress: float) -> float:
-        """Return the sum of rendered pixels up to a share of the window; full size counts 1 per
-        window.
+        """Return the sum of rendered pixels up to a share of the window, in photos at full size.
 
         The sum is the integral of the squared scale. The share may be above 1.
         """
@@ -70,7 +69,7 @@ class Course:
         return reduced + progress - borders[-1]
 
     def text(self, schedule: Schedule, window: float) -> str:
-        """Return a text with the scales by step, for a run whose window ends at the count `window`."""
+        """Return a text with the scales by step, for a window that ends at a given count."""
         if not self.scales:
             return "full size"
         scales = (*self.scales, 1.0)
@@ -104,9 +103,7 @@ class CoarseToFine(Resolution):
 
     @abstractmethod
     def window(self, schedule: Schedule) -> float:
-        """Return the count of views or steps after which every view has full size; 0: from the
-        start.
-        """
+        """Return the count of views or steps from which views have full size; 0: from the start."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, Part]:

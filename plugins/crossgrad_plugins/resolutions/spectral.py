@@ -158,8 +158,7 @@ def _course(scales: tuple[float, ...]) -> Course:
 
 
 def kept_shares(views: Sequence[View]) -> Floats:
-    """Return [GRID + 1] X(F_r) / X(F) at the scales 0, 1 / GRID .. 1: the share of the spectrum
-    kept.
+    """Return [GRID + 1] X(F_r) / X(F) at scales 0, 1 / GRID .. 1: the share of the spectrum kept.
 
     X(F) is the sum of the amplitudes |DFT| of the grey photos. X(F_r) is the sum over the
     frequencies that a photo at 1 / r of the size contains: at most 1 / r of the highest frequency,
@@ -186,8 +185,7 @@ def _of_view(view: View) -> Floats:
 
 
 def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
-    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean of the
-    rest.
+    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean of others.
 
     Args:
         image: [H, W, 3] uint8.
@@ -218,7 +216,5 @@ def amplitudes_within(grey: Floats) -> Floats:
 
 
 def _cells(frequencies: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the index of the first scale that keeps each frequency, cycles per pixel in [-1/2,
-    1/2].
-    """
+    """Return the first scale index that keeps each frequency, cycles per pixel in [-1/2, 1/2]."""
     return np.asarray(np.ceil(2.0 * GRID * np.abs(frequencies) - _ROUNDING), dtype=np.int64)
