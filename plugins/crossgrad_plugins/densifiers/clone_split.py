@@ -298,8 +298,6 @@ def child_on_axis(
 ) -> dict[str, Tensor]:
     """Return new values for one child of each parent [S], placed on the parent's longest axis.
 
-    Source: fixed positions on the longest axis as in Deng et al. 2024 (arXiv 2411.10133).
-
     Args:
         context: The step.
         parents: Rows of the parents.

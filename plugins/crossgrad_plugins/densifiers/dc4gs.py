@@ -20,8 +20,6 @@ def inconsistency(sums: Tensor) -> Tensor:
     R is the length of the mean direction, or 0 if there is no pixel. ga is the norm of the absolute
     gradients. The result is 0 if all gradients have the same direction or if all are zero.
 
-    Source: DC4GS.
-
     Args:
         sums: [5, N] fields of `Screen.directions`, summed over bins: direction (x, y), absolute
             gradients (x, y), number of pixels.
@@ -63,8 +61,6 @@ def split_positions(scores: Tensor) -> Tensor:
     The function searches the minimum of the polynomial of degree 4 through the scores, on a grid
     and at the nodes. Of equal values the most central one is used, so equal scores split in the
     middle.
-
-    Source: DC4GS.
 
     Args:
         scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.

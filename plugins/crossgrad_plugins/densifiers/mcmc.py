@@ -45,8 +45,6 @@ def position_noise(
     is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. This holds for
     every opaque Gaussian, so the noise costs little after the first steps of training.
 
-    Source: Kheradmand et al. 2024 (3DGS-MCMC), eq. 8.
-
     Args:
         parameters: Parameters with `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit)
             [N].

@@ -121,7 +121,7 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [...] share of the variance of values [..., N >= 2] between the sides of Otsu's
+    """Return [...] share of the variance of values [..., N >= 2] between both sides of the
     threshold.
 
     The share is 1 for two values, and 3/4 for very many evenly spread values. It is 0 if all values
@@ -138,10 +138,9 @@ def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _between(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [..., N-1] N^2 times the variance between the sides of each cut of sorted values [...,
-    N].
+    """Return [..., N-1] N^2 times the variance between the sides of each cut.
 
-    The result is -1 for a cut between equal values.
+    Values [..., N] are sorted. The result is -1 for a cut between equal values.
     """
     sums, total = np.cumsum(ordered, axis=-1)[..., :-1], ordered.sum(axis=-1, keepdims=True)
     left = np.arange(1, ordered.shape[-1])

@@ -41,8 +41,6 @@ def l1_ssim_loss(
     A masked-out pixel is 0 in both images before SSIM's windows are summed. It has no term of its
     own in either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
 
-    Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
-
     Args:
         image: [H, W, C] floating point; values may be outside [0, 1].
         target: [H, W, C] floating point, or uint8 (then 255 means 1).
@@ -80,8 +78,6 @@ def _weighted(values: Tensor, mask: Tensor | None, weights: Tensor) -> Tensor:
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """Return the SSIM of every pixel and channel, [H, W, C]; windows are zero-padded.
-
-    Source: Wang et al. 2004, eq. 13, 11 x 11 Gaussian window, sigma 1.5, L = 1.
 
     Args:
         image: [H, W, C] floating point.

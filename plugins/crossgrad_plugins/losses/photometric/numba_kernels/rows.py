@@ -67,7 +67,10 @@ def set_centres(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, box: _Box, width: int,
 ) -> None:  # fmt: skip
-    """Write the centres: per channel, means of s and d over every eighth row, with x and y clipped."""
+    """Write the centres: per channel, means of s and d over every eighth row of the tile.
+
+    x and y are clipped to [0, 1].
+    """
     top, bottom, left, right = box
     for channel in range(CHANNELS):
         count = 1e-9  # if nothing is kept, the sums are 0, and so are the centres
@@ -263,8 +266,9 @@ def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
 
 @device
 def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Like `down`, but return the sums of values and of squares, first for `row`, then for the
-    next.
+    """Like `down`, but return the sums of values and of squares.
+
+    The first two results are for `row`, the last two for the next row.
     """
     a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
     return (
