@@ -121,11 +121,10 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [...] share of the variance of values [..., N >= 2] between both sides of the
-    threshold.
+    """Return [...] share of the variance of values [..., N >= 2] between the two sides.
 
-    The share is 1 for two values, and 3/4 for very many evenly spread values. It is 0 if all values
-    are equal.
+    The sides are those of Otsu's threshold. The share is 1 for two values, and 3/4 for very many
+    evenly spread values. It is 0 if all values are equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """

@@ -61,7 +61,7 @@ class Cells:
         return np.asarray(on_photo, dtype=np.bool_)
 
     def colors(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return [C, 3] mean colours of the photo's nearest cell, and [C] whether that cell has
+        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] whether they have
         pixels.
 
         Pixels that do not count are left out.
@@ -117,9 +117,7 @@ class Cells:
     def _under_large(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [C] whether a cell's centre is in one of the squares that replace discs of equal
-        area.
-        """
+        """Return [C] whether a cell's centre is in the square of the area of one of the discs."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         half = (np.sqrt(np.pi) / 2.0 * radii / self.size)[:, None]
         middle = np.clip(pixels / self.size, -1e6, 1e6) + self.margin - 0.5

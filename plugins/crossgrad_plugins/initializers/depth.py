@@ -44,7 +44,7 @@ class Sky:
     most: float
 
     def depth(self, camera: Camera) -> float:
-        """Return the distance of the sky: behind everything of the scene that the camera could see."""
+        """Return the distance of the sky: behind all of the scene that the camera could see."""
         center = camera.center.numpy()
         far = float(np.linalg.norm(self.centers - center, axis=1).max())
         if len(self.points):
@@ -93,8 +93,13 @@ class Depth:
     def of(
         cls, camera: Camera, points: NDArray[np.float64], fewest: int, sky: Sky
     ) -> "Depth | None":
-        """Return the depth from the observed points [S, 3]; None if fewer than `fewest` are in
-        front.
+        """Return the depth of a photo, or None if fewer than `fewest` points are in front of it.
+
+        Args:
+            camera: The photo's camera.
+            points: [S, 3] the observed points.
+            fewest: Minimum number of points in front of the camera.
+            sky: The scene's sky.
         """
         pixels, depth = camera.project(points)
         ahead = depth > 0.0
@@ -127,7 +132,7 @@ class Depth:
         return _on(self.rise, around) > 0.0
 
     def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N] depths at pixels [N, 2], in units of the longer side from the photo's centre."""
+        """Return [N] depths at pixels [N, 2], in units of the longer side from the centre."""
         count = min(_NEIGHBOURS, len(self.rest))
         distances, rows = self._tree.query(around, k=[*range(1, count + 1)])
         weights = 1.0 / (distances**2 + _BLUR**2)

@@ -57,8 +57,7 @@ class ColorCorrectedSSIM(Metric):
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
-    """Return [H, W, 3] uint8, the render after the affine colour map that fits it best to its
-    photo.
+    """Return [H, W, 3] uint8, the render after the affine colour map that fits it to its photo.
 
     The map is fitted where the mask is True and applied everywhere. None if no pixel counts.
     """

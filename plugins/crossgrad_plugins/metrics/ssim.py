@@ -41,9 +41,7 @@ class SSIM(Metric):
 
 
 class SSIMOfSkimage(Metric):
-    """Structural similarity of scikit-image: Gaussian weights, sigma 1.5, without sample
-    covariance.
-    """
+    """Structural similarity of scikit-image: Gaussian weights, sigma 1.5, no sample covariance."""
 
     figure: ClassVar[Figure] = Figure(
         name="ssim_skimage",
