@@ -61,7 +61,7 @@ class Cells:
         return np.asarray(on_photo, dtype=np.bool_)
 
     def colors(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] whether they have
+        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] if they have
         pixels.
 
         Pixels that do not count are left out.

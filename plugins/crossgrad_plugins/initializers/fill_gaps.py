@@ -146,8 +146,7 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fill a photo, or with a margin the cells beyond its edges that no picture in `seen`
-        shows.
+        """Fill a photo, or, with a margin, the cells beyond its edges that `seen` does not show.
 
         Rays that go up could place points in the air. On the photo such points become sky. Beyond
         its edges they are left out.
@@ -221,8 +220,9 @@ class _Air:
         return cls(np.array(centers).reshape(-1, 3), np.array(reach))
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N] whether points [N, 3] are in this space; points within rounding of its border
-        are not.
+        """Return [N] whether points [N, 3] are in this space.
+
+        Points within rounding of its border are not.
         """
         held = np.zeros(len(points), dtype=np.bool_)
         for center, reach in zip(self.centers, self.reach, strict=True):
@@ -266,8 +266,9 @@ class _Pictures:
         )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N] whether a view shows each point [N, 3]: inside its image and not far behind
-        its depth.
+        """Return [N] whether a view shows each point [N, 3].
+
+        A point is shown if it is inside the image and not far behind the depth of the view.
         """
         pixels, depth, inside = self._seen(points)
         shown = np.asarray((inside & (depth <= self.limits[:, :1])).any(axis=0))
@@ -303,9 +304,7 @@ class _Pictures:
     def _seen(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return [V, N, 2] pixels times depth, [V, N] depths, and whether points are inside the
-        images.
-        """
+        """Return [V, N, 2] pixels times depth, [V, N] depths, and whether they are in the images."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]

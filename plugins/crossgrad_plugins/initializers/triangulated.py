@@ -247,8 +247,7 @@ def _triangulated(
     at: NDArray[np.float64],
     other: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return [M, 3] points whose projections [3, 4] are nearest to pixels [M, 2], in a linear
-    sense.
+    """Return [M, 3] points whose projections [3, 4] are nearest to pixels [M, 2], linearly.
 
     Source: Hartley and Zisserman, Multiple View Geometry, section 12.2 (homogeneous method).
     """
