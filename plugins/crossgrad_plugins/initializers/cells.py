@@ -61,10 +61,9 @@ class Cells:
         return np.asarray(on_photo, dtype=np.bool_)
 
     def colors(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] if they have
-        pixels.
+        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] validity flags.
 
-        Pixels that do not count are left out.
+        A flag is True if that cell has pixels. Pixels that do not count are left out.
         """
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()

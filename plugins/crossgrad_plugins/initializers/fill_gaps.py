@@ -304,7 +304,7 @@ class _Pictures:
     def _seen(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return [V, N, 2] pixels times depth, [V, N] depths, and whether they are in the images."""
+        """Return [V, N, 2] pixels times depth, [V, N] depths, and if points are in the images."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]

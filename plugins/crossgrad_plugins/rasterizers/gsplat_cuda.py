@@ -31,8 +31,7 @@ _GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
 class GsplatRasterizer(Rasterizer):
-    """Renders with the package gsplat (Apache-2); docs/rasterizers.md lists the differences in its
-    rules.
+    """Renders with the package gsplat (Apache-2); docs/rasterizers.md lists its different rules.
 
     Source: Ye et al. 2024 (gsplat, arXiv 2409.06765).
     """
@@ -100,9 +99,7 @@ class GsplatRasterizer(Rasterizer):
         backgrounds: Sequence[Tensor],
         outputs: frozenset[str],
     ) -> list[Render]:
-        """Return the renders of K views of one size, with N Gaussians each, from one call of
-        gsplat.
-        """
+        """Return the renders of K views of one size, with N Gaussians each, in one call."""
         gaussians, camera = views[0]
         if not len(gaussians):
             return [
@@ -148,7 +145,7 @@ def _batch(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return [N, 3] RGB like `view_colors`; harmonics above degree 0 are evaluated in one kernel."""
+    """Return [N, 3] RGB like `view_colors`; harmonics above degree 0 use one kernel."""
     center = camera.center.to(gaussians.means, non_blocking=True)
     coefficients = coefficients_of(gaussians) if gaussians.colors is None else None
     if coefficients is None or not gaussians.sh_degree:
@@ -160,7 +157,7 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
-    """Return poses [K, 1, 4, 4] and intrinsics [K, 1, 3, 3], copied to the device in one transfer."""
+    """Return poses [K, 1, 4, 4] and intrinsics [K, 1, 3, 3], copied in one transfer."""
     poses = torch.stack([camera.world_to_camera.reshape(-1) for camera in cameras])
     matrices = torch.stack([camera.matrix.reshape(-1) for camera in cameras])
     both = torch.cat([poses, matrices], 1).to(like, non_blocking=True)

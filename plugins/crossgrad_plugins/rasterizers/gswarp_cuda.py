@@ -29,8 +29,7 @@ _NEAR = 0.2
 
 
 class GswarpRasterizer(Rasterizer):
-    """Renders with the package gswarp (Apache-2); docs/rasterizers.md lists the differences in its
-    rules.
+    """Renders with the package gswarp (Apache-2); docs/rasterizers.md lists its different rules.
 
     gswarp's near plane is fixed. The scene is scaled so that this plane is at the depth `near`.
     """

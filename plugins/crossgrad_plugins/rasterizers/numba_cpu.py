@@ -1,5 +1,6 @@
-"""The CPU rasterizer: tiles and a hand-written backward pass, with equal bits on any number of
-cores.
+"""The CPU rasterizer: tiles and a hand-written backward pass.
+
+The results have the same bits for any number of cores.
 """
 
 from collections.abc import Callable

@@ -136,10 +136,9 @@ class TorchRasterizer(Rasterizer):
         return projection, shapes, view_colors(gaussians, eye)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the Gaussians to draw, front to back, their tile boxes [V, 4], and published
-        radii.
+        """Return the Gaussians to draw, front to back, their tile boxes [V, 4], and their radii.
 
-        The radii [N] int32 are None unless the footprint is `3-sigma`.
+        The radii [N] int32 are the published radii; None unless the footprint is `3-sigma`.
         """
         projection, shapes, colors = self._splats(gaussians, camera)
         table = splat_table(projection.means, projection.depths, colors, shapes)

@@ -14,8 +14,9 @@ _ALL: Final = 1 << 30
 
 
 def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
-    """Return the function `Screen.count` of a view; it keeps the projected data and tile lists
-    alive.
+    """Return the function `Screen.count` of a view.
+
+    It keeps the projected data and the tile lists alive.
 
     Args:
         meta: The metadata that gsplat's `rasterization` returns.

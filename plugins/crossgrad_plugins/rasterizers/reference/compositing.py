@@ -91,7 +91,7 @@ def composite_tiles(
 
 
 def _tile_centers(size: tuple[int, int], like: Tensor) -> list[Tensor]:
-    """Return [h, w, 2] pixel centres of each tile, row-major; tiles at the far borders are smaller."""
+    """Return [h, w, 2] pixel centres of each tile, row-major; border tiles can be smaller."""
     columns, rows = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in size)
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)  # [H, W, 2]
     return [tile for band in torch.split(grid, TILE) for tile in torch.split(band, TILE, 1)]
@@ -151,9 +151,7 @@ class PixelCounter:
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, [P, G] each: whether alpha >= 1/255, whether the Gaussian was blended, and its
-    weight.
-    """
+    """Return [P, G] of a tile: if alpha >= 1/255, if the Gaussian was blended, and its weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)

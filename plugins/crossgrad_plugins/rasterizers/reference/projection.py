@@ -83,9 +83,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
 
 
 def _slopes(size: int, focal: float, center: float) -> tuple[float, float]:
-    """Return the range of x / z in which the Jacobian is evaluated: the image and a margin around
-    it.
-    """
+    """Return the range of x / z for the Jacobian: the image and a margin around it."""
     margin = JACOBIAN_MARGIN * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin
 
@@ -149,8 +147,9 @@ def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> 
 
 
 def _mip_factor(before: Tensor, after: Tensor) -> Tensor:
-    """Return the opacity factor that compensates the area added by dilation (Mip-Splatting, 2-D
-    filter).
+    """Return the opacity factor that compensates the area added by dilation.
+
+    Source: Mip-Splatting, 2-D filter.
     """
     drawn = (before > MIP_EPSILON) & (after > MIP_EPSILON)
     factor = (before / (after + MIP_EPSILON) + MIP_EPSILON).sqrt()
@@ -193,19 +192,16 @@ def _windowed(projection: Projection, opacities: Tensor) -> Shape:
 
 
 def _floored_root(squares: Tensor) -> Tensor:
-    """Return standard deviations of `squares`, at least the floor, and without gradient at the
-    floor.
-    """
+    """Return standard deviations of `squares`, at least the floor; at the floor without gradient."""
     return squares.clamp(min=SIGMA_FLOOR**2).sqrt()
 
 
 def _window(offset: Tensor, sigma: Tensor) -> Tensor:
-    """Return the mass of a 1-D Gaussian in a window of one pixel, at `offset` from the window's
-    centre.
+    """Return the mass of a 1-D Gaussian in a window of one pixel.
 
-    This is F(x + h) - F(x - h) with F(x) = sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h
-    = 0.5 / sigma. It is computed as a product, so that precision is not lost for tails or for wide
-    Gaussians.
+    The window's centre is at `offset` from the mean. The mass is F(x + h) - F(x - h) with F(x) =
+    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. It is computed as a
+    product, so that precision is not lost for tails or for wide Gaussians.
     """
     x = -offset.abs() / sigma
     h = 0.5 / sigma

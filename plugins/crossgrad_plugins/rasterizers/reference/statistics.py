@@ -35,9 +35,7 @@ class Recorder:
     axes: Tensor | None = None
 
     def record(self, signed: Tensor, sums: Tensor) -> None:
-        """Store the gradients [V, 2] of the drawn rows, and the sums in the gradient of their
-        probes.
-        """
+        """Store the gradients [V, 2] of the drawn rows, and the sums from their probes."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
             self.screen.abs_gradient = self._scattered(sums[:, :2])
@@ -46,7 +44,7 @@ class Recorder:
             self.screen.directions = binned.view(self.count, BINS, FIELDS)
 
     def probe(self, like: Tensor) -> Tensor:
-        """Return [V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero for each sum of a bin."""
+        """Return [V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero per sum of a bin."""
         zeros = like.new_zeros(len(like), 2)
         if self.axes is None:
             return zeros
