@@ -236,8 +236,7 @@ def find_tiles(
     depths: NDArray[np.float64],
     order: NDArray[np.int32],
 ) -> None:
-    """Find the tiles that each footprint reaches, and, as a parallel job, sort the records by
-    depth.
+    """Find the tiles that each footprint reaches; a parallel job sorts the records by depth.
 
     Args:
         jobs: From `share`.

@@ -192,7 +192,7 @@ def _windowed(projection: Projection, opacities: Tensor) -> Shape:
 
 
 def _floored_root(squares: Tensor) -> Tensor:
-    """Return standard deviations of `squares`, at least the floor; at the floor without gradient."""
+    """Return standard deviations of `squares`; at the floor they have no gradient."""
     return squares.clamp(min=SIGMA_FLOOR**2).sqrt()
 
 
