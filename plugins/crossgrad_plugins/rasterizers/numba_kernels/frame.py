@@ -292,10 +292,10 @@ def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:
-    """Return an array to select the kernels of the analytic response, or None for the plain
-    response.
+    """Return an array if the response is analytic, else None; kernels specialise on this type.
 
-    The content of the array is not used. These kernels are compiled at their first use.
+    The content of the array is not used. Kernels of the analytic response are compiled at first
+    use.
     """
     return np.empty(0, np.float32) if options.response == "analytic" else None
 

@@ -85,12 +85,11 @@ def _may_be_drawn(
     opacities: NDArray[np.float32],
     flags: NDArray[np.uint8],
 ) -> None:
-    """Set `flags` for each of `size` Gaussians that may touch a pixel; branch-free for
-    vectorisation.
+    """Set `flags` for each of `size` Gaussians that may touch a pixel.
 
-    A footprint ends sqrt(2 log(255 opacity)) standard deviations from the mean. The projected
-    standard deviation is at most the projection of a ball with the radius of the largest scale. All
-    values are multiplied by the depth.
+    The loop has no branches, so it is vectorised. A footprint ends sqrt(2 log(255 opacity))
+    standard deviations from the mean. The projected standard deviation is at most the projection of
+    a ball with the radius of the largest scale. All values are multiplied by the depth.
     """
     pose = in_registers(camera.pose)
     steep_x = max(abs(camera.left), abs(camera.right))
