@@ -306,7 +306,7 @@ def coverage_gradients(
 def axis_offsets(
     cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
 ) -> tuple[Lanes, Lanes]:
-    """Return the offsets along the main axes of pixels at `offsets` from the middle of four rows."""
+    """Return the offsets along the main axes of pixels `offsets` from the middle of four rows."""
     u = fma(cosine, offsets, broadcast_four_wide(rows, row + ROW_U))
     v = fnma(sine, offsets, broadcast_four_wide(rows, row + ROW_V))
     return u, v
