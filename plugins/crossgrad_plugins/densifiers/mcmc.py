@@ -158,7 +158,7 @@ class Pool:
 
         Args:
             index: [M'] int64.
-            lowest: Lower bound of a shared opacity; the upper bound is the largest float32 below 1.
+            lowest: Lower bound of a shared opacity; the upper bound is 1 minus the float32 epsilon.
         """
         copies = torch.bincount(index, minlength=self.source.shape[0]).clamp(max=MOST_COPIES)
         rows = (copies > 1).nonzero().squeeze(1)

@@ -82,8 +82,7 @@ def _kept(image: Tensor, mask: Tensor | None) -> Bytes:
 def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
     """Return matrix [3, 3] and offset [3] with `render @ matrix + offset` closest to `photo`.
 
-    Both images are [N, 3]. If several maps are equally close, the one with the smallest matrix is
-    used.
+    Both images are [N, 3]. Of several equally close maps, the map with the smallest matrix is used.
     """
     sums = _sums(render, photo)
     within, across = _spread(sums, slice(0, 3)), _spread(sums, slice(3, 6))

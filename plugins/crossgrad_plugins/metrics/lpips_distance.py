@@ -145,7 +145,7 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
             return load_file(path)
         # Map to the CPU, so that files written on a GPU can be read without a GPU.
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # What a damaged file raises is documented nowhere.
+    except Exception as error:  # Exceptions for damaged files are not documented.
         # Torch's own message ends with the advice to execute code from the file, so it is not
         # shown.
         raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error

@@ -86,7 +86,7 @@ class Choice:
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether the backbone has per-axis Gaussians that are rendered as published."""
+        """Whether the backbone's Gaussians have their own axes and are rendered as published."""
         backbone = self.facts.backbone
         return bool(backbone.axes) and backbone.response == "plain"
 

@@ -121,9 +121,9 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        ahead = np.searchsorted(ends, parts, side="right")  # The next level that is reached.
+        ahead = np.searchsorted(ends, parts, side="right")  # The level that the run leaves next.
         behind = np.maximum(ahead - 1, 0)
-        # Before the first level is reached, there is no level to interpolate from.
+        # Before the first level is left, there is no level to interpolate from.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
         found = pixels[behind] + share * (pixels[ahead] - pixels[behind])
         return tuple(np.sqrt(found).round(4).tolist())

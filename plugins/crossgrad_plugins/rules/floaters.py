@@ -79,7 +79,8 @@ def _primitives(model: Model) -> int:
 
 
 def floaters(model: Model, empty: float) -> Tensor:
-    """Return [F] int64 rows of primitives in the empty space around a camera that no photo touches.
+    """Return [F] int64 rows of primitives in empty space near a camera that touch no training
+    photo.
 
     A hidden primitive counts as touched. A primitive is a floater only if the rasterizer omits it
     from every training photo.
@@ -116,7 +117,7 @@ def cameras_that_tell(scene: Scene) -> list[View]:
 
 
 def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -> NDArray[np.bool_]:
-    """Return [N] bool: whether each position is in the empty space in front of the nearest camera.
+    """Return [N] bool: whether each position is in the empty space around the nearest camera.
 
     Args:
         positions: [N, 3], local frame.

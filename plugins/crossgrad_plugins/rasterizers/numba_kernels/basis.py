@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import WIDE, fma, load_wide, picking, store
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Rows of numbers of sixteen directions: x, y, z and the inverse distance.
+#: Size of the rows x, y, z and inverse distance of sixteen directions.
 WAYS = 4 * WIDE
 #: Number of basis functions of all degrees, equal to the lanes of a vector; and their floats for
 #: sixteen directions.

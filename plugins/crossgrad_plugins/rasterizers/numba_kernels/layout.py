@@ -52,7 +52,7 @@ COSINE, SINE = 4, 5  # of the longer main axis
 INVERSE_1, INVERSE_2 = 6, 7  # 1 / standard deviation along each main axis, 1 / pixels
 PEAK = 8  # opacity times 2 pi times both standard deviations
 REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which nothing is touched, pixels
-RADIUS = 15  # squared, in sigmas beyond half a pixel, likewise for both axes together
+RADIUS = 15  # squared reach of both axes together, in sigmas beyond half a pixel
 #: Number of sums over pixels that the backward pass writes per drawn Gaussian and tile.
 PARTIAL = 16
 SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5

@@ -101,7 +101,7 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
     """Blend the Gaussians of one tile over its pixels.
 
     Args:
-        table: [G, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
+        table: [G, R + 7 + S] the probe's columns and the columns of `splat_table`, front to back.
         centers: [P, 2] pixel centres.
         drawing: Data common to all tiles.
 

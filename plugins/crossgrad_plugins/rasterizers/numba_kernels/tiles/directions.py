@@ -203,7 +203,7 @@ def mean_gradients(
 ) -> tuple[Lanes, Lanes]:
     """Blend into a patch; return its pixels' gradients by the projected mean (x and y).
 
-    The gradients of plain records are in units of 2 log 2 px^-1, those of analytic records in
+    Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records in
     px^-1.
     """
     row = base + row_of(patch)
