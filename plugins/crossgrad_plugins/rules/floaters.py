@@ -79,8 +79,7 @@ def _primitives(model: Model) -> int:
 
 
 def floaters(model: Model, empty: float) -> Tensor:
-    """Return [F] int64 rows of primitives in empty space near a camera that touch no training
-    photo.
+    """Return [F] int64 rows of primitives in empty space that touch no training photo.
 
     A hidden primitive counts as touched. A primitive is a floater only if the rasterizer omits it
     from every training photo.
