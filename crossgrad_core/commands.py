@@ -1,10 +1,10 @@
-"""The public module for commands: what a command of a plugin package imports from the core.
+"""The public module for commands: everything that a command of a plugin package imports.
 
-Importing it is quick; what takes long (torch, numba) is imported when a function below is called
-or a class is asked for, so that a command says within two seconds that it has started: import this
-module at the top, call `announce()` first, and import `crossgrad_core.plugin` (the types of scenes,
-models and components) in the modules that do the work. What is listed here keeps its meaning within
-a minor version; see docs/plugins.md.
+Importing this module is quick. Slow modules (torch, numba) are imported when a function below is
+called or a class below is accessed, so that a command reports within two seconds that it has
+started. Import this module at the top, call `announce()` first, and import `crossgrad_core.plugin`
+(the types of scenes, models and components) in the modules that do the work. The names listed here
+keep their meaning within a minor version; see docs/plugins.md.
 """
 
 from collections.abc import Mapping
@@ -189,7 +189,7 @@ __all__ = [
 
 #: Exit code of a command whose training failed.
 FAILED: Final = 1
-#: What is imported when it is asked for -> where it is, with another name where it has one there.
+#: Name that is imported on first access -> its module, and its name there if that is different.
 _LATE: Final = {
     "ComponentChoice": "config",
     "DEFAULT_STEPS": "run.decisions",
@@ -221,7 +221,7 @@ _LATE: Final = {
 
 
 def __getattr__(name: str) -> object:
-    """The class or function of that name; imports its module."""
+    """Return the class or function of this name; import its module."""
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, there = _LATE[name].partition(":")
@@ -229,7 +229,7 @@ def __getattr__(name: str) -> object:
 
 
 def names(slot: str) -> list[str]:
-    """Names of the installed plugins of a slot such as `operators`, third parties' too, sorted.
+    """Return the sorted names of all installed plugins of a slot such as `operators`.
 
     Raises:
         KeyError: There is no such slot.
@@ -238,7 +238,7 @@ def names(slot: str) -> list[str]:
 
 
 def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Writes settings as a configuration file, for `crossgrad run --config`.
+    """Write settings as a configuration file, for `crossgrad run --config`.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -249,7 +249,7 @@ def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
 
 
 def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a YAML file that `read_settings` gets the mapping back from.
+    """Write a mapping as a YAML file, which `read_settings` reads back.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -260,10 +260,10 @@ def write_mapping(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def configured(settings: Mapping[str, Any]) -> "RunConfig":
-    """The configuration that `crossgrad run` would have, with the scene filled in.
+    """Return the configuration that `crossgrad run` would use, with the scene filled in.
 
     Args:
-        settings: As in a configuration file, components in their long form: `{"name": ...}`.
+        settings: As in a configuration file, with components in their long form: `{"name": ...}`.
 
     Raises:
         UserError: A setting does not exist or has a wrong value.
@@ -275,7 +275,10 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
 
 
 def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
-    """Slot and choice of each component that a configuration names, links of a chain one by one."""
+    """Return slot and choice of each component that a configuration names.
+
+    A chain of operators gives one entry for each of its links.
+    """
     from crossgrad_core.config import AUTO, ComponentChoice
 
     found: list[tuple[str, ComponentChoice]] = []
@@ -289,7 +292,9 @@ def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
 
 
 def fingerprint(scene: "Scene", config: "RunConfig") -> str:
-    """A digest of what a scene is known by, wherever it lies: cameras, split, points, files.
+    """Return a digest that identifies a scene independently of its path.
+
+    The digest covers cameras, split, points and files.
 
     Raises:
         UserError: A photo or mask cannot be read.
@@ -303,13 +308,13 @@ def fingerprint(scene: "Scene", config: "RunConfig") -> str:
 
 
 def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
-    """The scene of a configuration, checked, and the name of the reader that read it.
+    """Return the scene of a configuration, checked, and the name of the reader that read it.
 
     Sets the number of CPU threads first.
 
     Raises:
-        UserError: No reader accepts the folder, the one that does cannot read it, or the scene
-            contradicts itself.
+        UserError: No reader accepts the folder, the reader cannot read it, or the scene contradicts
+            itself.
     """
     from crossgrad_core.numerics.threads import configure_threads
     from crossgrad_core.run import assemble as assembling
@@ -321,7 +326,7 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
 
 
 def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
-    """As `assemble`, and refuses what a new run refuses: settings and labels that do nothing.
+    """Like `assemble`, but also refuse settings and labels without effect, as a new run does.
 
     Raises:
         UserError: As `assemble`, or a setting would change nothing.
@@ -339,14 +344,14 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
 
 
 def resolved(setup: "Setup") -> dict[str, Any]:
-    """The configuration that a run would write: components with all options, as plain data."""
+    """Return the configuration that a run writes: components with all options, as plain data."""
     from crossgrad_core.run import resolve
 
     return resolve.resolved(setup).model_dump(mode="json")
 
 
 def available_cores() -> tuple[int, ...]:
-    """The numbers of the cores that this process may use, as many as its container's quota."""
+    """Return the numbers of the cores that this process may use, at most its container's quota."""
     import os
 
     from crossgrad_core.system import cores
@@ -357,7 +362,7 @@ def available_cores() -> tuple[int, ...]:
 
 
 def available_memory() -> int | None:
-    """Bytes of memory that can still be taken; None where the system does not say."""
+    """Return the bytes of memory that are still available; None if the system reports none."""
     import torch
 
     from crossgrad_core.training.memory import available_bytes
@@ -366,7 +371,7 @@ def available_memory() -> int | None:
 
 
 def summary_of(folder: Path) -> dict[str, Any] | None:
-    """The content of a run's summary.json; None before the run has ended, or where it is damaged.
+    """Return the content of a run's summary.json; None if missing or damaged.
 
     Imports no torch.
     """
@@ -381,7 +386,7 @@ def summary_of(folder: Path) -> dict[str, Any] | None:
 
 
 def with_steps(setup: "Setup", steps: int) -> "Setup":
-    """The run with the published schedule stretched to so many steps, whatever fills its slots."""
+    """Return the run with the published schedule stretched to `steps`, for any components."""
     from crossgrad_core.contract.schedule import Schedule
 
     counting = setup.schedule.counting
@@ -389,10 +394,12 @@ def with_steps(setup: "Setup", steps: int) -> "Setup":
 
 
 def affordable_steps(setup: "Setup", seconds: float) -> int:
-    """How many steps fit into seconds of training; compiles the kernels first, off that clock.
+    """Return how many steps fit into `seconds` of training.
+
+    The kernels are compiled first; this time does not count.
 
     Raises:
-        TrainingFailedError: Not even the steps that are tried out can be taken.
+        TrainingFailedError: The trial steps failed.
     """
     from crossgrad_core.training.budget import steps_for
     from crossgrad_core.training.start import warm_up
@@ -406,13 +413,13 @@ def affordable_steps(setup: "Setup", seconds: float) -> int:
 
 
 def take_steps(setup: "Setup", state: "TrainState") -> None:
-    """Trains to the end of the schedule without a folder: nothing is evaluated or saved.
+    """Train to the end of the schedule without a folder: nothing is evaluated or saved.
 
-    `state` is moved on in place. To watch, register a plugin first:
+    `state` is updated in place. To observe the training, register a plugin first:
     `setup.manager.register(plugin, name=...)`.
 
     Raises:
-        TrainingFailedError: Training failed; the state is the last one that was good.
+        TrainingFailedError: Training failed; `state` is the last good state.
     """
     from crossgrad_core.training.loop import Stopper, train
 
@@ -420,7 +427,7 @@ def take_steps(setup: "Setup", state: "TrainState") -> None:
 
 
 class _NoFolder:
-    """Where the results of steps without a folder go."""
+    """A stand-in for a run's folder that discards all results."""
 
     def evaluate(self, setup: "Setup", state: "TrainState") -> None:
         pass

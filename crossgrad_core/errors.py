@@ -1,24 +1,24 @@
-"""The one error type that users see, and how it is worded."""
+"""The error type for users, and the layout of its message."""
 
 from pathlib import Path
 from typing import Final
 
 from crossgrad_core.wording import one_line, showable
 
-#: Longest part of a message, and longest place; the middle of what is longer is left out.
+#: Longest part and longest place of a message; the middle of a longer text is left out.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
 
 
 class UserError(Exception):
-    """Bad input from the user: reported as one message with exit code 2, never as a traceback.
+    """Bad input from the user, reported as one message with exit code 2, never as a traceback.
 
     Args:
-        what: What is wrong, as a sentence without a full stop.
+        what: The problem, as a sentence without a full stop.
         where: The file, option or plugin concerned.
-        expected: What would have been right.
-        found: What was there instead.
-        todo: What the user can do about it.
+        expected: The value that would have been right.
+        found: The value that was there instead.
+        todo: The next step for the user.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class UserError(Exception):
         super().__init__(self.message())
 
     def message(self) -> str:
-        """The error as indented lines: what, where, expected, found, what to do."""
+        """Return the error as indented lines: what, where, expected, found, what to do."""
         rows = (
             ("where", _short(one_line(self.where), LONGEST_PLACE)),
             ("expected", _short(self.expected)),
@@ -44,7 +44,7 @@ class UserError(Exception):
 
 
 def _short(content: str, longest: int = LONGEST) -> str:
-    """A part as it is shown: cut after its control characters were written out, not before."""
+    """Return a part of a message, shortened after its control characters are escaped."""
     text = showable(content)
     if len(text) <= longest:
         return text
@@ -52,15 +52,15 @@ def _short(content: str, longest: int = LONGEST) -> str:
 
 
 class IncompatibleSelectionError(UserError):
-    """The selected components cannot work together; raised before training, with the reason."""
+    """The selected components cannot work together; raised before training, with the reasons."""
 
 
 class RunFailedError(Exception):
-    """Training failed; raised by `crossgrad_core.run` and `resume`. What there is was kept.
+    """Training failed; raised by `crossgrad_core.run` and `resume`. Existing results are kept.
 
     Args:
-        folder: The run's folder: results so far, log.txt, and checkpoints to go on from.
-        error: What went wrong.
+        folder: The run's folder: results so far, log.txt, and checkpoints to continue from.
+        error: The reason of the failure.
     """
 
     def __init__(self, folder: Path, error: str) -> None:

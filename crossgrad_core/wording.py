@@ -3,49 +3,49 @@
 import re
 from collections.abc import Iterable
 
-# Control characters could move the cursor or recolour the terminal, and those of bidirectional text
-# reorder a line; lone surrogates stand for bytes that are not UTF-8, and cannot be written to a
-# file.
+# Control characters could move the cursor or recolour the terminal. Characters of bidirectional
+# text reorder a line. Lone surrogates represent bytes that are not UTF-8; they cannot be written to
+# a file.
 _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def showable(text: str) -> str:
-    """Return text from any file as a terminal can show it; line feeds stay."""
+    """Return text in a form that a terminal can show; line feeds stay."""
     return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
 def one_line(text: object) -> str:
-    """Return text that stays within one line, such as a name or a path: line feeds are escaped."""
+    """Return text as one line, for names and paths: line feeds are escaped."""
     return showable(str(text)).replace("\n", "\\n")
 
 
 def singular(slot: str) -> str:
-    """The word for one member of a slot: `operators` -> `operator`, `losses` -> `loss`."""
+    """Return the word for one member of a slot: `operators` -> `operator`, `losses` -> `loss`."""
     return slot.removesuffix("es" if slot.endswith("sses") else "s")
 
 
 def with_article(noun: str) -> str:
-    """`a sampler`, `an operator`; as it is written, not as it sounds."""
+    """Return `a sampler` or `an operator`, chosen by the first letter, not by the sound."""
     return f"an {noun}" if noun[0] in "aeio" else f"a {noun}"
 
 
 def plural(word: str) -> str:
-    """The slot of one member's word, the inverse of `singular`."""
+    """Return the slot for the word of one member, the inverse of `singular`."""
     return f"{word}es" if word.endswith("ss") else f"{word}s"
 
 
 def count(number: int, noun: str) -> str:
-    """`1 photo`, `2 photos`."""
+    """Return a number with its noun: `1 photo`, `2 photos`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names as `a, b, c`; `none` where there are none."""
+    """Return names as `a, b, c`; `none` if there are no names."""
     return ", ".join(names) or "none"
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:
-    """`did you mean 'x'?` where one of the choices is close to `name`, else an empty string."""
+    """Return `did you mean 'x'?` if one of the choices is close to `name`, else an empty string."""
     from difflib import get_close_matches
 
     close = get_close_matches(name, list(choices), n=1)
@@ -53,11 +53,11 @@ def did_you_mean(name: str, choices: Iterable[str]) -> str:
 
 
 def sentences(*parts: str) -> str:
-    """The non-empty parts, joined by semicolons."""
+    """Return the non-empty parts, joined by semicolons."""
     return "; ".join(part for part in parts if part)
 
 
 def in_one_line(error: BaseException) -> str:
-    """Type and text of an exception without line breaks."""
+    """Return type and text of an exception without line breaks."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -31,28 +31,28 @@ INTERRUPTED = 130
 
 
 class WithPlugins(TyperGroup):
-    """The core's commands, and behind them those of installed plugins.
+    """The core's commands, followed by the commands of installed plugins.
 
-    Other packages are looked at only where the core's own commands do not answer; a plugin cannot
-    replace one of them.
+    Other packages are searched only if the core does not have the command. A plugin cannot replace
+    a command of the core.
     """
 
     @override
     def get_command(self, ctx: "Context", cmd_name: str) -> "Command | None":
-        """The command of that name."""
+        """Return the command of that name."""
         if cmd_name not in self.commands:
             self._add_plugins()
         return super().get_command(ctx, cmd_name)
 
     @override
     def list_commands(self, ctx: "Context") -> list[str]:
-        """The names of all commands."""
+        """Return the names of all commands."""
         self._add_plugins()
         return super().list_commands(ctx)
 
     @override
     def invoke(self, ctx: "Context") -> object:
-        """Runs a command; an interrupt ends it with the status that shells expect."""
+        """Run a command; an interrupt ends it with the exit status that shells expect."""
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
@@ -68,7 +68,7 @@ class WithPlugins(TyperGroup):
 
 
 def _plain(error: typer.BadParameter) -> str:
-    """What is wrong with a value, and which one, without the words of the library that found it."""
+    """Return the problem with a value and the value, without the terms of the library."""
     from pydantic import ValidationError
 
     message = error.message.removeprefix("Value error, ").replace("Input should be", "must be")
@@ -81,7 +81,7 @@ def _plain(error: typer.BadParameter) -> str:
 
 
 class PluginCommand(TyperCommand):
-    """Stands for a command of a plugin until it is called."""
+    """A placeholder for a command of a plugin until it is called."""
 
     def __init__(self, entry: registry.Entry) -> None:
         super().__init__(entry.name, callback=None, short_help=summary(entry))
@@ -90,7 +90,7 @@ class PluginCommand(TyperCommand):
     def make_context(
         self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: Any
     ) -> "Context":
-        """The context of the command itself, which is imported here.
+        """Return the context of the command itself; import the command first.
 
         Raises:
             UserError: Several packages offer the name, or the command cannot be imported.
@@ -142,12 +142,12 @@ app.command("export", cls=GroupedCommand)(trained.export)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the command line; bad input ends in one message and exit status 2.
+    """Run the command line; bad input ends in one message and exit status 2.
 
     Args:
-        arguments: What the user typed after `crossgrad`; `sys.argv[1:]` by default.
+        arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    if arguments is None:  # This process is the command's own.
+    if arguments is None:  # This process belongs to the command.
         outlast_readers()
     try:
         # Not `app()`, which would replace `sys.excepthook`.
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         told = error if isinstance(error, UserError) else failed_plugin(error)
         if told is None and isinstance(error, OSError) and is_too_long(error):
             told = path_too_long(error.filename)
-        if told is None:  # Our own mistakes keep their traceback.
+        if told is None:  # Bugs of crossgrad keep their traceback.
             raise
         finish()
         print(f"error: {told}", file=sys.stderr)  # noqa: T201

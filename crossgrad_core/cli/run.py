@@ -16,21 +16,21 @@ from crossgrad_core.system.command_options import print_all_options
 from crossgrad_core.system.startup import announce
 from crossgrad_core.wording import listed
 
-#: What only this start of the command is asked.
+#: Options that concern only this start of the command.
 _OF_THE_COMMAND: Final = frozenset(
     {"resume", "accept_scene", "accept_plugins", "check", "quiet", "verbose"}
 )
 
 
 def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
-    """Refuses what the user typed beside `--resume` where the run would not heed it.
+    """Refuse options given with `--resume` that the resumed run would ignore.
 
     Args:
-        run: The folder that goes on.
-        given: Option name -> value; None, False and empty lists where the user did not give it.
+        run: The folder of the run to resume.
+        given: Option name -> value; None, False and empty lists if the user did not give it.
 
     Raises:
-        UserError: Names each of them as the user typed it.
+        UserError: There are such options; the message names them as the user typed them.
     """
     typed = list(_typed(given))
     if typed:
@@ -79,7 +79,7 @@ def _own(
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
-#: What is no setting, below its heading: in front of the settings, behind the first of them, last.
+#: Options that are not settings: before the settings, after the first result setting, and last.
 _FRONT: Final = (
     _own(
         "config",
@@ -165,7 +165,7 @@ _LAST: Final = (
 
 
 def _parameters() -> Iterator[Parameter]:
-    """All parameters of the command in the order of its help."""
+    """Yield all parameters of the command in the order of its help."""
     for option in OPTIONS:
         if not option.flag.heading:
             yield _setting(option)
@@ -180,7 +180,7 @@ def _parameters() -> Iterator[Parameter]:
 
 
 def _setting(option: Option) -> Parameter:
-    """The parameter of a setting; None where the user does not give it."""
+    """Return the parameter of a setting; its value is None if the user does not give it."""
     flag = option.flag
     info = (
         typer.Option(
@@ -197,7 +197,7 @@ def _setting(option: Option) -> Parameter:
 
 
 def _with_options(function: Callable[..., None]) -> Callable[..., None]:
-    """The function with the signature that typer reads options from."""
+    """Return the function with the signature from which typer reads options."""
     parameters = list(_parameters())
     function.__dict__["__signature__"] = Signature(parameters)
     function.__annotations__ = {each.name: each.annotation for each in parameters}

@@ -1,4 +1,4 @@
-"""Standard streams that end no command: a reader may leave, and text may not fit the encoding."""
+"""Standard streams that never end a command: for closed readers and for limited encodings."""
 
 import io
 import os
@@ -16,11 +16,11 @@ _HIGHEST: Final = 2  # stderr
 
 
 def outlast_readers() -> None:
-    """Make stdout and stderr swallow what can no longer be read, and escape what is no plain text.
+    """Make stdout and stderr ignore failed writes, and escape characters that are not plain text.
 
-    A closed pipe (`| head`), a terminal that is gone or a full disk would otherwise end a training
-    of hours at its next line of progress. So would the name of a folder that the encoding of the
-    terminal lacks. What a run says stands in its log.txt as well.
+    Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
+    at the next progress line. A folder name that the terminal's encoding lacks would do the same.
+    The messages of a run are also in its log.txt.
     """
     _occupy()
     sys.stdout = _lasting(sys.stdout)
@@ -28,14 +28,14 @@ def outlast_readers() -> None:
 
 
 class _LastingFile(io.FileIO):
-    """A file that takes everything, whether or not it can be written."""
+    """A file that accepts all content, even if the content cannot be written."""
 
     @override
     def write(self, content: "Buffer", /) -> int:
-        """Writes what can be written; of the rest it is said that it was."""
+        """Write as much as possible, and report that everything was written."""
         try:
             written = super().write(content)
-            if written is None:  # Another process of the terminal told it not to wait.
+            if written is None:  # Another process set the terminal to non-blocking.
                 os.set_blocking(self.fileno(), True)
                 written = super().write(content)
         except OSError:
@@ -44,9 +44,9 @@ class _LastingFile(io.FileIO):
 
 
 def _occupy() -> None:
-    """Opens the null device for each standard stream that the caller closed (`2>&-`).
+    """Open the null device for each standard stream that the caller closed (`2>&-`).
 
-    The next file that is opened would otherwise take its number, and get what is meant for it.
+    Otherwise the next opened file would get the stream's number, and with it the stream's output.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= _HIGHEST:
         pass
@@ -54,7 +54,7 @@ def _occupy() -> None:
 
 
 def _lasting(stream: TextIO | None) -> TextIO:
-    """Return a stream over the same file; one of another kind (a Windows console) as it is."""
+    """Return a stream over the same file that never fails; other kinds (a Windows console) stay."""
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")
     if not isinstance(stream, io.TextIOWrapper):

@@ -107,7 +107,7 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
 
 class Split(StrEnum):
-    """Which views are drawn."""
+    """The choice of views to draw."""
 
     TEST = "test"
     TRAIN = "train"
@@ -169,7 +169,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
 
 def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:
-    """Refuses an option that would do nothing beside another."""
+    """Refuse an option that would do nothing together with another one."""
     if option[1] is not None and other[1] is not None:
         raise UserError(
             f"{option[0]} does nothing beside {other[0]}: {why}",

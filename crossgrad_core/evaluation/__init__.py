@@ -1,1 +1,1 @@
-"""Drawing held-out views and measuring them."""
+"""Rendering of held-out views and their metrics."""

@@ -1,10 +1,10 @@
-"""Evaluation of held-out views: every metric of each, means overall and per regime, PSNR.
+"""Evaluation of held-out views: metrics of each view, means overall and per regime, and PSNR.
 
-Source: 3DGS evaluation scripts; each render is rounded to 8 bits per channel before it is compared,
-metrics are means over images. Masked pixels do not count.
+Both images are clamped to [0, 1] and rounded to 8 bits per channel before the comparison, as if the
+render had been written to a file and read back. Masked pixels do not count. Metrics are means over
+images.
 
-Both images are clamped to [0, 1] and rounded to 8 bits first, as if the render had been written to
-a file and read back. With a mask only kept pixels count.
+Source: 3DGS evaluation scripts.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,16 +19,17 @@ from crossgrad_core.contract.scene import View, to_uint8
 from crossgrad_core.contract.slots.metric import Compared, Metric
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
 
-#: PSNR of identical images, in dB. JSON has no infinity, and a mean over views must stay finite;
-#: images that differ reach it only if fewer than one value in 150,000 is off, by one 8-bit step.
+#: PSNR of identical images, in dB. It is finite, because JSON has no infinity and a mean over views
+#: must stay finite. Different images reach it only if fewer than one value in 150,000 differs, by
+#: one 8-bit step.
 PSNR_LIMIT = 100.0
-#: Pixels whose differences stay in the cache until they are summed.
+#: Number of pixels whose differences stay in the cache until they are summed.
 _AT_ONCE = 2**15
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """A view with what was compared and its figures."""
+    """A view with its compared images and its metrics."""
 
     compared: Compared
     metrics: ViewMetrics
@@ -41,14 +42,14 @@ def evaluate(
     on_view: Callable[[Evaluated], None] | None = None,
     points: NDArray[np.float64] | None = None,
 ) -> EvaluationResult:
-    """Renders and measures the views, one at a time.
+    """Render and measure the views, one at a time.
 
     Args:
-        views: The held-out views; none gives figures that are null, with the reason.
-        render_one: [H, W, 3] float image of a view, on any device, need not be clamped.
-        metrics: What is measured.
-        on_view: Told each view with its render, for panels.
-        points: [P, 3] SfM points of the scene, local frame, for figures that need them.
+        views: The held-out views; without any, all metrics are null, with the reason.
+        render_one: Returns the [H, W, 3] float image of a view, on any device; need not be clamped.
+        metrics: The metrics to measure.
+        on_view: Called with each view and its render, for panels.
+        points: [P, 3] SfM points of the scene, local frame, for metrics that need them.
     """
     measured = []
     with torch.no_grad():
@@ -62,7 +63,7 @@ def evaluate(
 
 
 def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = None) -> Compared:
-    """The view's photo and its render [H, W, 3], rounded to 8 bits, and the points it observed."""
+    """Return a view's photo and render [H, W, 3], rounded to 8 bits, and the points it observed."""
     photo, mask = view.photo.image(), view.photo.mask()
     seen = np.zeros((0, 3)) if points is None else points[view.seen]
     return Compared(view, to_uint8(render), photo, mask, render.detach().cpu(), seen)
@@ -70,7 +71,7 @@ def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = Non
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
     found = {metric.figure.name: metric.measure(compared) for metric in metrics}
-    # Of a tensor, say, files would hold the text.
+    # Convert to float: of a tensor, for example, files would contain the text form.
     values = {name: None if value is None else float(value) for name, value in found.items()}
     view, mask = compared.view, compared.mask
     masked = mask is not None and not bool(mask.any())
@@ -78,7 +79,7 @@ def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """Peak signal-to-noise ratio over all kept pixels and channels, in dB.
+    """Return the peak signal-to-noise ratio over all kept pixels and channels, in dB.
 
     Args:
         image: [H, W, 3] in [0, 1], or uint8.
@@ -96,7 +97,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     )
     if rendered.numel() == 0:
         return None
-    # All of these are whole numbers that float32 and float64 hold, in whatever order.
+    # Squares and sums are whole numbers, which float32 and float64 represent exactly.
     total = 0.0
     for ours, theirs in zip(
         *(torch.split(each, _AT_ONCE) for each in (rendered, photo)), strict=True

@@ -1,4 +1,4 @@
-"""Results of an evaluation: figures per view, means overall and per regime. Imports no torch."""
+"""Results of an evaluation: metrics per view, means overall and per regime. Imports no torch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,13 +12,13 @@ ALL_MASKED = "every pixel is masked"
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """The figures of one view.
+    """The metrics of one view.
 
     Attributes:
         name: Name of the view.
         regime: Its regime.
-        values: Name of a figure -> value; None where there is none.
-        masked: Whether no pixel of it counts.
+        values: Name of a metric -> value; None if there is no value.
+        masked: True if all its pixels are masked.
     """
 
     name: str
@@ -32,7 +32,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views that are not masked as a whole; None where none has the figure."""
+    """Means over `views` views, not counting fully masked ones; None if no view has the metric."""
 
     views: int
     values: Mapping[str, float | None]
@@ -41,7 +41,7 @@ class Means:
         return self.values[figure]
 
     def as_data(self) -> dict[str, float | int | None]:
-        """The number of views and the figures by name."""
+        """Return the number of views and the metrics by name."""
         return {"views": self.views, **self.values}
 
 
@@ -50,11 +50,11 @@ class EvaluationResult:
     """The results of an evaluation.
 
     Attributes:
-        figures: What was measured, in the order of all tables.
-        views: Figures of each view, in the order of the scene.
+        figures: The measured metrics, in the order of all tables.
+        views: Metrics of each view, in the order of the scene.
         overall: Means over all views.
         regimes: Regime -> means over its views, sorted by name.
-        reasons: Name of a figure -> why it is null.
+        reasons: Name of a metric -> why it is null.
     """
 
     figures: tuple[Figure, ...]
@@ -65,7 +65,7 @@ class EvaluationResult:
 
 
 def summarised(views: Sequence[ViewMetrics], figures: Sequence[Figure]) -> EvaluationResult:
-    """Means overall and per regime of views that were measured."""
+    """Return the results with means overall and per regime."""
     names = sorted({view.regime for view in views})
     regimes = {
         name: _means([view for view in views if view.regime == name], figures) for name in names

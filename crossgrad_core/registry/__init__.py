@@ -1,1 +1,1 @@
-"""Which plugins there are, what slots they fill, and how a run calls them."""
+"""The installed plugins, the slots that they fill, and the way a run calls them."""

@@ -1,4 +1,4 @@
-"""Commands by name: described without importing them, imported when they are called."""
+"""Commands by name: described without an import, imported when they are called."""
 
 import ast
 import inspect
@@ -17,15 +17,15 @@ from crossgrad_core.system.command_options import GroupedCommand
 if TYPE_CHECKING:
     from typer import _click as click
 
-#: What an entry point in the group `crossgrad.commands` names.
+#: The object that an entry point in the group `crossgrad.commands` names.
 Command: TypeAlias = "typer.Typer | Callable[..., Any]"
 
 
 def load_command(entry: Entry) -> Command:
-    """The typer app or function that an entry point names; imports its module.
+    """Return the typer app or function that an entry point names; import its module.
 
     Raises:
-        UserError: It cannot be imported, or is something else.
+        UserError: It cannot be imported, or is another kind of object.
     """
     found = resolve_entry(entry)
     if isinstance(found, typer.Typer) or inspect.isfunction(found):
@@ -40,11 +40,11 @@ def load_command(entry: Entry) -> Command:
 
 
 def as_group_member(command: Command, name: str) -> "click.Command":
-    """The command as `crossgrad` calls it.
+    """Return the command in the form in which `crossgrad` calls it.
 
     Args:
-        command: A typer app, or a function; of a function, the help groups its options.
-        name: Name that users type.
+        command: A typer app, or a function; the help groups the options of a function.
+        name: The name that users type.
     """
     if not isinstance(command, typer.Typer):
         app = typer.Typer(rich_markup_mode=None, add_completion=False)
@@ -54,9 +54,9 @@ def as_group_member(command: Command, name: str) -> "click.Command":
 
 
 def summary(entry: Entry) -> str:
-    """What a command does, in the first line of its docstring, or of its module's.
+    """Return the first line of a command's docstring, or of its module's docstring.
 
-    The source is read, not run; where there is none, the line says who offers the command.
+    The source is read, not run. Without a source or a docstring, the line names the package.
     """
     module, _, name = entry.value.partition(":")
     try:
@@ -70,10 +70,10 @@ def summary(entry: Entry) -> str:
 
 
 def _source(module: str) -> bytes:
-    """The source of a module; unlike `importlib.util.find_spec` this imports no parent package.
+    """Return the source of a module; unlike `importlib.util.find_spec`, import no parent package.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: There is no such module.
     """
     parts = module.split(".")
     path: list[str] | None = None

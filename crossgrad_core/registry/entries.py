@@ -1,8 +1,8 @@
-"""Plugins by name: listed from package metadata, imported only when a run asks for them.
+"""Plugins by name: listed from package metadata, imported only when a run needs them.
 
-Listing reads entry points and imports no plugin, no torch and no pydantic. Loading is loud: an
-unknown name, a name that two distributions offer, a plugin that fails to import and an object of
-the wrong kind are errors that name the plugin and its distribution.
+Listing reads entry points and imports no plugin, no torch and no pydantic. Loading never fails
+silently: it raises an error that names the plugin and its distribution if a name is unknown, if two
+distributions offer the name, if the plugin fails to import, or if it has the wrong kind.
 """
 
 import sys
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     C = TypeVar("C", bound=Component)
 
 
-#: The distribution whose own plugins these are.
+#: The distribution of crossgrad's own plugins.
 OURS: Final = "crossgrad"
 
 
@@ -45,9 +45,9 @@ class Entry:
     """One plugin as its distribution announces it.
 
     Attributes:
-        name: Name that users type.
+        name: The name that users type.
         slot: Slot that it fills, a key of `OFFERED`, or `planners`.
-        value: Where its class is: `module:Class`.
+        value: The place of its class: `module:Class`.
         distribution: Name of the distribution that offers it.
         version: Version of that distribution.
     """
@@ -60,22 +60,22 @@ class Entry:
 
     @property
     def package(self) -> str:
-        """The import package or module that holds its class."""
+        """The import package or module that contains its class."""
         return self.value.partition(":")[0].partition(".")[0].strip()
 
     @property
     def file(self) -> str | None:
-        """The source file of its module, once that is imported."""
+        """The source file of its module; None before the module is imported."""
         return getattr(sys.modules.get(self.value.partition(":")[0].strip()), "__file__", None)
 
     @property
     def origin(self) -> str:
-        """Where it comes from, for messages."""
+        """The place of its class and its distribution, for messages."""
         return f"{self.value}, from {self.distribution} {self.version}"
 
 
 def offers(slot: str) -> tuple[Entry, ...]:
-    """All that installed distributions offer for a slot, by name; a name may occur twice.
+    """Return all entries of installed distributions for a slot, by name; names may repeat.
 
     Raises:
         KeyError: There is no such slot.
@@ -84,7 +84,7 @@ def offers(slot: str) -> tuple[Entry, ...]:
 
 
 def entries(slot: str) -> dict[str, Entry]:
-    """Name -> entry for a slot. Imports no plugin.
+    """Return name -> entry for a slot. Imports no plugin.
 
     Raises:
         KeyError: There is no such slot.
@@ -93,7 +93,7 @@ def entries(slot: str) -> dict[str, Entry]:
 
 
 def find(slot: str, name: str) -> Entry:
-    """The one entry of that name.
+    """Return the only entry of that name.
 
     Raises:
         UserError: No distribution offers the name, or more than one does.
@@ -121,27 +121,27 @@ def load(slot: "type[C]", name: str) -> "type[C]": ...
 @overload
 def load(slot: str, name: str) -> "type[Component]": ...
 def load(slot: "str | type[Component]", name: str) -> "type[Component]":
-    """The class that fills a slot under a name; imports its module.
+    """Return the class that fills a slot under a name; import its module.
 
     Args:
-        slot: Name of the slot, or its base class, which the answer is a subclass of.
+        slot: Name of the slot, or its base class; the returned class is a subclass of it.
         name: Name of the plugin.
 
     Raises:
-        UserError: The name is unknown or ambiguous, the plugin fails to import, or what it offers
-            is no complete subclass of the slot's base class, or has methods that take other
+        UserError: The name is unknown or ambiguous, the plugin fails to import, or its object is
+            not a complete subclass of the slot's base class or has methods that take other
             arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
 
 def load_entry(entry: Entry) -> "type[Component]":
-    """The class that an entry points at; see `load`."""
+    """Return the class that an entry names; see `load`."""
     return _checked(entry, resolve_entry(entry))
 
 
 def resolve_entry(entry: Entry) -> object:
-    """Whatever an entry points at; imports its module.
+    """Return the object that an entry names; import its module.
 
     Raises:
         UserError: It cannot be imported, or its package requires another version of crossgrad.
@@ -163,10 +163,10 @@ def resolve_entry(entry: Entry) -> object:
 
 
 def refuse_other_version(entry: Entry) -> None:
-    """Refuses a plugin whose package requires another version of crossgrad than this one.
+    """Refuse a plugin whose package requires another version of crossgrad than this one.
 
     Raises:
-        UserError: It does; names the package and what it requires.
+        UserError: It does; the message names the package and its requirement.
     """
     if required := unmet_requirement(entry.distribution):
         raise UserError(
@@ -180,16 +180,16 @@ def refuse_other_version(entry: Entry) -> None:
 
 
 def notes_on(error: BaseException) -> list[str]:
-    """In which step, and in which hook of which plugin, an exception was raised, if noted."""
-    # The hook notes it first.
+    """Return the notes on the step, hook and plugin in which an exception was raised."""
+    # The hook adds its note first.
     return list(reversed(getattr(error, "__notes__", ())))
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return the function that answers for a component before its class is imported, or None.
+    """Return a function that answers for a component without importing its class, or None.
 
-    A package may announce one under the name of its component: one that answers as `accepts` of
-    the reader with its default options, or as `speed` of the rasterizer.
+    A package may announce such a function under the name of its component. The function answers
+    like `accepts` of a reader with default options, or like `speed` of a rasterizer.
 
     Raises:
         UserError: It cannot be imported.
@@ -201,12 +201,12 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
 
 
 def failed_plugin(error: Exception) -> UserError | None:
-    """What to say of an exception that came out of another package's code; None of our own."""
+    """Return the error for an exception from another package's code; None for crossgrad's own."""
     others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
     found = [(entry, place) for entry in others if (place := raised_at(error, entry.package))]
     if not found:
         return None
-    # Of two distributions that share a package, the one whose module it is.
+    # If two distributions share a package, prefer the one that contains the module.
     entry, place = next((one for one in found if one[1].startswith(f"{one[0].file}:")), found[0])
     return UserError(
         f"a plugin of {entry.distribution} {entry.version} failed",
@@ -217,7 +217,7 @@ def failed_plugin(error: Exception) -> UserError | None:
 
 
 def from_elsewhere(names: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """A note on each distribution but crossgrad's own that components come from.
+    """Return a note on each distribution, except crossgrad, that components come from.
 
     Args:
         names: Slot -> names of components.
@@ -236,10 +236,10 @@ def build(slot: "type[C]", name: str, options: Mapping[str, Any]) -> "C": ...
 @overload
 def build(slot: str, name: str, options: Mapping[str, Any]) -> "Component": ...
 def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) -> "Component":
-    """The component of that name with validated options.
+    """Return the component of that name with validated options.
 
     Args:
-        slot: Name of the slot, or its base class, which the answer is an instance of.
+        slot: Name of the slot, or its base class; the returned component is an instance of it.
         name: Name of the plugin.
         options: Name of an option -> value.
 
@@ -266,7 +266,7 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
 
 
 def installed_as(kind: "type[Component]") -> Entry | None:
-    """The entry of a class; None where no package offers it."""
+    """Return the entry of a class; None if no package offers the class."""
     package = kind.__module__.partition(".")[0]
     for entry in entries(kind.slot).values():
         module, _, attribute = entry.value.partition(":")
@@ -278,23 +278,23 @@ def installed_as(kind: "type[Component]") -> Entry | None:
 
 
 def name_of(component: "Component") -> str:
-    """The name under which a component is installed, else that of its class."""
+    """Return the name under which a component is installed, else the name of its class."""
     kind = type(component)
     entry = installed_as(kind)
     return kind.__name__ if entry is None else entry.name
 
 
 def plain(component: "Component") -> dict[str, Any]:
-    """A component as a configuration has it: its name, and the options that are no defaults."""
+    """Return a component as in a configuration: its name and its options that are not defaults."""
     return {"name": name_of(component), **component.model_dump(mode="json", exclude_defaults=True)}
 
 
 @cache
 def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG001 - cache key
-    """Slot -> entries; `path` is `sys.path`, so that a changed path is looked at again."""
+    """Return slot -> entries; `path` is `sys.path`, so that a changed path is scanned again."""
     from importlib.metadata import entry_points
 
-    # One unfiltered call: each one scans every installed distribution.
+    # One call without a filter, because each call scans every installed distribution.
     points = entry_points()
     found: dict[str, tuple[Entry, ...]] = {}
     groups = [*OFFERED.items(), (PLANNERS, f"crossgrad.{PLANNERS}")]
@@ -312,7 +312,7 @@ def _offers(path: tuple[str, ...]) -> dict[str, tuple[Entry, ...]]:  # noqa: ARG
 
 @cache
 def _identity(distribution: "Distribution | None") -> tuple[str, str]:
-    """Name and version; cached because each look parses the distribution's metadata file."""
+    """Return name and version; cached, because each access parses the metadata file."""
     if distribution is None:
         return "unknown", "unknown"
     metadata = distribution.metadata
@@ -335,7 +335,7 @@ def _unknown(slot: str, name: str) -> UserError:
 
 
 def _resolve(value: str) -> object:
-    """The object at `module:attribute.attribute`."""
+    """Return the object at `module:attribute.attribute`."""
     module, _, attributes = value.partition(":")
     path = filter(None, attributes.split("."))
     return reduce(getattr, path, import_module(module.strip()))

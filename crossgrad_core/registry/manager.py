@@ -1,7 +1,7 @@
-"""One plugin manager per run, and first-result hooks, which must answer.
+"""One plugin manager per run, and first-result hooks, which must return an answer.
 
-pluggy is quiet about a hook that is not specified, a hook method without its mark and a second
-plugin that answers first. All three are errors here, with the plugin's name.
+pluggy does not report an unknown hook, a hook method without its mark, or a second plugin that
+answers a first-result hook. All three are errors here, with the plugin's name.
 """
 
 import inspect
@@ -37,9 +37,9 @@ _MARK = f"{PROJECT}_impl"
 
 
 class _Manager(pluggy.PluginManager):
-    """A manager that asks pluggy only about attributes that can be hooks.
+    """A manager that passes only attributes to pluggy that can be hooks.
 
-    A component has a hundred attributes, and pluggy takes its time over each: 0.3 s of every start.
+    A component has a hundred attributes, and pluggy is slow for each: 0.3 s of every start.
     """
 
     def __init__(self, project: str) -> None:
@@ -48,21 +48,20 @@ class _Manager(pluggy.PluginManager):
 
     @override
     def parse_hookimpl_opts(self, plugin: object, name: str) -> Any:
-        if self._asked[0] is not plugin:  # pluggy asks for one plugin after the other.
+        if self._asked[0] is not plugin:  # pluggy handles one plugin after the other.
             self._asked = plugin, _may_be_hooks(plugin)
         return super().parse_hookimpl_opts(plugin, name) if name in self._asked[1] else None
 
 
 def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
-    """A fresh manager with the hooks and the given plugins registered.
+    """Return a new manager with the hooks and the given plugins registered.
 
     Args:
-        plugins: Name -> plugin. Of two wrappers of one hook the later one is the outer one.
+        plugins: Name -> plugin. If two plugins wrap one hook, the later one is the outer wrapper.
 
     Raises:
-        UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, a
-            hook with other arguments than the hook's, or answers a hook that another plugin
-            answers.
+        UserError: A plugin has a hook that does not exist, a hook method without `@hookimpl`, or a
+            hook method with wrong arguments; or two plugins answer the same first-result hook.
     """
     manager = _Manager(PROJECT)
     manager.add_hookspecs(HookSpecs)
@@ -83,11 +82,11 @@ def make_manager(plugins: Mapping[str, object]) -> pluggy.PluginManager:
 
 
 def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> A:
-    """The answer of a hook, checked.
+    """Call a first-result hook and return its answer, checked.
 
     Args:
         hook: A hook that stops at the first answer, such as `manager.hook.crossgrad_densify`.
-        context: What the plugins are offered.
+        context: The argument that the plugins receive.
         answer: Type of the answer.
 
     Raises:
@@ -107,11 +106,11 @@ def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: typ
 
 
 def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> list[A]:
-    """The answers of all plugins to a hook, checked.
+    """Call a hook that several plugins answer and return all answers, checked.
 
     Args:
-        hook: One that all answer who have it, such as `manager.hook.crossgrad_after_step`.
-        context: What the plugins are offered.
+        hook: A hook that all plugins answer, such as `manager.hook.crossgrad_after_step`.
+        context: The argument that the plugins receive.
         answer: Type of the answers.
 
     Raises:
@@ -125,7 +124,7 @@ def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> 
 
 
 def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserError:
-    """Return the error about an answer to a hook that the run cannot use."""
+    """Return the error for an answer to a hook that the run cannot use."""
     return UserError(
         f"a plugin answers {hook.name} with something else",
         where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
@@ -138,8 +137,8 @@ def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserErro
 def one_by_one(manager: pluggy.PluginManager, name: str) -> tuple[pluggy.HookCaller, ...]:
     """Return a caller for each plugin that answers a hook, in the order of registration.
 
-    Each of them asks one plugin, so that the next one can be asked about its answer. Wrappers take
-    part in every call.
+    Each caller calls one plugin, so that the next plugin can receive the answer of the previous
+    one. Wrappers take part in every call.
     """
     answering = [
         implementation.plugin
@@ -153,7 +152,7 @@ def one_by_one(manager: pluggy.PluginManager, name: str) -> tuple[pluggy.HookCal
 
 
 def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
-    """Lets exceptions that hooks of a plugin raise say whose hook it was."""
+    """Add a note to exceptions from hooks of a plugin that names the hook and the plugin."""
     whose = _described(name, plugin)
     for caller in manager.get_hookcallers(plugin) or ():
         for implementation in caller.get_hookimpls():
@@ -163,7 +162,7 @@ def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> 
 
 
 def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
-    """The function, which may be a wrapper; the note is on every exception that it raises first."""
+    """Return the function (it may be a wrapper), which then adds the note to its own exceptions."""
 
     def call(*arguments: object) -> object:
         try:
@@ -183,7 +182,7 @@ def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
 
 
 def _add_note(error: BaseException, note: str) -> None:
-    # What a wrapper passes on is another plugin's, and was noted there.
+    # An exception that a wrapper passes on comes from another plugin and already has a note.
     if not any(each.startswith("in hook ") for each in getattr(error, "__notes__", ())):
         error.add_note(note)
 
@@ -196,7 +195,7 @@ def _described(name: str, plugin: object) -> str:
 
 
 def _complete(answer: Answer) -> bool:
-    """Whether an answer's own part is of its type: a None inside must not go unnoticed either."""
+    """Return True if the content of an answer has its type; a None inside is an error, too."""
     match answer:
         case SampleResult():
             return bool(answer.draw)
@@ -211,9 +210,9 @@ def _complete(answer: Answer) -> bool:
 
 
 def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
-    """Raises for hooks that do not exist; replaces pluggy's own `check_pending`.
+    """Raise an error for hooks that do not exist; replaces pluggy's own `check_pending`.
 
-    That one sees only marked methods and suggests no name.
+    `check_pending` sees only marked methods and suggests no name.
     """
     for attribute in dir(plugin):
         options = manager.parse_hookimpl_opts(plugin, attribute)
@@ -227,7 +226,7 @@ def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: obj
 
 
 def _may_be_hooks(plugin: object) -> frozenset[str]:
-    """The attributes that are marked, or of a kind that only pluggy can tell."""
+    """Return the attributes that are marked, or of a kind that only pluggy can classify."""
     if inspect.isclass(plugin) or inspect.ismodule(plugin):
         return frozenset(dir(plugin))
     found: dict[str, object] = {}
@@ -238,7 +237,7 @@ def _may_be_hooks(plugin: object) -> frozenset[str]:
 
 
 def _may_be_hook(attribute: object) -> bool:
-    """Whether an attribute of a class is marked, or of a kind that only pluggy can tell."""
+    """Return True if a class attribute is marked, or of a kind that only pluggy can classify."""
     if isinstance(attribute, FunctionType):
         return hasattr(attribute, _MARK)
     if isinstance(attribute, staticmethod | classmethod | MethodType):
@@ -275,7 +274,7 @@ def _no_such_hook(name: str, plugin: object, hook: str) -> UserError:
 
 
 def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
-    """Raises where two plugins answer one hook: the later one would silently replace the other."""
+    """Refuse two plugins that answer one hook: the later one would replace the other silently."""
     for hook in _HOOKS:
         caller: pluggy.HookCaller = getattr(manager.hook, hook)
         spec = caller.spec

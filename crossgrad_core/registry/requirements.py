@@ -1,4 +1,4 @@
-"""Which versions of crossgrad the package of a plugin says that it works with."""
+"""The versions of crossgrad that the package of a plugin requires."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ CROSSGRAD: Final = "crossgrad"
 
 
 def unmet_requirement(distribution: str) -> str:
-    """What a distribution requires of crossgrad, if this version is another; else empty."""
+    """Return a distribution's requirement on crossgrad if this version fails it; else empty."""
     if distribution == CROSSGRAD:
         return ""
     from importlib.metadata import PackageNotFoundError, requires
@@ -18,7 +18,7 @@ def unmet_requirement(distribution: str) -> str:
         lines = requires(distribution) or []
     except (PackageNotFoundError, ValueError):
         return ""
-    # Packages have many requirements, and few of them begin like this one.
+    # Packages have many requirements; few of them begin with this name.
     return next(filter(None, map(_refusing, filter(_may_be_ours, lines))), "")
 
 
@@ -27,7 +27,7 @@ def _may_be_ours(line: str) -> bool:
 
 
 def _refusing(line: str) -> str:
-    """The requirement in a line of metadata, if it excludes this version of crossgrad."""
+    """Return the requirement in a line of metadata if it excludes this version of crossgrad."""
     from packaging.requirements import InvalidRequirement, Requirement
 
     try:

@@ -1,4 +1,4 @@
-"""Checks of a component's methods against their calls, and places in its source."""
+"""Checks of a component's methods against the calls, and places in its source for messages."""
 
 import inspect
 import traceback
@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Final
 
 _POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-#: Where the methods are defined that crossgrad calls.
+#: The package that defines the methods that crossgrad calls.
 _CONTRACT: Final = "crossgrad_core.contract."
 
 
 @cache
 def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...]:
-    """Methods that cannot be called like those of the base class that they replace.
+    """Return the methods that cannot be called like the base class's methods.
 
     Hooks are left out: they may take fewer arguments.
 
@@ -25,7 +25,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         base: The base class of a slot.
 
     Returns:
-        The name, the signature of the base class and the one that was found, of each.
+        Name, signature in the base class and signature found, for each such method.
     """
     contract = [each for each in base.__mro__ if each.__module__.startswith(_CONTRACT)]
     names = dict.fromkeys(name for each in contract for name in vars(each))
@@ -35,7 +35,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         if name.startswith(("_", "crossgrad_")) or own is theirs:
             continue
         if isfunction(theirs) and isfunction(own):
-            # A decorator may pass arguments of its own: what it takes itself counts.
+            # A decorator may pass arguments of its own; its own signature counts.
             expected, given = signature(theirs), signature(own, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
                 wrong.append((name, str(expected), str(given)))
@@ -43,7 +43,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
-    """Whether a call with all arguments, or with those that have no default, can be made."""
+    """Return True if a call with all arguments, or only with the required ones, is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
     positional = [each for each in passed if each.kind in _POSITIONAL]
     named = {each.name: None for each in passed if each.kind is Parameter.KEYWORD_ONLY}
@@ -55,10 +55,10 @@ def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
 
 
 def raised_at(error: BaseException, package: str) -> str:
-    """The innermost line of a package that an exception passed; empty where it passed none.
+    """Return the innermost line of a package that raised or passed an exception; else empty.
 
     Args:
-        error: The exception, or one that was raised from it.
+        error: The exception; exceptions that caused it are searched, too.
         package: Name of the import package or module.
     """
     roots = _roots(package)
@@ -73,7 +73,7 @@ def raised_at(error: BaseException, package: str) -> str:
 
 
 def defined_at(thing: object) -> str:
-    """Where a class or function is defined; empty where it has no source."""
+    """Return the place of the definition of a class or function; empty without a source."""
     try:
         return f"{inspect.getsourcefile(thing)}:{inspect.getsourcelines(thing)[1]}"  # type: ignore[arg-type]
     except (TypeError, OSError):
@@ -81,7 +81,7 @@ def defined_at(thing: object) -> str:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """The exception and those that it was raised from."""
+    """Yield the exception and the exceptions that caused it."""
     each: BaseException | None = error
     while each is not None:
         yield each
@@ -89,7 +89,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def _roots(package: str) -> tuple[Path, ...]:
-    """The folders of a package, or the file of a module; nothing is imported."""
+    """Return the folders of a package, or the file of a module; import nothing."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):

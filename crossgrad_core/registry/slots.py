@@ -1,4 +1,4 @@
-"""The slots that plugins fill, their entry-point groups, and groups that do not exist.
+"""The slots that plugins fill, their entry-point groups, and entry points in unknown groups.
 
 Imports nothing heavy.
 """
@@ -35,23 +35,23 @@ GROUPS: Final[dict[str, str]] = {
 LISTS: Final = ("metrics", "observers")
 #: Slots that a run fills with any number of components; `rules` is a mapping of names.
 MANY: Final = (*LISTS, "rules")
-#: What packages offer as commands of `crossgrad`; no slot of a run.
+#: The group of commands that packages add to `crossgrad`; not a slot of a run.
 COMMANDS: Final = "commands"
 #: Everything that packages can offer -> entry-point group.
 OFFERED: Final[dict[str, str]] = {**GROUPS, COMMANDS: f"crossgrad.{COMMANDS}"}
-#: What decides settings of a run by its scene (`--plan`); no slot of a run either.
+#: The group of planners, which decide settings of a run by its scene (`--plan`); not a slot.
 PLANNERS: Final = "planners"
-#: Slot -> entry-point group of the functions that answer a question of `auto` before a component is
-#: imported: `accepts` of a reader, `speed` of a rasterizer.
+#: Slot -> entry-point group of functions that answer for `auto` before a component is imported:
+#: `accepts` of a reader, `speed` of a rasterizer.
 QUICK: Final = {
     "readers": "crossgrad.readers.accepts",
     "rasterizers": "crossgrad.rasterizers.speed",
 }
-#: The core's own commands, which no plugin replaces.
+#: The core's own commands; no plugin replaces them.
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
 _KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"
-#: How alike a group has to be that does not begin with `crossgrad`.
+#: Similarity above which a group without the prefix `crossgrad` counts as misspelt.
 _ALIKE: Final = 0.85
 
 
@@ -62,7 +62,7 @@ class Stray:
     Attributes:
         name: Its name.
         group: The group that it is in.
-        meant: The group that is probably meant; empty where none is alike.
+        meant: The group that is probably meant; empty if no group is similar.
         distribution: Name of its distribution.
         version: Version of that distribution.
     """
@@ -80,13 +80,13 @@ class Stray:
 
     @property
     def reason(self) -> str:
-        """Why it is not read, and what to do."""
+        """The reason why it is not read, and what to do."""
         right = f"write {self.meant}" if self.meant else f"the groups are {', '.join(_KNOWN)}"
         return f"there is no entry-point group {self.group}: {right}"
 
 
 def strays() -> Iterator[Stray]:
-    """The entry points of all installed distributions that are in such groups."""
+    """Yield the entry points of installed distributions that are in unknown crossgrad groups."""
     from importlib.metadata import entry_points
 
     points = entry_points()
@@ -105,7 +105,7 @@ def _is_like_ours(group: str) -> bool:
 
 
 def _meant(group: str) -> str:
-    """The group that is meant: that of a slot's single word, or the one that is written alike."""
+    """Return the group that is probably meant: by its singular word, or by similar spelling."""
     from difflib import get_close_matches
 
     slot = plural(group.lower().removeprefix(_PREFIX).strip("._-:"))

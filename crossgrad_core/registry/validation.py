@@ -1,4 +1,4 @@
-"""Pydantic's validation errors in the words of a user error."""
+"""Conversion of pydantic's validation errors to user errors."""
 
 from collections.abc import Sequence
 from types import NoneType, UnionType
@@ -18,14 +18,14 @@ _PREFIXES = ("Input should be ", "Value error, ", "Assertion failed, ")
 def as_user_error(
     error: ValidationError, model: type[BaseModel], *, subject: str, prefix: str = "", todo: str
 ) -> UserError:
-    """The first of the validation errors, with the names of the others.
+    """Return a user error for the first validation error, with the names of the others.
 
     Args:
-        error: What pydantic found.
-        model: The model that was validated; its fields are the options that are suggested.
-        subject: What has these options, for example `operator cagrad`.
-        prefix: Where its options are in a configuration, for example `operator`.
-        todo: What the user can do about it.
+        error: The error of pydantic.
+        model: The validated model; its fields are the options that are suggested.
+        subject: The owner of the options, for example `operator cagrad`.
+        prefix: The place of the options in a configuration, for example `operator`.
+        todo: Advice for the user.
     """
     details = error.errors(include_url=False)
     first, places = details[0], [_place(model, each["loc"]) for each in details]
@@ -55,9 +55,9 @@ def as_user_error(
 def _place(
     model: type[BaseModel], location: _Location
 ) -> tuple[tuple[str, ...], type[BaseModel] | None]:
-    """The place in the input that a location of pydantic means, and the model that holds it.
+    """Return the place in the input that a pydantic location names, and the model that holds it.
 
-    A location also names the branch of a union that was tried, which no user has written.
+    A location also names the branch of a union that was tried; users never write such a branch.
     """
     parts: list[str] = []
     holder: type[BaseModel] | None = None
@@ -76,7 +76,7 @@ def _place(
 
 
 def _unwrapped(annotation: object) -> tuple[object, Sequence[object]]:
-    """An annotation without `Annotated` and `None`, and its branches where it is a union."""
+    """Return an annotation without `Annotated` and `None`, and its branches if it is a union."""
     while True:
         if get_origin(annotation) is Annotated:
             annotation = get_args(annotation)[0]
@@ -94,7 +94,7 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """The model that holds a part, if it is one, and the annotation of that part."""
+    """Return the model that holds a part, if it is a model, and the annotation of that part."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

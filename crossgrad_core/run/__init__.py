@@ -1,7 +1,7 @@
-"""A run from its settings to its results, and what is done with it afterwards.
+"""A run from its settings to its results, and all later work on a trained run.
 
-The module can be called: `crossgrad_core.run("SCENE", operator="pcgrad")` is `api.run`. A function
-of that name in `crossgrad_core` would hide this package, or be hidden by it.
+This module is callable: `crossgrad_core.run("SCENE", operator="pcgrad")` calls `api.run`. A
+function `run` in `crossgrad_core` would hide this package, or this package would hide the function.
 """
 
 import sys
@@ -24,7 +24,7 @@ class _Room(ModuleType):
         verbose: bool = False,
         **options: object,
     ) -> "Run":
-        """Trains a scene, evaluates and exports it; see `crossgrad_core.run.api.run`."""
+        """Train a scene, evaluate and export it; see `crossgrad_core.run.api.run`."""
         from crossgrad_core.run.api import run
 
         return run(scene, config=config, quiet=quiet, verbose=verbose, **options)

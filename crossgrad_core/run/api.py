@@ -1,4 +1,4 @@
-"""Runs from Python: what `crossgrad run` does, with exceptions instead of exit codes."""
+"""Runs from Python: like `crossgrad run`, with exceptions instead of exit codes."""
 
 import signal
 from collections.abc import Iterator, Sequence
@@ -21,27 +21,27 @@ def run(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Trains a scene, evaluates and exports it, into the same folder as `crossgrad run`.
+    """Train a scene, evaluate and export it, into the same folder as `crossgrad run`.
 
     Args:
         scene: Scene folder; the bundled example scene by default.
-        config: YAML file with settings, such as the config.yaml of a run; options win over it.
-        quiet: Shows no progress.
-        verbose: Shows every decision and event.
-        options: What the options of `crossgrad run` and the keys of config.yaml are called:
-            `backbone="scaffold"`, `seconds=60`, `max_size=800`, `out="runs/mine"`. A component's
-            own options go with its name, `operator={"name": "cagrad", "c": 0.4}`, or stand for
-            themselves, `**{"operator.c": 0.4}`. An installed component may also be given as its
-            class, or as an instance, of which the run takes the options. None leaves an option out.
+        config: YAML file with settings, such as the config.yaml of a run; `options` override it.
+        quiet: Show no progress.
+        verbose: Show every decision and event.
+        options: Named like the options of `crossgrad run` or like the keys of config.yaml:
+            `backbone="scaffold"`, `seconds=60`, `max_size=800`, `out="runs/mine"`. The options of a
+            component are given with its name, `operator={"name": "cagrad", "c": 0.4}`, or one by
+            one, `**{"operator.c": 0.4}`. An installed component may also be given as its class, or
+            as an instance whose options the run uses. An option with the value None is ignored.
 
     Returns:
         The run, finished or stopped (`stop_after`).
 
     Raises:
         UserError: The input is bad; nothing was written.
-        RunFailedError: Training failed; what there is was kept.
-        KeyboardInterrupt: The user interrupted it. In the main thread of Python that happens after
-            the step, and the run can be resumed.
+        RunFailedError: Training failed; existing results are kept.
+        KeyboardInterrupt: The user interrupted the run. In Python's main thread it is raised after
+            the current step, and the run can be resumed.
     """
     settings = merged(None if config is None else Path(config), {"scene": scene, **options}, ())
     with _speaking(quiet=quiet), as_in_a_command():
@@ -58,20 +58,20 @@ def resume(
     verbose: bool = False,
     **options: object,
 ) -> Run:
-    """Continues a stopped run, bit for bit.
+    """Continue a stopped run, bit for bit.
 
     Args:
         folder: The run's folder.
-        accept_scene: Go on although photos, masks or points of the scene have changed.
-        accept_plugins: Go on with other versions of the packages that train the run.
-        quiet: Shows no progress.
-        verbose: Shows every decision and event.
-        options: `device`, `threads` and `stop_after`; everything else stays as it was.
+        accept_scene: Continue although photos, masks or points of the scene have changed.
+        accept_plugins: Continue with other versions of the packages that train the run.
+        quiet: Show no progress.
+        verbose: Show every decision and event.
+        options: `device`, `threads` and `stop_after`; no other setting can change.
 
     Raises:
-        UserError: It is no run, it is finished or in use, an option would change the training, or
-            the scene or a package is another one.
-        RunFailedError: Training failed; what there is was kept.
+        UserError: The folder is not a run, the run is finished or in use, an option would change
+            the training, or the scene or a package has changed.
+        RunFailedError: Training failed; existing results are kept.
         KeyboardInterrupt: See `run`.
     """
     settings = merged(None, options, ())
@@ -84,7 +84,7 @@ def resume(
 
 @contextmanager
 def _speaking(*, quiet: bool) -> Iterator[None]:
-    """Tells the stages of the start, as a command does."""
+    """Report the stages of the start, as a command does."""
     announce(quiet=quiet)
     try:
         yield
@@ -97,11 +97,11 @@ def _way(*, quiet: bool, verbose: bool) -> app.Way:
 
 
 def _say_nothing(table: str, folder: Path, words: Sequence[str]) -> None:
-    """The returned object says it."""
+    """Do nothing: the returned object holds the results."""
 
 
 def _result(outcome: app.Outcome) -> Run:
-    """The run, or the exception that its ending calls for."""
+    """Return the run, or raise the exception that matches its ending."""
     folder, ending = outcome.folder.resolve(), outcome.ending
     if ending.status == "failed":
         raise RunFailedError(folder, ending.error or "") from ending.cause

@@ -1,4 +1,4 @@
-"""A run from its settings to its results: a new one, or one that goes on."""
+"""A run from its settings to its results: a new run, or a resumed one."""
 
 import logging
 import sys
@@ -77,10 +77,10 @@ from crossgrad_core.wording import listed, one_line
 
 
 def check_clock(config: RunConfig) -> None:
-    """Refuses a budget in CPU seconds on several threads or a GPU; threads are set already.
+    """Refuse a budget in CPU seconds on several threads or a GPU; call after setting the threads.
 
     Raises:
-        UserError: They would be counted while they wait, or not counted while they work.
+        UserError: CPU time would count waiting threads, or would miss the work of the GPU.
     """
     if config.seconds is None or config.clock == "wall":
         return
@@ -103,14 +103,14 @@ def check_clock(config: RunConfig) -> None:
         )
 
 
-#: The length of a run on the bundled scene that asks for none, whichever is over first: training
-#: seconds, and 100 views of each of its training photos, which more teach by heart
+#: The length of a run on the bundled scene if the user sets no length: it ends after this many
+#: training seconds, or after 100 views of each training photo. More views overfit
 #: (docs/few-photos.md).
 BUNDLED_SECONDS = 120.0
 
 
 def bundled_scene() -> Path:
-    """The folder of the bundled scene: inside an installed package, or in a checkout.
+    """Return the folder of the bundled scene, in an installed package or in a checkout.
 
     Raises:
         UserError: It is in neither place.
@@ -129,7 +129,7 @@ def bundled_scene() -> Path:
 
 
 _LOG = logging.getLogger(__name__)
-#: Exit code of a run that failed; what it has is kept.
+#: Exit code of a failed run; its results so far are kept.
 FAILED = 1
 
 
@@ -138,9 +138,9 @@ class Outcome:
     """The outcome of a run.
 
     Attributes:
-        folder: Where its results are.
-        ending: How it ended.
-        signal: Number of the signal that stopped it; None where none did.
+        folder: The folder of its results.
+        ending: Its status and, after a failure, the reason.
+        signal: Number of the signal that stopped the run; None if there was no signal.
     """
 
     folder: Path
@@ -149,13 +149,13 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0, 1 where training failed, 128 and the signal's number where one stopped the run."""
+        """0; 1 if training failed; 128 plus the signal's number if a signal stopped the run."""
         if self.ending.status == "failed":
             return FAILED
         return 0 if self.signal is None else exit_code(self.signal)
 
 
-#: Is told the results while signals are still only noted: table, folder and last words.
+#: Receives the results (table, folder and exit messages) while signals are still only recorded.
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
@@ -169,21 +169,21 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
     accept_plugins: bool = False,
     check: bool = False,
 ) -> int:
-    """Trains, evaluates, exports, and prints the results: what `crossgrad run` does.
+    """Train, evaluate, export, and print the results, as `crossgrad run` does.
 
     Args:
-        settings: What the user set, in the shape of `RunConfig`.
+        settings: The user's settings, in the shape of `RunConfig`.
         resume: Folder of a stopped run to continue.
-        dry_run: Of a new run, check everything, print the resolved settings, train nothing.
+        dry_run: For a new run: check everything, print the resolved settings, train nothing.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        accept_scene: Of a new run, train although the scene contradicts itself; of one that goes
-            on, continue although photos, masks or points of the scene have changed.
+        accept_scene: For a new run: train although the scene contradicts itself. For a resumed
+            run: continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
         check: Decode all photos before training.
 
     Returns:
-        The exit code: 0, 1 where training failed, 130 where the user interrupted the run (128 and
-        the number of the signal).
+        The exit code: 0; 1 if training failed; 128 plus the signal's number if a signal stopped the
+        run (130 for an interrupt by the user).
 
     Raises:
         UserError: The input is bad; nothing was written.
@@ -215,12 +215,12 @@ def _end(outcome: "Outcome", way: "Way") -> int:
 
 @dataclass(frozen=True)
 class Way:
-    """How a run speaks.
+    """The way in which a run reports to the user.
 
     Attributes:
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        tell: Is told the results.
-        check: Whether all photos are decoded before training, not the held-out ones only.
+        tell: Receives the results.
+        check: True to decode all photos before training, False for the held-out photos only.
     """
 
     verbosity: int
@@ -229,7 +229,7 @@ class Way:
 
 
 def new(settings: Mapping[str, Any], way: Way) -> Outcome:
-    """Trains a new run, evaluates and exports it.
+    """Train a new run, evaluate and export it.
 
     Raises:
         UserError: The input is bad; nothing was written.
@@ -259,7 +259,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
 
 
 def _with_remarks(setup: Setup) -> tuple[Setup, float]:
-    """The setup with what exposure and start say about the scene, and the seconds it took."""
+    """Return the setup with messages of exposure and initializer, and the seconds spent on them."""
     begun, scene = perf_counter(), setup.scene
     messages = setup.exposure.messages(scene, known_starts(setup))
     messages += setup.selection.initializer.messages(scene)
@@ -267,7 +267,7 @@ def _with_remarks(setup: Setup) -> tuple[Setup, float]:
 
 
 def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
-    """The setup of a new run, all that can be refused refused, and the seconds of loading."""
+    """Return the setup of a new run after all checks, and the seconds of loading."""
     config = with_defaults(parsed(with_recipe(settings)))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
@@ -281,7 +281,7 @@ def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
 
 
 def with_defaults(config: RunConfig) -> RunConfig:
-    """The configuration with the scene filled in, and a length for the bundled one."""
+    """Return the configuration with the scene filled in, and a length for the bundled scene."""
     lengths = {"steps": config.steps, "views": config.max_views, "seconds": config.seconds}
     given = {unit: length for unit, length in lengths.items() if length is not None}
     if "steps" in given and len(given) > 1:
@@ -308,10 +308,13 @@ def with_defaults(config: RunConfig) -> RunConfig:
 
 @contextmanager
 def _tried_out() -> Iterator[None]:
-    """Words an error in steps that load kernels or plan a length, before anything is written."""
+    """Turn an error in trial steps (kernels, planned length) into a message for the user.
+
+    Nothing has been written yet.
+    """
     try:
         yield
-    # What numbers can cause; other errors would be our own mistakes, and keep their traceback.
+    # Errors that numbers can cause; any other error is a bug of crossgrad and keeps its traceback.
     except (TrainingFailedError, NonFiniteError, RuntimeError, ValueError, MemoryError) as error:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
@@ -323,7 +326,7 @@ def _tried_out() -> Iterator[None]:
 
 
 def _within(setup: Setup, seconds: float) -> Setup:
-    """The setup with the length that fits into `seconds` of training."""
+    """Return the setup with the length that fits into `seconds` of training."""
     steps, note, share = steps_for(setup, seconds)
     update = {"steps": steps, "seconds": None, "max_views": None, "revisions": ()}
     given = {"planned_seconds": seconds, "planned_views": setup.config.max_views}
@@ -342,7 +345,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
 
 @contextmanager
 def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
-    """A folder for a new run, which no other process writes into meanwhile."""
+    """Yield a new folder for a run, locked against other processes."""
     names = setup.selection.names
     name = RunName(
         setup.scene.name,
@@ -375,7 +378,7 @@ def _held(folder: Path) -> Iterator[None]:
 def _train(
     setup: Setup, state: TrainState, session: Session, length: Length, tell: Tell
 ) -> Outcome:
-    """Trains from `state` on and finishes the run's folder whatever happens."""
+    """Train from `state` on, and finish the run's folder in every case."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
     setup.manager.register(session.machine, name="machine")
@@ -407,21 +410,21 @@ def resumed(
     accept_scene: bool = False,
     accept_plugins: bool = False,
 ) -> Outcome:
-    """Continues a run.
+    """Continue a run.
 
     Args:
         folder: The run's folder.
-        settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
-        way: How it speaks.
+        settings: Only `device`, `threads` and `stop_after` may differ from the run's own settings.
+        way: How the run reports to the user.
         accept_scene: Continue although photos, masks or points of the scene have changed.
         accept_plugins: Continue with other versions of the packages that train the run.
 
     Raises:
-        UserError: It is no run, it is finished or in use, a setting would change the training, or
-            the scene or a package is another one.
+        UserError: The folder is not a run, the run is finished or in use, a setting would change
+            the training, or the scene or a package has changed.
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-    read_config(folder)  # Before a lock is laid into a folder that is no run's.
+    read_config(folder)  # Before the lock, which must not be written into any other folder.
     with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total
@@ -460,7 +463,7 @@ def resumed(
 
 
 def _decoded(setup: Setup, way: Way) -> float:
-    """Finds held-out photos, or all, that cannot be decoded; answers the seconds."""
+    """Check that the held-out photos, or all photos, can be decoded; return the seconds."""
     start = perf_counter()
     keep = fits(setup.scene, setup.config.data.cache_mib)
     views = setup.scene.views if way.check else setup.scene.test_views
@@ -478,10 +481,10 @@ def _print_dry_run(setup: Setup) -> None:
 
 @contextmanager
 def as_in_a_command() -> Iterator[None]:
-    """Inside the block torch and numpy are as in a new process; then as they were.
+    """Reset the global state of torch and numpy to that of a new process inside the block.
 
     Default type and device, `no_grad`, `inference_mode`, `np.errstate` and the number of threads
-    would change the bits of a run, or end it.
+    would change the bits of a run, or end it. They are restored afterwards.
     """
     threads = torch.get_num_threads(), numba.get_num_threads()
     kind, device = torch.get_default_dtype(), torch.get_default_device()
@@ -502,6 +505,6 @@ def as_in_a_command() -> Iterator[None]:
 
 
 def _set_device(old: torch.device, new: torch.device) -> None:
-    """Does nothing where there is nothing to do: a default device slows every call down."""
+    """Set the default device only if it changes: a default device slows every call down."""
     if old != new:
         torch.set_default_device(new)

@@ -1,4 +1,4 @@
-"""From a configuration to a Setup: read, select, object, or say what was left out."""
+"""From a configuration to a Setup: read the scene, select components, check, report omissions."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
@@ -42,9 +42,10 @@ from crossgrad_core.wording import in_one_line, listed, plural, singular
 
 
 def idle_note(setup: Setup) -> tuple[str, ...]:
-    """Says that an operator leaves the gradient of a single view as it is, and the way out.
+    """Return a note if the operator leaves the gradient of a single view unchanged.
 
-    The default operator is left alone: a sum of one gradient is expected to be no more than that.
+    The note also proposes a way out. There is no note for the default operator, because a sum of
+    one gradient is expected to be this gradient.
     """
     selection = setup.selection
     name, views = selection.names["operator"], selection.views_per_step
@@ -64,10 +65,10 @@ _LOG = logging.getLogger(__name__)
 
 
 def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
-    """The scene and the name of the reader that read it.
+    """Return the scene and the name of the reader that read it.
 
     Raises:
-        UserError: No reader accepts the folder, or several do, or one cannot read it.
+        UserError: No reader accepts the folder, several readers do, or the reader cannot read it.
     """
     _LOG.info("reading scene %s", path)
     name = config.reader.name
@@ -80,19 +81,19 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
                 found=f"files of the readers {listed(able)}",
                 todo=f"choose one, such as --reader {able[0]}",
             )
-        # If no reader recognises the folder, one of them explains what it misses.
+        # If no reader recognises the folder, one reader explains what is missing.
         near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
         name = (*able, *near, READER)[0]
     return build(Reader, name, config.reader.options).read(path, config.data), name
 
 
 def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tuple[Scene, str]:
-    """As `read_scene`, and points, poses and photos are checked against each other.
+    """Like `read_scene`, and check points, poses and photos against each other.
 
     Args:
         config: The configuration.
         path: The scene's folder.
-        accept: Go on although the scene contradicts itself, as the configuration may also say.
+        accept: Continue although the scene contradicts itself; the configuration can also set this.
 
     Raises:
         UserError: As `read_scene`, or the scene contradicts itself.
@@ -104,12 +105,12 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
 
 
 def accepts(name: str, path: Path) -> bool:
-    """Whether a reader takes the folder; one that fails does not keep the others from it."""
+    """Return True if a reader accepts the folder; False, with a warning, if the reader fails."""
     return _answer(name, lambda: _accepts(name, path))
 
 
 def nearly_accepts(name: str, path: Path) -> bool:
-    """Whether a file in the folder is nearly of a reader's format; see `accepts`."""
+    """Return True if a file in the folder nearly has the format of a reader; see `accepts`."""
     return _answer(name, lambda: build(Reader, name, {}).nearly_accepts(path))
 
 
@@ -127,11 +128,11 @@ def _answer(name: str, question: Callable[[], bool]) -> bool:
 
 
 def check_names(config: RunConfig) -> None:
-    """Looks up every component and the device, before a large scene is read for nothing.
+    """Look up every component and the device before a large scene is read in vain.
 
     Raises:
-        UserError: A name does not exist, with the closest one that does, or its package requires
-            another version of crossgrad.
+        UserError: A name does not exist (the message names the closest one), or its package
+            requires another version of crossgrad.
     """
     if config.device != AUTO:
         choose_device(config.device)
@@ -147,7 +148,7 @@ def check_names(config: RunConfig) -> None:
 
 
 def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
-    """Everything that a configuration names, loaded, fitted to the scene and checked.
+    """Load everything that a configuration names, fit it to the scene and check it.
 
     Args:
         config: The configuration.
@@ -191,7 +192,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
         decisions=decisions,
         decide=decide,
     )
-    # The length of a run within a budget is not known yet.
+    # The length of a run with a time budget is not known yet.
     timed = notes_on_length(setup) if config.seconds is None else ()
     named = {plural(word): [name] for word, name in selection.names.items()}
     named["operators"] = [each.name for each in config.operators]
@@ -206,7 +207,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
 
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
-    """Where photos are kept besides those that were decoded last."""
+    """Return the cache of photos, in addition to the photos that were decoded last."""
     mib, device = config.data.cache_mib, choose_device(config.device)
     # At half the size photos take a quarter of the memory.
     scaled = ScaledPhotos(mib // 4)
@@ -214,9 +215,9 @@ def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
 
 
 def _with_first_degree(config: RunConfig) -> RunConfig:
-    """The configuration that says at which SH degree the run starts.
+    """Return the configuration with the SH degree at which the run starts.
 
-    Written down, so that a run goes on without the file that it started from.
+    The degree is stored, so that a resumed run does not need the file that it started from.
     """
     path = config.data.init_file
     if config.sh_from is not None or path is None:
@@ -226,12 +227,12 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 
 
 def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
-    """The configuration with a length in steps, where it has none in seconds.
+    """Return the configuration with a length in steps, unless its length is in seconds.
 
-    Views within seconds stay: whether there are seconds for them is known after the first steps.
+    Views within seconds stay: the first steps show whether the seconds suffice for them.
 
     Raises:
-        UserError: A single step draws more views.
+        UserError: A single step draws more views than `max_views`.
     """
     if config.max_views is None:
         known = config.seconds is not None or config.steps is not None
@@ -279,7 +280,7 @@ def _plugins(selection: Selection, observers: Mapping[str, Component]) -> dict[s
 def reasons_against(
     config: RunConfig, selection: Selection, answers: Iterable[list[str]]
 ) -> tuple[str, ...]:
-    """Why the selection cannot work: what its components object, and what the core does."""
+    """Return the objections of the components and of the core to the selection."""
     given = [[answer] if isinstance(answer, str) else answer for answer in answers]
     reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
@@ -294,10 +295,10 @@ def reasons_against(
 
 
 def refuse(reasons: tuple[str, ...]) -> None:
-    """Ends the start of a run for these reasons, if there are any.
+    """Stop the start of a run if there are reasons against it.
 
     Raises:
-        IncompatibleSelectionError: There are.
+        IncompatibleSelectionError: `reasons` is not empty.
     """
     if reasons:
         raise IncompatibleSelectionError(

@@ -1,4 +1,4 @@
-"""Cameras without photos: a path from a file, or from the farthest photos down to the nearest."""
+"""Cameras without photos: a path from a file, or a zoom path from far photos to near ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,17 +19,17 @@ from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.scene.raw import FARTHEST, FARTHEST_LOCAL
 from crossgrad_core.system.text_files import read_json
 
-#: Instead of a file: from the farthest photos down to the nearest.
+#: The name of the built-in path: from the farthest photos to the nearest.
 ZOOM: Final = "zoom"
 FRAMES_PER_SECOND: Final = 24.0
-#: Of a zoom path.
+#: Number of frames of a zoom path.
 FRAMES: Final = 120
-#: Views that observe fewer SfM points say too little about what they look at.
+#: Views that observe fewer SfM points do not show reliably what they look at.
 FEWEST_SEEN: Final = 8
-#: Of more views the ends of a zoom path are sought among so many, spread over all.
+#: With more views than this, the ends of a zoom path are chosen from an even sample of this size.
 MOST_VIEWS: Final = 500
 _TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
-#: Longer paths are a mistake.
+#: Longer paths are refused as a mistake.
 MOST_FRAMES: Final = 100_000
 _Floats = NDArray[np.float64]
 
@@ -39,8 +39,8 @@ class CameraPath:
     """Cameras in the local frame, one per frame.
 
     Attributes:
-        name: A part of file names.
-        cameras: One for each frame.
+        name: Part of the names of files.
+        cameras: One camera per frame.
         fps: Frames per second.
     """
 
@@ -50,15 +50,15 @@ class CameraPath:
 
 
 def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
-    """The cameras of a path.
+    """Return the cameras of a path.
 
     Args:
         scene: The scene of the run.
         path: `zoom`, or a camera path as nerfstudio's viewer writes it, in input coordinates.
-        frames: How many a zoom path has.
+        frames: Number of frames of a zoom path.
 
     Raises:
-        UserError: There is no such file, it holds no path, or the photos give no zoom path.
+        UserError: There is no such file, it contains no path, or the photos give no zoom path.
     """
     if path == ZOOM:
         return CameraPath(ZOOM, zoom_path(scene.train_views, scene.points, frames))
@@ -66,10 +66,11 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 
 
 def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
-    """Along a line from a far photo to a near one that shows the same, nearer by equal factors.
+    """Return cameras on a line from a far photo to a near photo that shows the same things.
 
-    The ends are one of the farthest fifth of the views and one of the nearest fifth: those that
-    have the most SfM points in common, and of equals the pair whose directions differ least.
+    The distance shrinks by the same factor in each frame. One end is among the farthest fifth of
+    the views, the other among the nearest fifth. The pair with the most common SfM points is used;
+    of equal pairs, the pair whose viewing directions differ least.
 
     Args:
         views: The training views.
@@ -97,7 +98,7 @@ def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Came
 
 
 def _distance(camera: Camera, seen: _Floats) -> float:
-    """The median depth of what a camera observes, local units."""
+    """Return the median depth of the points that a camera observes, in local units."""
     depths = camera.local(seen)[:, 2]
     return float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
 
@@ -119,14 +120,14 @@ def _ends(views: Sequence[View], distances: _Floats, points: int) -> tuple[int, 
 
 
 def _way(share: float, nearer: float) -> float:
-    """The share of the line at which the distance has fallen by `nearer` to the power `share`."""
-    if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of what follows
+    """Return the share of the line at which the distance is `nearer ** share` times the first."""
+    if abs(nearer - 1.0) < 1e-6:  # noqa: PLR2004 - the limit of the next formula
         return share
     return float((1.0 - nearer**share) / (1.0 - nearer))
 
 
 def _between(first: Camera, last: Camera, share: float, nearer: float) -> Camera:
-    """The camera at a share of the time, which turns evenly as its field of view changes."""
+    """Return the camera at a share of the time; direction and field of view change evenly."""
     ends = first.world_to_camera.numpy(), last.world_to_camera.numpy()
     down, ahead = ((1.0 - share) * ends[0][row, :3] + share * ends[1][row, :3] for row in (1, 2))
     forward = _unit(ahead)
@@ -220,10 +221,10 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
 
 
 def checked_camera(camera: object) -> Camera:
-    """The camera.
+    """Return the camera if it is valid.
 
     Raises:
-        UserError: It is none, or one of its numbers is none of a camera.
+        UserError: It is not a camera, or one of its numbers is not valid for a camera.
     """
     if not isinstance(camera, Camera):
         raise _refused("a view's name or a camera", f"{type(camera).__name__}")

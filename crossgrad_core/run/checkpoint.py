@@ -1,4 +1,4 @@
-"""Resumable checkpoints: safetensors and JSON in one folder, complete or not there at all.
+"""Resumable checkpoints: safetensors and JSON in one folder, either complete or absent.
 
 <run>/checkpoints/step-000700/tensors.safetensors   parameters, moments, plugin tensors
 <run>/checkpoints/step-000700/state.json            everything else, and the tensors' SHA-256
@@ -35,7 +35,7 @@ from crossgrad_core.wording import showable
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Everything from which a run continues bit for bit.
+    """The complete state from which a run continues bit for bit.
 
     Attributes:
         step: Steps done.
@@ -45,7 +45,7 @@ class Checkpoint:
         adam_steps: Tensor name -> number of Adam steps taken.
         plugins: Plugin name -> its state.
         generators: Stream name -> `bit_generator.state` of its NumPy generator.
-        scalars: Counters, clocks and whatever else JSON can hold (tuples come back as lists).
+        scalars: Counters, clocks and other values that JSON can hold (tuples come back as lists).
     """
 
     step: int
@@ -67,37 +67,37 @@ _SCRATCH = ".scratch-"
 
 @dataclass(frozen=True)
 class Keep:
-    """Which checkpoints survive the writing of a new one.
+    """The rule for the checkpoints that survive the writing of a new one.
 
     Attributes:
-        last: The newest so many, the new one included.
-        every: And those at multiples of this step; None for no others.
+        last: Number of newest checkpoints that survive, including the new one.
+        every: Checkpoints at multiples of this step survive, too; None for none of them.
     """
 
     last: int = 2
     every: int | None = None
 
     def drops(self, steps: list[int]) -> list[int]:
-        """Those of `steps` that are to be deleted."""
+        """Return the members of `steps` whose checkpoints are to be deleted."""
         old = sorted(steps)[: -self.last]
         return [step for step in old if self.every is None or step % self.every]
 
 
 def is_checkpoint(folder: Path) -> bool:
-    """Whether this is the folder of a checkpoint, of which files may have been lost since."""
+    """Return True for the folder of a checkpoint, even if some of its files are lost."""
     return _STEP.fullmatch(folder.name) is not None and folder.is_dir()
 
 
 def is_complete(folder: Path) -> bool:
-    """Whether all files of a checkpoint are there."""
+    """Return True if all files of a checkpoint exist."""
     return (folder / STATE).is_file() and (folder / TENSORS).is_file()
 
 
 def named_checkpoints(folder: Path) -> dict[int, Path]:
     """Return step -> folder of the checkpoints in `folder`, in the order of steps.
 
-    A checkpoint gets its name when all of its files are there. One that lacks a file is damaged. It
-    is not passed over, because an older one would then be taken in its place without a word.
+    A checkpoint gets its name when all of its files are written. A checkpoint that lacks a file is
+    damaged. It is still returned, because otherwise an older one would silently replace it.
     """
     if not folder.is_dir():
         return {}
@@ -107,7 +107,7 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """The error for a checkpoint that cannot be used; points to another one if there is one."""
+    """Return the error for a damaged checkpoint; it names another checkpoint if there is one."""
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
@@ -122,7 +122,7 @@ def damaged(folder: Path, found: str) -> UserError:
 
 @contextmanager
 def scratch_folder(final: Path) -> Iterator[Path]:
-    """A folder to write into that gets the name `final` when the block ends without an error."""
+    """Yield a folder to write into; it gets the name `final` if the block ends without an error."""
     scratch = final.with_name(f"{_SCRATCH}{final.name}")
     final.parent.mkdir(parents=True, exist_ok=True)
     _clear(final.parent)
@@ -136,7 +136,7 @@ def scratch_folder(final: Path) -> Iterator[Path]:
 
 
 def discard(folder: Path) -> None:
-    """Deletes a checkpoint in such a way that half of one never looks complete."""
+    """Delete a checkpoint so that a partly deleted folder never looks complete."""
     doomed = folder.with_name(f"{_SCRATCH}old-{folder.name}")
     folder.rename(doomed)
     shutil.rmtree(doomed)
@@ -157,34 +157,34 @@ def _take_name(scratch: Path, final: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Deletes what this or an interrupted run left half-written."""
+    """Delete the half-written folders of this run or of an interrupted run."""
     for path in folder.glob(f"{_SCRATCH}*"):
         shutil.rmtree(path, ignore_errors=True)
 
 
-#: Version of the layout; raised whenever an older reader could misread a newer checkpoint.
+#: Version of the layout; increased if an older reader could misread a newer checkpoint.
 FORMAT = 1
 _DIGEST = "state_sha256"
 
 
 def state_text(state: Mapping[str, Any]) -> str:
-    """The content of state.json: `state`, the versions that wrote it, and a digest of all that."""
+    """Return the content of state.json: `state`, the versions that wrote it, and a digest."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     whole = {"format": FORMAT, "crossgrad": VERSION, **rest}
     return json.dumps({_DIGEST: digest(whole), **whole}, indent=1)
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """SHA-256 of a state, its own digest left out; the same before and after JSON."""
+    """Return the SHA-256 of a state without its own digest; JSON does not change it."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def check_json(value: object, where: str) -> None:
-    """Refuses what JSON would change on the way: keys that are not text, tuples, arrays.
+    """Refuse values that JSON would change: keys that are not text, tuples, arrays.
 
     Raises:
-        UserError: Names the place and the culprit.
+        UserError: There is such a value; the message names its place.
     """
     if wrong := no_json(value):
         raise UserError(
@@ -197,7 +197,7 @@ def check_json(value: object, where: str) -> None:
 
 
 def read_state(folder: Path) -> dict[str, Any]:
-    """The content of a checkpoint's state.json.
+    """Return the content of a checkpoint's state.json.
 
     Raises:
         UserError: The checkpoint is missing, damaged, or of another format version.
@@ -229,10 +229,10 @@ def read_state(folder: Path) -> dict[str, Any]:
 
 
 def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
-    """Refuses a state that is not what was written.
+    """Refuse a state that differs from the written one.
 
     Raises:
-        UserError: The digest differs, or something is missing or of another type.
+        UserError: The digest differs, or a part is missing or of another type.
     """
     if state.get(_DIGEST) != digest(state):
         raise damaged(folder, f"{STATE} is not what was written (its SHA-256 differs)")
@@ -249,7 +249,7 @@ def _is_map(value: object) -> bool:
     return isinstance(value, dict)
 
 
-#: What a state consists of, and how each part is known.
+#: Part of a state -> test for a valid value.
 _PARTS: Mapping[str, Callable[[Any], bool]] = {
     "sha256": lambda value: isinstance(value, str),
     "step": _is_count,
@@ -267,7 +267,7 @@ _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
 
 @dataclass
 class Unpacked:
-    """The tensors of a checkpoint file, sorted by what they belong to."""
+    """The tensors of a checkpoint file, sorted by owner."""
 
     parameters: dict[str, Tensor] = field(default_factory=dict)
     exp_avg: dict[str, Tensor] = field(default_factory=dict)
@@ -275,13 +275,13 @@ class Unpacked:
     plugins: dict[str, dict[str, dict[str, Tensor]]] = field(default_factory=dict)
 
     def plugin(self, name: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """`tensors` and `per_primitive` of a plugin's state."""
+        """Return `tensors` and `per_primitive` of a plugin's state."""
         kinds = self.plugins.get(name, {})
         return kinds.get("tensors", {}), kinds.get("per_primitive", {})
 
 
 def pack(checkpoint: "Checkpoint") -> dict[str, Tensor]:
-    """Key -> contiguous CPU tensor that shares its memory with no other."""
+    """Return key -> contiguous CPU tensor; no two tensors share memory."""
     packed: dict[str, Tensor] = {}
     storages: set[int] = set()
     for path, tensor in _all(checkpoint):
@@ -297,15 +297,15 @@ def pack(checkpoint: "Checkpoint") -> dict[str, Tensor]:
 
 
 def packed_bytes(tensors: Mapping[str, Tensor]) -> int:
-    """Size of the tensors in bytes."""
+    """Return the size of the tensors in bytes."""
     return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
 
 
 def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
-    """The inverse of `pack`.
+    """Return the tensors by owner; the inverse of `pack`.
 
     Raises:
-        ValueError: A key is none that `pack` makes.
+        ValueError: `pack` cannot have made one of the keys.
     """
     tensors = Unpacked()
     for key, tensor in packed.items():
@@ -325,10 +325,11 @@ def unpack(packed: Mapping[str, Tensor]) -> Unpacked:
 
 
 def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
-    """Writes a safetensors file and waits until it is on the disk.
+    """Write a safetensors file and wait until it is on the disk.
 
     Raises:
-        OSError: Also where the library wraps what the system said, such as that the disk is full.
+        OSError: The system refused, for example because the disk is full. An error of the system
+            that the library wraps is raised as OSError, too.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -337,7 +338,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # The library makes a file of its own, which nobody else may read.
+        # The library creates a file of its own that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -348,7 +349,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Reads a safetensors file into memory of our own.
+    """Read a safetensors file into memory of our own.
 
     Raises:
         ValueError: It is not a readable safetensors file.
@@ -366,7 +367,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
-    """Every tensor of a checkpoint with the path that names it."""
+    """Yield every tensor of a checkpoint with the path that names it."""
     for kind in ("parameters", "exp_avg", "exp_avg_sq"):
         tensors: Mapping[str, Tensor] = getattr(checkpoint, kind)
         for name, tensor in tensors.items():
@@ -379,21 +380,21 @@ def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
 
 
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
-    """Writes a checkpoint below the run's folder and then deletes those not worth keeping.
+    """Write a checkpoint below the run's folder, then delete the checkpoints that `keep` drops.
 
-    The new checkpoint gets its name when all of it is on the disk; until then, and after any
-    failure, the earlier ones stay as they are.
+    The new checkpoint gets its name when all of it is on the disk. Until then, and after any
+    failure, the earlier checkpoints stay as they are.
 
     Args:
         run: The run's folder.
-        checkpoint: What to save; tensors on any device.
-        keep: Which checkpoints survive; the last two where not given.
+        checkpoint: The checkpoint; tensors on any device.
+        keep: The rule for older checkpoints; by default the last two survive.
 
     Returns:
         The checkpoint's folder.
 
     Raises:
-        UserError: The disk is full or must not be written to, or a plugin's state is not JSON.
+        UserError: The disk is full or not writable, or a plugin's state is not JSON.
     """
     tensors = pack(checkpoint)
     state = _plain_state(checkpoint, list(tensors))
@@ -405,7 +406,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
         try:
             _write(final, tensors, state)
         except OSError as error:
-            # Those that would go afterwards may make the room; the newest of them all stays.
+            # Deleting the dropped checkpoints first may free enough space; the newest one stays.
             if not is_full(error) or not _drop(final.parent, keep, checkpoint.step):
                 raise
             _write(final, tensors, state)
@@ -422,7 +423,7 @@ def _write(final: Path, tensors: dict[str, Tensor], state: Mapping[str, Any]) ->
 
 
 def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
-    """Deletes the checkpoints not worth keeping beside those that are coming; whether any was."""
+    """Delete the checkpoints that `keep` drops once `coming` exist; return True if any was."""
     steps = named_checkpoints(folder)
     doomed = [steps[step] for step in keep.drops([*steps, *coming]) if step in steps]
     for each in doomed:
@@ -431,7 +432,7 @@ def _drop(folder: Path, keep: Keep, *coming: int) -> bool:
 
 
 def load_latest(run: Path) -> Checkpoint:
-    """Reads the newest checkpoint of a run, which may be training and deletes old ones meanwhile.
+    """Read the newest checkpoint of a run; a training run may delete old checkpoints meanwhile.
 
     Raises:
         UserError: There is none, or it is damaged.
@@ -470,14 +471,14 @@ def latest(run: Path) -> Path:
 
 
 def drop_later(run: Path, step: int) -> None:
-    """Deletes checkpoints beyond `step`, from which a resumed run would no longer follow."""
+    """Delete checkpoints after `step`, because a resumed run would no longer lead to them."""
     for later, folder in named_checkpoints(run / CHECKPOINTS).items():
         if later > step:
             discard(folder)
 
 
 def load(folder: Path) -> Checkpoint:
-    """Reads a checkpoint folder: on the CPU, without gradients, bit for bit as it was saved.
+    """Read a checkpoint folder: on the CPU, without gradients, bit for bit as it was saved.
 
     Raises:
         UserError: It is missing, incomplete, damaged, or of another format version.

@@ -1,4 +1,4 @@
-"""The views of another capture of the same place, as a run sees them."""
+"""The views of another capture of the same place, in the local frame of a run."""
 
 import math
 from collections.abc import Sequence
@@ -16,15 +16,17 @@ from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
-#: A pose nearer than this to a training view's is that view: local units (extents), and radians.
+#: A pose nearer than this to the pose of a training view counts as the same: local units (extents),
+#: and radians.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: Of the other capture's points at least this share lies in the box of the run's points and
-#: cameras, made so much larger.
+#: At least this share of the other capture's points must be in the box around the run's points and
+#: cameras, enlarged by this factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
-#: Points of captures of one place lie on the same surfaces: their distances from the run's have at
-#: most this share of the median that they have however the capture is turned about its middle.
+#: Points of two captures of one place are on the same surfaces. Their median distance from the
+#: run's points is at most this share of the median after any of `TURNS` random rotations about the
+#: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Points that are looked at, at least and of either scene at most.
+#: Numbers of points for this test: at least, at most of the other capture, at most of the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -34,10 +36,10 @@ class Elsewhere:
 
     Attributes:
         name: Its name.
-        views: Those of its views that the run was not trained on.
+        views: Its views without the views that the run was trained on.
         points: [P, 3] its SfM points.
-        trained: How many of its views the run was trained on.
-        alike: Whether its points lie where those of the run lie, as far as that can be told.
+        trained: Number of its views that the run was trained on.
+        alike: False if its points are not near the run's points; True also if this is unknown.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Elsewhere:
     alike: bool = True
 
     def messages(self) -> list[str]:
-        """What the user should know of it."""
+        """Return messages for the user about this capture."""
         told = []
         if not self.alike:
             told.append(
@@ -60,10 +62,11 @@ class Elsewhere:
 
 
 def elsewhere(setup: Setup, path: Path) -> Elsewhere:
-    """The views of another scene in the same input coordinates, in the size of the run's photos.
+    """Return the views of another scene in the same input coordinates, at the run's photo size.
 
     Raises:
-        UserError: It cannot be read, lies elsewhere, or the run was trained on all of its views.
+        UserError: The scene cannot be read or is in another place, or the run was trained on all
+            of its views.
     """
     reading = {"split": "none", "masks": None, "init": "random", "points": None}
     config = setup.config.model_copy(
@@ -90,7 +93,7 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
 
 
 def _reader(setup: Setup, path: Path) -> ComponentChoice:
-    """How the other scene is read: as the run's own where that can be, which others could, too."""
+    """Return the reader of the other scene: the run's own if it accepts the folder, else auto."""
     own, scene = setup.config.reader, setup.config.scene
     if scene is not None and path.resolve() == Path(scene).resolve():
         return own
@@ -99,7 +102,7 @@ def _reader(setup: Setup, path: Path) -> ComponentChoice:
 
 
 def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
-    """The camera of another scene's local frame in the frame of `similarity`."""
+    """Return a camera in the local frame of `other`, moved to the frame of `similarity`."""
     rotation = camera.world_to_camera[:3, :3]
     center = other.similarity.to_input(camera.center.numpy()[None])
     pose = torch.eye(4, dtype=torch.float64)
@@ -109,9 +112,9 @@ def _moved(camera: Camera, other: Scene, similarity: Similarity) -> Camera:
 
 
 def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
-    """Whether the pose of each view is that of a training view."""
+    """Return for each view whether its pose is the pose of a training view."""
     centers, rotations = centers_of(trained), _rotations_of(trained)
-    # The trace of the rotation from one camera to the other falls with its angle.
+    # The trace of the rotation between two cameras falls with the angle between them.
     least = 1.0 + 2.0 * math.cos(SAME_DIRECTION)
 
     def is_trained(center: NDArray[np.float64], rotation: NDArray[np.float64]) -> bool:
@@ -123,14 +126,14 @@ def _are_trained(views: Sequence[View], trained: Sequence[View]) -> list[bool]:
 
 
 def _rotations_of(views: Sequence[View]) -> NDArray[np.float64]:
-    """[V, 3, 3] world to camera."""
+    """Return the rotations of the views, [V, 3, 3], world to camera."""
     return np.stack([view.camera.world_to_camera[:3, :3].numpy() for view in views])
 
 
 def _check_place(
     scene: Scene, points: NDArray[np.float64], centers: NDArray[np.float64], path: Path
 ) -> None:
-    """Refuses a capture in other coordinates: what it shows is not where the run's scene is."""
+    """Refuse a capture in other coordinates: its points are not where the run's scene is."""
     own = np.concatenate([scene.points, scene.robust_centers])
     middle, half = (own.max(axis=0) + own.min(axis=0)) / 2, np.ptp(own, axis=0) / 2
     what = points if len(points) else centers
@@ -146,10 +149,13 @@ def _check_place(
 
 
 def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Whether points lie near those of the run, and would not if they were turned."""
+    """Return True if `points` are near the run's points, and would not be after a rotation.
+
+    Return True also if there are too few points to tell.
+    """
     from scipy.spatial import cKDTree
 
-    # What lies beyond the run's points says nothing: it may show more of the place.
+    # Points outside the run's points do not count: the other capture may show more of the place.
     points = points[((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1)]
     if min(len(own), len(points)) < FEWEST_POINTS:
         return True
@@ -166,5 +172,5 @@ def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
 
 
 def _some(points: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """At most so many points, evenly spread over their order."""
+    """Return at most `most` points, evenly spread over their order."""
     return points[:: -(-len(points) // most)]

@@ -1,4 +1,4 @@
-"""The facts that a recipe decides from, and the one call that makes the table of decisions."""
+"""The facts that a recipe decides from, and the functions that make the table of decisions."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -30,8 +30,8 @@ from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
 _LOG = logging.getLogger(__name__)
-#: A planner: the configuration, with the settings of the user alone, and the scene -> the rows of
-#: the settings that the scene decides.
+#: A planner: a function of the configuration (only the user's settings) and the scene that returns
+#: the rows of the settings that the scene decides.
 Planner: TypeAlias = Callable[[RunConfig, Scene], Sequence[Decision]]
 #: Length of a run for which neither steps nor views nor seconds are set (3DGS).
 DEFAULT_STEPS = 30_000
@@ -41,7 +41,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
     """Return the facts about a run.
 
     Args:
-        config: The configuration, with the settings of the user alone.
+        config: The configuration with only the user's settings.
         scene: Its scene.
 
     Raises:
@@ -79,17 +79,17 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
 def with_decisions(
     config: RunConfig, scene: Scene
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
-    """Return the configuration with all settings decided, the table, and what makes it again.
+    """Return the decided configuration, the table, and a function that makes the table again.
 
-    With `--plan auto` the planner's rows about the scene come first, and count as given for the
-    recipe.
+    With `--plan auto`, the planner's rows about the scene come first. The recipe treats them as
+    settings of the user.
 
     Raises:
         UserError: See `facts_of`; there is no planner, a photo cannot be decoded, or the recipe
             leaves a setting open.
     """
     if config.seconds is not None:
-        # The seconds are planned anew, and with them all that follows the length.
+        # The seconds are planned anew, and so is everything that depends on the length.
         config = open_again(config)
     if is_complete(config):
         return config, rows_of(config), repeats
@@ -109,12 +109,12 @@ def with_decisions(
 
 
 def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[str, Decision]:
-    """Return setting -> decision, for what the user leaves open.
+    """Return setting -> decision for the settings that the user left open.
 
     Args:
-        config: The configuration, with the settings of the user alone.
+        config: The configuration with only the user's settings.
         scene: Its scene.
-        start: Primitives at the start, if the number of primitives is asked for.
+        start: Primitives at the start, if the number of primitives is to be decided.
 
     Raises:
         UserError: See `with_decisions`.
@@ -124,13 +124,13 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with the numbers and rules of the length that is planned now.
+    """Return the run with the numbers and rules for the length that is planned now.
 
-    Other components stay.
+    Other components stay the same.
 
     Args:
         setup: The run.
-        planned: Steps that it is planned with.
+        planned: Number of steps that the run is now planned with.
         start: Primitives at the start; None before they are counted.
     """
     numbers = {each.name for each in fields(Numbers)}

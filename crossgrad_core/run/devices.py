@@ -1,4 +1,4 @@
-"""The device of a run: named by the user, or a GPU if a rasterizer for it works."""
+"""The device of a run: chosen by the user, or a GPU if a rasterizer works on it."""
 
 import logging
 
@@ -17,7 +17,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def choose_device(name: str) -> torch.device:
-    """The torch device of that name.
+    """Return the torch device of this name.
 
     Raises:
         UserError: There is no such device on this machine.
@@ -47,7 +47,7 @@ def _require_cuda(device: torch.device) -> None:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if (device.index or 0) < count:
         return
-    # A build of torch for AMD's GPUs calls them CUDA devices, too.
+    # A torch build for AMD GPUs also calls them CUDA devices.
     built_for = torch.version.cuda or torch.version.hip
     if built_for is None:
         found, todo = "a build for CPUs only", "install a CUDA build of torch"
@@ -65,7 +65,7 @@ def _require_cuda(device: torch.device) -> None:
 
 
 def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
-    """Return the configuration with the device that `auto` stands for, and a note on it.
+    """Return the configuration with the device that `auto` resolves to, and a note about it.
 
     There is no note on a machine without a GPU.
     """
@@ -84,9 +84,10 @@ def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
 
 
 def _rasterizer(config: RunConfig) -> tuple[str, str]:
-    """Return the rasterizer that would draw on the GPU, and why the GPU is not used, if it is not.
+    """Return the rasterizer for the GPU, and the reason against the GPU; empty if there is none.
 
-    A rasterizer that the user did not name must be faster there than every one on the CPU.
+    A rasterizer that the user did not choose must be faster on the GPU than every rasterizer on the
+    CPU.
     """
     name = config.rasterizer.name
     if config.seconds is not None and config.clock == "cpu":
@@ -105,7 +106,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
-    """Return what the rasterizer would draw, and what needs its statistics."""
+    """Return the backbone that the rasterizer draws, and the densifier that needs its outputs."""
     backbone = build(Backbone, config.backbone.name, config.backbone.options)
     choice = config.densifier or ComponentChoice(name=AUTO)
     name = backbone.default_densifier if choice.name == AUTO else choice.name
@@ -113,18 +114,18 @@ def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
 
 
 def _missing() -> list[str]:
-    """Return what installed rasterizers lack to run on the GPU, with the way to install it."""
+    """Return what each installed rasterizer lacks to run on the GPU, and how to install it."""
     told = []
     for name in entries("rasterizers"):
         try:
             told.append(load(Rasterizer, name).missing("cuda"))
-        except UserError:  # A note says already that it cannot be imported.
+        except UserError:  # Another note already reports that it cannot be imported.
             continue
     return told
 
 
 def _failure(config: RunConfig, name: str) -> str:
-    """Try the rasterizer, and return what is wrong; empty if it works."""
+    """Test the rasterizer on the GPU and return the problem; empty if it works."""
     _LOG.info("trying rasterizer %s on the GPU: the first time it may compile for minutes", name)
     try:
         build(Rasterizer, name, config.rasterizer.options).self_test("cuda")

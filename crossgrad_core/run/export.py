@@ -1,4 +1,4 @@
-"""Writing the trained scene to a file, and what that costs where it is an approximation."""
+"""Export of the trained scene to a file, and the loss of quality if the file approximates it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ class Exported:
 
     Attributes:
         gaussians: Number of Gaussians.
-        baked_for: The view that it was baked for, `N training views` on average, or None where
-            nothing had to be baked.
-        views: Views on which it was compared with the live model: the one that it was baked for,
-            else the held-out ones.
-        psnr: dB, mean over these views of the file's Gaussians, drawn on black as viewers draw
-            them; None where the live model has the same Gaussians on the same background, or where
-            there are no such views.
-        live_psnr: dB, the same of the live model on its own background.
-        background: Name of that background, where it is not black; no file holds it.
+        baked_for: The view that the file was baked for, or `N training views` for their average;
+            None if nothing had to be baked.
+        views: Number of views on which the file was compared with the live model: the view that it
+            was baked for, else the held-out views.
+        psnr: dB, mean over these views, for the file's Gaussians drawn on black as viewers draw
+            them. None if the live model has the same Gaussians on the same background, or if there
+            are no such views.
+        live_psnr: dB, the same mean for the live model on its own background.
+        background: Name of the live model's background if it is not black; no file stores it.
         notes: What the user should know about the file.
     """
 
@@ -51,13 +51,13 @@ class Exported:
 
     @property
     def loss(self) -> float | None:
-        """What baking, and the background that no file holds, cost, dB."""
+        """The loss in dB by baking and by the background that no file stores."""
         if self.psnr is None or self.live_psnr is None:
             return None
         return self.live_psnr - self.psnr
 
     def as_data(self) -> dict[str, Json]:
-        """For summary.json."""
+        """Return the values for summary.json."""
         told = {name: value for name, value in vars(self).items() if name != "notes"}
         return {**told, "loss": self.loss}
 
@@ -70,16 +70,16 @@ def export_scene(
     exporter: Exporter | None = None,
     coordinates: str = INPUT,
 ) -> Exported:
-    """Writes the trained scene; beside it `.georef.json`, where there is something to tell.
+    """Write the trained scene, and with it a `.georef.json` if there is something to record.
 
     Args:
         setup: The run.
         state: Its state.
         path: The file.
-        camera: Name of the view to bake what depends on the view for; None takes the average over
-            the training views.
-        exporter: What writes the file; the run's own where none is given.
-        coordinates: Of the file, as `check_coordinates` takes them.
+        camera: Name of the view for which view-dependent parts are baked; None for the average
+            over the training views.
+        exporter: The exporter; the run's own by default.
+        coordinates: Coordinates of the file, as `check_coordinates` accepts them.
 
     Raises:
         UserError: There is no view of that name, the scene cannot be put into these coordinates, or
@@ -114,12 +114,12 @@ def export_scene(
 
 
 def georef_of(path: Path) -> Path:
-    """The file beside an exported one that tells other programs where it belongs."""
+    """Return the path of the file that tells other programs where an exported file belongs."""
     return path.with_suffix(".georef.json")
 
 
 def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, ...]:
-    """Writes that file, where there is something to tell; answers what rounding costs."""
+    """Write the `.georef.json` if there is something to record; return a note about rounding."""
     rounding = exporter.rounding(placed.gaussians, placed.similarity)
     offset, largest = rounding.offset.tolist(), rounding.largest
     if not placed.facts and not any(offset):
@@ -131,12 +131,12 @@ def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, 
 
 
 def _own_background(setup: Setup) -> str | None:
-    """The background of evaluated views, where it is not black."""
+    """Return the name of the background of evaluated views; None if it is black."""
     return setup.config.background if bool(eval_background(setup).any()) else None
 
 
 def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> float | None:
-    """dB, mean over the views that have pixels to compare; None without any."""
+    """Return the mean PSNR in dB over the views with pixels to compare; None without any."""
     each = []
     with torch.no_grad():
         for view in views:
@@ -147,10 +147,10 @@ def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> f
 
 
 def view_named(setup: Setup, name: str, where: str = "--camera") -> View:
-    """The view of that name; `where` it was given.
+    """Return the view of this name; `where` names its option in the error message.
 
     Raises:
-        UserError: There is none.
+        UserError: There is no such view.
     """
     for view in setup.scene.views:
         if view.name == name:
@@ -165,19 +165,19 @@ def view_named(setup: Setup, name: str, where: str = "--camera") -> View:
 
 
 def renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
-    """Renders a view with the parameters to be shown as an evaluation does, exposure included."""
+    """Return a function that renders a view as an evaluation does, exposure included."""
     through = camera_renderer(setup, state)
     return lambda view: apply(setup, state, view, through(view.camera))
 
 
 def plain_renderer(setup: Setup, state: TrainState) -> Callable[[View], Tensor]:
-    """Renders a view that is none of the scene's: nothing is known of its exposure."""
+    """Return a function that renders a view of another capture, whose exposure is unknown."""
     through = camera_renderer(setup, state)
     return lambda view: through(view.camera)
 
 
 def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tensor]:
-    """Renders what any camera sees with the parameters to be shown, before any exposure."""
+    """Return a function that renders any camera as an evaluation does, before any exposure."""
     background, parameters = eval_background(setup), eval_parameters(setup, state)
     phase = setup.phase(state.step, training=False)
 
@@ -189,23 +189,23 @@ def camera_renderer(setup: Setup, state: TrainState) -> Callable[[Camera], Tenso
 
 
 def drawer(setup: Setup, state: TrainState, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Renders a view of Gaussians that are the same for every camera, exposure included.
+    """Return a function that renders the same Gaussians for every view, exposure included.
 
-    On black: what a file holds is what viewers draw, and they draw it so.
+    The background is black, because viewers draw the Gaussians of a file on black.
     """
     plain = plain_drawer(setup, gaussians)
     return lambda view: apply(setup, state, view, plain(view))
 
 
 def plain_drawer(setup: Setup, gaussians: Gaussians) -> Callable[[View], Tensor]:
-    """Renders a view, on black, of such Gaussians before any exposure."""
+    """Return a function that renders the same Gaussians on black, before any exposure."""
     background = torch.zeros(3, device=setup.device)
     moved = gaussians.mapped(lambda tensor: tensor.to(setup.device))
     return lambda view: setup.rasterizer.render(moved, view.camera, background).image
 
 
 def described(exported: Exported, path: Path) -> Sequence[str]:
-    """Lines for the user about a file."""
+    """Return lines for the user about an exported file."""
     lines = [*exported.notes]
     if exported.loss is None:
         return lines

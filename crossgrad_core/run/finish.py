@@ -1,4 +1,4 @@
-"""A run from its first step to its last file: whatever ends it, what there is gets kept."""
+"""A run from its first step to its last file: its results are kept, however it ends."""
 
 import traceback
 from collections.abc import Callable, Sequence
@@ -28,12 +28,12 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: How torch says that there is no memory, besides errors of a type of its own.
+#: Texts in torch errors that mean out of memory; some such errors have a type of their own.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 def reason_of(error: BaseException) -> str:
-    """What went wrong; of an unexpected error also its type and place."""
+    """Return the reason of an error; for an unexpected error with its type and place."""
     if not is_unexpected(error):
         return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -43,19 +43,19 @@ def reason_of(error: BaseException) -> str:
 
 
 def is_unexpected(error: BaseException) -> bool:
-    """Whether the error is none that crossgrad words for its users."""
+    """Return True if crossgrad did not write the error's message for its users."""
     return not isinstance(error, UserError | TrainingFailedError)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory was asked for that is not there."""
+    """Return True if the error means that there was not enough memory."""
     if isinstance(error, MemoryError):
         return True
     return isinstance(error, RuntimeError) and any(sign in str(error) for sign in _NO_MEMORY)
 
 
 def traceback_of(error: BaseException) -> str:
-    """The traceback as text."""
+    """Return the traceback as text."""
     return "".join(traceback.format_exception(error))
 
 
@@ -67,21 +67,21 @@ def _place(error: BaseException) -> str:
     return f" ({Path(last.filename).name}, line {last.lineno}, in {last.name})"
 
 
-#: A run that ends so many decibels below its best evaluation says so; where few photos are held out
-#: single evaluations differ by less all the time.
+#: A run whose last evaluation is more than this many decibels below its best one reports it. With
+#: few held-out photos, single evaluations always differ by smaller amounts.
 WORSE: Final = 0.3
 _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended.
+    """The ending of a run.
 
     Attributes:
         status: `finished`, `stopped` (resumable) or `failed`.
-        error: What went wrong and what there is not therefore; None where nothing did.
-        traced: Whether log.txt holds a traceback.
-        cause: The exception that ended training; None where none did.
+        error: The reason of the failure and the missing results; None if nothing failed.
+        traced: True if log.txt contains a traceback.
+        cause: The exception that ended training; None if there was none.
     """
 
     status: Status
@@ -92,15 +92,15 @@ class Ending:
 
 @dataclass
 class RunLoop:
-    """A run under way.
+    """A run in progress.
 
     Attributes:
-        setup: What it is made of; a run that follows the clock revises it.
+        setup: Its setup; a run that follows the clock replaces it.
         state: Its state; after an exception the last good one.
-        session: Where its results go.
+        session: The writer of its results.
         log: Its log.txt.
-        stopper: Whether it is to stop.
-        ending: How it ends, as far as that is known.
+        stopper: The requests to stop it.
+        ending: Its ending, as far as it is known.
     """
 
     setup: Setup
@@ -111,9 +111,10 @@ class RunLoop:
     ending: Ending = Ending("finished")
 
     def to_the_end(self, length: Length) -> Ending:
-        """Trains, and then saves and describes the last state.
+        """Train, then save and describe the last state.
 
-        Part by part: none that fails costs another, and the ending says which did.
+        Each part is attempted separately: if one fails, the others still run, and the ending
+        reports the failure.
         """
         self._attempt("", lambda: self._train(length))
         if self.ending.status == "finished":
@@ -121,7 +122,7 @@ class RunLoop:
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
-        # What a step left half done, and nothing could put back, is no state to go on from.
+        # A state that a step left half changed, and that was not restored, cannot be continued.
         if self.state.step > 0 and not self.state.touched:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
@@ -154,7 +155,7 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    keeper.copy(state)  # A length is written down with its step: none goes behind.
+                    keeper.copy(state)  # No rollback before the step of a new length.
                 if revised.config is not self.setup.config:  # A planned length is written already.
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
@@ -173,7 +174,7 @@ class RunLoop:
             self.setup.hook.crossgrad_log(text=edit.note)
 
     def _catch_up(self) -> None:
-        """Evaluates where an earlier session ended before it could."""
+        """Evaluate if an earlier session ended before its evaluation."""
         setup, state, session = self.setup, self.state, self.session
         if evaluates_after(setup, state.step) and not session.has_row(state.step):
             session.evaluate(setup, state)
@@ -196,7 +197,7 @@ class RunLoop:
             try:
                 return part()
             except Exception as error:
-                # Compiled code makes an error of its own of an interrupt that it was met by.
+                # Compiled code can turn an interrupt into an error of its own.
                 if self.stopper.at_once:
                     raise KeyboardInterrupt from error
                 raise
@@ -209,10 +210,10 @@ class RunLoop:
         )
 
     def _attempt(self, missing: str, part: Callable[[], None]) -> None:
-        """Does a part of the run; where it fails, the ending says so.
+        """Do a part of the run; if it fails, record the failure in the ending.
 
         Args:
-            missing: What there is not where the part fails.
+            missing: The result that is missing if the part fails.
             part: The part.
         """
         try:
@@ -248,7 +249,7 @@ class RunLoop:
 
 
 def exit_messages(course: RunLoop) -> list[str]:
-    """What the user is told of a run that came to nothing or did not finish, and how to go on."""
+    """Return messages about a run that failed, is empty or is unfinished, and how to continue."""
     ending, folder = course.ending, course.session.folder
     lines = []
     if not course.state.primitives(course.setup):
@@ -267,7 +268,7 @@ def exit_messages(course: RunLoop) -> list[str]:
 
 
 def overdone(rows: Sequence[Row]) -> list[str]:
-    """Says that a run ended more than `WORSE` decibels below its best evaluation."""
+    """Return a line if a run ended more than `WORSE` decibels below its best evaluation."""
     best, last = best_of(rows), rows[-1].get("psnr") if rows else None
     if best is None or last is None or not best["psnr"] - last > WORSE:
         return []
@@ -286,12 +287,12 @@ def next_line(folder: Path) -> str:
 
 
 def resume_line(folder: Path) -> str:
-    """How a run goes on."""
+    """Return the command that continues a run."""
     return f"continue with: crossgrad run --resume {one_line(quote(str(folder)))}"
 
 
 def _kept(course: RunLoop) -> list[str]:
-    """What to say about the state, where not all of it is in the newest checkpoint."""
+    """Return a line about the state if the newest checkpoint does not hold it."""
     step = course.state.step
     saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
@@ -300,17 +301,17 @@ def _kept(course: RunLoop) -> list[str]:
     return [f"the state of step {step} could not be saved; {there}"]
 
 
-#: Steps and training seconds to look at before anything is said; the very first step is left out.
+#: Steps and training seconds to observe before the estimate; the very first step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
-#: A run that takes less is over before an estimate helps.
+#: No estimate is given for less than this many seconds: the run ends before it helps.
 WORTH_A_LINE = 60.0
 
 
 class Forecast:
-    """Another length; says once how long the rest of the run will take.
+    """A wrapper of a length that logs once how long the rest of the run will take.
 
     Args:
-        length: The length that decides.
+        length: The length that decides about the end of the run.
     """
 
     def __init__(self, length: Length) -> None:
@@ -319,13 +320,13 @@ class Forecast:
         self._told = False
 
     def due(self, state: TrainState) -> bool:
-        """When there is something to decide or to tell."""
+        """Return True if there is something to decide or to log."""
         if self._first is None:
             self._first = state.step, state.clock.train
         return self._length.due(state) or self._is_time(state)
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """The setup with the length that now holds."""
+        """Return the setup with the current length; log the estimate if it is time."""
         if self._length.due(state):
             setup = self._length.revised(setup, state)
         if self._is_time(state):

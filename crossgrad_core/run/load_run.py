@@ -1,4 +1,4 @@
-"""From settings, or from a run's folder, to a run that can go on."""
+"""Assembling a run from settings, or loading it from its folder so that it can continue."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -54,9 +54,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Clock, Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
-#: Settings that say nothing about what was trained, or that a run which goes on may have changed:
-#: where things lie, when there is a look at them, how many faults are borne, and a length that
-#: follows the clock.
+#: Settings that do not affect what was trained, or that a resumed run may have changed: paths,
+#: times of evaluations, the number of tolerated faults, and a length that follows the clock.
 _LOOSE: Final = frozenset(
     {
         "clock",
@@ -84,22 +83,22 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
-#: The component that another machine may not have.
+#: The component that another machine may lack.
 _DRAWN: Final = "rasterizer"
-#: Whether the length follows a clock.
+#: Key that tells whether the length follows a clock.
 _TIMED: Final = "follows the clock"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
-    """What trains a run, flat (`loss.ssim_weight`), and the version that does."""
+    """Return the settings that affect training, flat (`loss.ssim_weight`), and the version."""
     loose = set(_LOOSE)
     if config.planned_seconds is None:
         loose -= {"revisions"}
     else:
-        loose |= {"steps"}  # The clock may have changed them.
+        loose |= {"steps"}  # The clock may have changed the number.
     data = config.model_dump(mode="json", exclude=loose)
-    del data[_DRAWN]["name"]  # What draws on this machine; how it does is another matter.
-    # What `opening` reads where a run that began with the usual ones has written none.
+    del data[_DRAWN]["name"]  # Another machine may use another rasterizer; its options still count.
+    # The same default as in `_config`, for a run that did not write this setting.
     data |= {
         "sh_from": config.sh_from or 0,
     }
@@ -111,11 +110,11 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
 
 
 def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpoint:
-    """The state as a checkpoint; tensors are shared, not copied.
+    """Return the state as a checkpoint; tensors are shared, not copied.
 
     Args:
         state: The state.
-        config: What trained it, where that is to be held against what it is read with.
+        config: The configuration that trained it, if a later load is to be compared with it.
     """
     scalars: dict[str, Any] = {
         "settings": {} if config is None else settings_of(config),
@@ -137,10 +136,10 @@ def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpo
 
 
 def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
-    """The state that continues bit for bit where the checkpoint was written.
+    """Return the state that continues bit for bit from the checkpoint.
 
     Raises:
-        UserError: It is not a state of this run: of another backbone, of other photos, or damaged.
+        UserError: It is not a state of this run: another backbone, other photos, or damaged.
     """
     _check_tensors(setup, checkpoint)
     try:
@@ -156,19 +155,19 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
 
 
 def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
-    """Refuses a state that other settings have trained: its figures would be filed under these.
+    """Refuse a state that was trained with other settings, as its results would be misattributed.
 
     Raises:
-        UserError: Some that train are not those of the checkpoint.
+        UserError: Settings that affect training differ from the checkpoint's.
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
-        return  # Of a version that wrote none, or whose settings may have other names.
+        return  # Written by another version: it stored no settings, or they may have other names.
     ours = settings_of(config)
-    # A setting that came later is none that was changed; an option of a component may be.
+    # A setting that is newer than the checkpoint is not a change; an option of a component may be.
     known = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
-    # Another rasterizer has other options, and a length that follows the clock is none of these.
+    # Another rasterizer has other options. A length that follows the clock lacks these settings.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
@@ -225,7 +224,7 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
     missing = [name for name in wanted if name not in parameters]
     if missing:
         raise _misfit(checkpoint, f"parameters {listed(wanted)}", f"no {listed(missing)}")
-    # Frozen ones may be whole numbers, such as the levels of an octree.
+    # Frozen parameters may be whole numbers, such as the levels of an octree.
     trained = [name for block in setup.trained_blocks for name in block.tensors]
     whole = [name for name in trained if not parameters[name].is_floating_point()]
     if whole:
@@ -272,24 +271,24 @@ def _record(plain: dict[str, Any] | None) -> StepRecord | None:
 
 
 _LOG = logging.getLogger(__name__)
-#: Slot -> what stands in for a part of it.
+#: Slot -> default component that replaces a missing one.
 _PLAIN: Final = {
     "sampler": defaults.SAMPLER,
     "operator": defaults.OPERATOR,
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
-    # It asks for no points, of which the scene may have none.
+    # It needs no points; the scene may have none.
     "initializer": defaults.INITIALIZER_WITHOUT_POINTS,
     "resolution": defaults.RESOLUTION,
 }
-#: Slots (singular words) whose components a run can be looked at without.
+#: Slots (singular words) whose components are not needed to look at a run.
 REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
 def without_missing(config: RunConfig) -> RunConfig:
-    """The configuration with plain parts for those that only train, and are not installed here.
+    """Return the configuration with default components for missing ones that only train.
 
-    Metrics, observers and rules that are not are left out.
+    Metrics, observers and rules that are not installed are left out.
     """
     update: dict[str, object] = {}
     lacking = []
@@ -312,7 +311,7 @@ def without_missing(config: RunConfig) -> RunConfig:
 
 
 def _is_gone(slot: str, choice: ComponentChoice) -> bool:
-    """Whether a part, or one that its options name, is not installed."""
+    """Return True if a component, or one that its options name, is not installed."""
     if choice.name not in entries(plural(slot)):
         return True
     if slot != "operator":
@@ -325,14 +324,14 @@ def _is_gone(slot: str, choice: ComponentChoice) -> bool:
 
 
 def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
-    """The configuration with the parts again that trained it."""
+    """Return the configuration with the components and rules that trained the run."""
     slots = (*_PLAIN, "rules")
     return config.model_copy(update={slot: getattr(trained, slot) for slot in slots})
 
 
-#: How a run ended that wrote down its results, and a checkpoint with them.
+#: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: What a run says that has to begin again.
+#: Note of a run that has to begin again.
 BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
 
 
@@ -343,13 +342,13 @@ def set_up(
     *,
     looks: bool = False,
 ) -> tuple[Setup, float]:
-    """The assembled run, and the seconds of reading the scene and of assembling.
+    """Return the assembled run, and the seconds of reading the scene and of assembling.
 
     Args:
         config: The configuration, with a scene.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        check: Refuses a scene that is not the run's; answers with notes on one that it takes.
-        looks: Nothing will be trained: the scene is not checked against itself.
+        check: Refuses a scene that is not the run's scene; returns notes on an accepted one.
+        looks: True if nothing will be trained: the scene is then not checked against itself.
 
     Raises:
         UserError: The scene cannot be read, or the components cannot work together.
@@ -358,7 +357,7 @@ def set_up(
     configure_threads(config.threads)
     start = perf_counter()
     path = cast("Path", config.scene)
-    # A run that goes on began with this scene, so that it was accepted.
+    # A resumed run began with this scene, so the scene was accepted then.
     scene, reader = (
         read_scene(config, path)
         if looks
@@ -375,10 +374,10 @@ def set_up(
 
 
 def _refuse_lost_checkpoints(folder: Path) -> None:
-    """Keeps the results of a run whose checkpoints somebody removed: it must not begin again here.
+    """Refuse to begin a run again whose checkpoints were removed, to protect its results.
 
     Raises:
-        UserError: The run has results, so that it had checkpoints.
+        UserError: The run has results, so it had checkpoints.
     """
     for status in _WITH_RESULTS:
         if step := summarised_step(folder, status):
@@ -393,10 +392,10 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
 
 
 def require_checkpoint(folder: Path) -> None:
-    """Refuses a folder in which there is nothing to look at yet; writes nothing there.
+    """Refuse a folder that has no trained state yet; write nothing there.
 
     Raises:
-        UserError: It is no run, or it has no checkpoint.
+        UserError: The folder is not a run, or the run has no checkpoint.
     """
     read_config(folder)
     if not named_checkpoints(folder / CHECKPOINTS):
@@ -415,16 +414,16 @@ def require_checkpoint(folder: Path) -> None:
 def opened(
     folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
 ) -> tuple[Setup, TrainState]:
-    """A finished or stopped run and its newest state, to look at; it may be training meanwhile.
+    """Load a finished, stopped or still training run and its newest state, to look at them.
 
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
-        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+        accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, a setting would change the training, or the
-            scene is another one.
+        UserError: The folder is not a run, the run has no checkpoint, a setting would change the
+            training, or the scene is another one.
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
@@ -442,20 +441,20 @@ def continued(
     accept_scene: bool = False,
     accept_plugins: bool = False,
 ) -> tuple[Setup, TrainState]:
-    """A run's setup and the state that it goes on from.
+    """Load a run's setup and the state from which it continues.
 
-    That is the newest one, or, where the run was ended before its first checkpoint, the first.
+    This is the newest state, or the initial state if the run has no checkpoint yet.
 
     Args:
         folder: The run's folder.
         settings: Only `device`, `threads` and `stop_after` may differ from the run's own.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        accept_scene: Take a scene of which photos, masks or points have changed.
-        accept_plugins: Take other versions of the packages that train the run.
+        accept_scene: Accept a scene whose photos, masks or points have changed.
+        accept_plugins: Accept other versions of the packages that train the run.
 
     Raises:
-        UserError: It is no run, a setting would change the training, or the scene or a package is
-            another one.
+        UserError: The folder is not a run, a setting would change the training, or the scene or a
+            package is another one.
     """
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
     packages = read_plugins(folder)
@@ -500,14 +499,14 @@ def _from(
 
 
 def _noted(folder: Path, setup: Setup, packages: Packages | None) -> tuple[str, ...]:
-    """What the scene says now, and what the run noted when it decided what is a setting now."""
+    """Return the scene's current notes, the notes of the run's start, and changes of packages."""
     packages = packages or {}
     stored = without_outdated(read_notes(folder) or setup.notes, packages)
     return tuple(dict.fromkeys((*setup.scene.notes, *stored, *history(packages))))
 
 
 def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
-    """The run's own configuration with what may differ."""
+    """Return the run's own configuration with the settings that may differ."""
     frozen = sorted(set(settings) - CHANGEABLE)
     if frozen:
         raise UserError(
@@ -518,7 +517,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # What a run began with is written down; where it is not, it was that of the first versions.
+    # Runs write the degree that they begin with; runs of the first versions began with degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})
@@ -537,7 +536,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
 
 
 def _check_device(name: str, folder: Path) -> None:
-    """Says what to do where the run's own device is not on this machine."""
+    """Refuse a device that is not on this machine; the message tells what to do."""
     import torch
 
     if name.startswith("cuda") and not torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""The options of `crossgrad run` that are settings, read from the schema of a run."""
+"""The settings that are options of `crossgrad run`, read from the schema of a run."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from crossgrad_core.config import RunConfig
 from crossgrad_core.contract.flags import Flag
 
-#: Types that an option has itself; everything else is read as text and validated by the schema.
+#: Types that an option keeps; every other value is read as text and validated by the schema.
 _OWN_TYPES: Final = (int, float, Path)
 
 
@@ -21,10 +21,10 @@ class Option:
     """An option of the command line.
 
     Attributes:
-        path: The setting that it is for, such as `("data", "split")`.
-        flag: How it appears.
+        path: The setting that it changes, such as `("data", "split")`.
+        flag: Its name and appearance on the command line.
         kind: Its type.
-        help: Its help.
+        help: Its help text.
     """
 
     path: tuple[str, ...]
@@ -56,5 +56,5 @@ def _kind(field: FieldInfo) -> object:
     return kind if kind in _OWN_TYPES else str
 
 
-#: All of them in the order of the schema.
+#: All options in the order of the schema.
 OPTIONS: Final = tuple(_options(RunConfig))

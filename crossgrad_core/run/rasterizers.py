@@ -1,4 +1,4 @@
-"""Which rasterizer draws where the user names none, or where that of a run has no device."""
+"""The choice of a rasterizer if the user names none, or if the run's own lacks the device."""
 
 import logging
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ class Wanted:
     options: frozenset[str] = frozenset()
 
     def lacking(self, rasterizer: type[Rasterizer]) -> tuple[str, ...]:
-        """What of it a rasterizer cannot do."""
+        """Return the demands that a rasterizer does not meet."""
         return tuple(
             sorted(
                 ({self.response} - rasterizer.responses)
@@ -45,7 +45,7 @@ class Wanted:
 
 
 def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densifier) -> Wanted:
-    """Return what a run asks of its rasterizer on a device type."""
+    """Return the demands of a run on its rasterizer for a device type."""
     of_recipe = frozenset() if is_complete(config) else recipe_of(config).rasterizer_options
     return Wanted(
         device=device,
@@ -56,18 +56,19 @@ def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densi
 
 
 def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
-    """The name of the rasterizer, and notes on why it was chosen.
+    """Return the name of the rasterizer, and notes on why it was chosen.
 
-    Every installed one says how fast it is on the device; the fastest that can do what is wanted is
-    taken, of equally fast ones the first by name; if none can, the fastest, and objections say why.
-    One that cannot be imported is left out. Slower ones are not imported.
+    Every installed rasterizer reports its speed on the device. The fastest one that meets the
+    demands is chosen; of equally fast ones, the first by name. If none meets them, the fastest is
+    chosen, and later checks report why it cannot work. A rasterizer that cannot be imported is left
+    out. Slower ones are not imported.
 
     Args:
-        name: What the user asked for; `auto` leaves it open.
-        wanted: What the run asks of it.
+        name: The user's choice; `auto` leaves it open.
+        wanted: The demands of the run.
 
     Raises:
-        UserError: It is left open, and no installed rasterizer runs on the device.
+        UserError: The choice is open, and no installed rasterizer runs on the device.
     """
     if name != AUTO:
         return name, (f"rasterizer {name}: asked for",)
@@ -84,12 +85,12 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
 
 
 def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) -> str | None:
-    """Return the fastest rasterizer that can do what is wanted; None if none can.
+    """Return the fastest rasterizer that meets the demands; None if none does.
 
     Args:
         speeds: Name -> speed.
-        wanted: What the run asks of it.
-        notes: Gets a line for each faster one that is left out.
+        wanted: The demands of the run.
+        notes: A line is added for each faster rasterizer that is left out.
     """
     for name in _ranked(speeds):
         try:
@@ -104,9 +105,9 @@ def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) 
 
 
 def drawn_elsewhere(config: RunConfig) -> RunConfig:
-    """A run's configuration for another device, with a rasterizer that runs there.
+    """Return a run's configuration for another device, with a rasterizer that runs there.
 
-    It keeps the options that every one which might be chosen has.
+    Only the options that every possible rasterizer has are kept.
 
     Raises:
         UserError: The run's own rasterizer is not installed.
@@ -127,7 +128,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
     """Return name -> speed of the rasterizers that run on a device type, and notes on broken ones.
 
-    Those that answer before they are imported are not imported.
+    A rasterizer that declares its speed without an import is not imported.
     """
     speeds: dict[str, float] = {}
     notes = []

@@ -1,4 +1,4 @@
-"""The configuration as it was carried out: every decision written down."""
+"""The configuration as it was carried out, with every decision filled in."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ ALWAYS = (
 
 
 def resolved(setup: Setup) -> RunConfig:
-    """The configuration that repeats the run: components with all options, K and steps fixed.
+    """Return a configuration that repeats the run: components with all options, K and steps fixed.
 
     The output folder is left out, so that the repetition gets its own.
     """
@@ -53,7 +53,7 @@ def resolved(setup: Setup) -> RunConfig:
 
 
 def _located(path: Path | None) -> Path | None:
-    """The whole path of what is there; any other path is one within the scene."""
+    """Return the absolute path if it exists; any other path is inside the scene."""
     return path.resolve() if path is not None and path.exists() else path
 
 

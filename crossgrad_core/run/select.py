@@ -1,4 +1,4 @@
-"""The components of a run, chosen and fitted to its scene, and the number of views per step."""
+"""Choice of the components of a run for its scene, and the number of views per step."""
 
 from pathlib import Path
 from typing import Final, TypeVar
@@ -32,12 +32,12 @@ from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
-#: Up to which K one that suits both is looked for.
+#: The search for a K that suits sampler and operator ends before this number.
 _MOST_VIEWS: Final = 13
 
 
 def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, list[str]]:
-    """The components, loaded and fitted to the scene, and notes on what was chosen or left out.
+    """Return the components, fitted to the scene, and notes on choices and omissions.
 
     Raises:
         UserError: A name or option is wrong.
@@ -103,7 +103,7 @@ def select(config: RunConfig, scene: Scene, reader: str) -> tuple[Selection, lis
 
 
 def rules_of(config: RunConfig) -> dict[str, Rule]:
-    """The rules of a run by name."""
+    """Return the rules of a run by name."""
     return {each.name: build(Rule, each.name, each.options) for each in config.used_rules}
 
 
@@ -120,7 +120,7 @@ def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None
 
 
 def _clouds_in(folder: Path | None) -> str:
-    """Names of files in the scene's folder that may be point clouds."""
+    """Describe the files in the scene's folder that may be point clouds."""
     files = sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
     names = [file.name for file in files if file.suffix.lower() in CLOUDS]
     return f"point clouds that are not used: {listed(names)}" if names else "no point cloud"
@@ -153,23 +153,23 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
 
 
 def fitted_backbone(config: RunConfig, scene: Scene) -> tuple[Backbone, tuple[str, ...]]:
-    """The backbone of a run, fitted to its scene, and what was left out."""
+    """Return the backbone of a run, fitted to its scene, and notes on what was left out."""
     backbone = chosen(Backbone, config.backbone)
     return pair(backbone.fitted_to(scene), Backbone, tuple, backbone, "fitted_to")
 
 
 def chosen(slot: type[C], choice: ComponentChoice | None) -> C:
-    """The component that the user or the recipe chose."""
+    """Build the component that the user or the recipe chose."""
     return build(slot, _name(choice), {} if choice is None else choice.options)
 
 
 def _name(choice: ComponentChoice | None) -> str:
-    """The name of a component; a recipe has filled in what was open."""
+    """Return the name of a component; the recipe has already filled in open names."""
     return AUTO if choice is None else choice.name
 
 
 def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Metric]:
-    """The metrics by name; of those by default only what gives each column a name of its own.
+    """Return the metrics by name; a default metric is left out if a column would occur twice.
 
     Raises:
         UserError: Two columns of metrics.csv would have one name.
@@ -209,7 +209,7 @@ def _check_form(name: str, form: str) -> None:
 
 
 def _or_default(choice: ComponentChoice | None, name: str) -> ComponentChoice:
-    """The choice, where its name is left open with the default one."""
+    """Return the choice, with the default name if its name is open."""
     if choice is None:
         return ComponentChoice(name=name)
     return choice.model_copy(update={"name": name}) if choice.name == AUTO else choice
@@ -220,7 +220,7 @@ def _grouping_choice(
 ) -> ComponentChoice | None:
     if config.grouping is not None and config.grouping.name != AUTO:
         return config.grouping
-    # Labels that the sampler makes up leave a grouping nothing to do.
+    # A sampler that makes its own labels needs no grouping.
     of_operator = None if sampler.own_labels else operator.resolved_grouping
     name = sampler.default_grouping or of_operator
     if name is not None:
@@ -236,7 +236,7 @@ def _grouping_choice(
 
 
 def operator_of(config: RunConfig) -> tuple[Operator, str]:
-    """The operator of a run, a chain where several are named, and its name."""
+    """Return the operator of a run (a chain if several are named), and its name."""
     links = config.operators
     built = tuple(build(Operator, link.name, link.options) for link in links)
     operator = built[0] if len(built) == 1 else build(Operator, CHAIN, {"links": built})
@@ -244,9 +244,9 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 
 
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
-    """Return K over a run, and why it is not the usual one of the sampler; empty if it is.
+    """Return K over a run, and why it differs from the sampler's default; empty if it does not.
 
-    If no K is set, it is the sampler's, or the least one that leaves no operator idle.
+    If no K is set, it is the sampler's default, or the smallest K at which the operator works.
     """
     if config.view_plan is not None:
         return config.view_plan, ""
@@ -255,7 +255,7 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     usual = sampler.resolved_views
     of_sampler = (k for k in range(1, _MOST_VIEWS) if sampler.view_counts.admits(k))
     both = [k for k in of_sampler if operator.views.admits(k)]
-    # Who names no operator expects no more than a sum of one gradient.
+    # A user who names no operator expects only the sum of the gradients.
     named = config.operator != RunConfig.model_fields["operator"].default
     found, why = usual, ""
     if usual not in both:

@@ -1,4 +1,4 @@
-"""Where the results of a run go while it trains and when it ends."""
+"""The writer of a run's results, while it trains and when it ends."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,21 +32,21 @@ from crossgrad_core.training.per_image_params import PHOTO_VALUES, write_photos
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 
-#: The trained scene, for viewers; the suffix is the exporter's.
+#: The trained scene, for viewers; the exporter gives the suffix.
 CLOUD = "point_cloud"
-#: Held-out views of which panels are drawn.
+#: Number of held-out views for which panels are drawn.
 PANELS = 4
 
 
 class Session:
-    """Writes one run's folder; the sink of the training loop.
+    """The writer of one run's folder; the training loop passes its results here.
 
     Args:
         folder: The run's folder.
         table: Its metrics.csv.
 
     Attributes:
-        machine: Watches the machine while the run trains.
+        machine: Records the load of the machine while the run trains.
     """
 
     def __init__(self, folder: Path, table: MetricsCsv) -> None:
@@ -60,12 +60,12 @@ class Session:
 
     @classmethod
     def fresh(cls, folder: Path, setup: Setup) -> "Session":
-        """The session of a new run."""
+        """Return the session of a new run."""
         return cls(folder, MetricsCsv.create(folder, columns_of(setup)))
 
     @classmethod
     def resumed(cls, folder: Path, setup: Setup, step: int) -> "Session":
-        """The session of a run that continues after `step`."""
+        """Return the session of a run that continues after `step`."""
         session = cls(folder, MetricsCsv.resume(folder, columns_of(setup), step))
         session._saved_step = step
         rows = read_metrics(folder)
@@ -74,15 +74,15 @@ class Session:
         return session
 
     def has_row(self, step: int) -> bool:
-        """Whether metrics.csv has a row of that step or a later one."""
+        """Return True if metrics.csv has a row of that step or a later one."""
         return self._evaluated_step >= step
 
     def result(self, step: int) -> EvaluationResult | None:
-        """What the evaluation after that step found; None where there was none."""
+        """Return the evaluation after that step; None if there was none."""
         return self._result[1] if self._result is not None and self._result[0] == step else None
 
     def evaluate(self, setup: Setup, state: TrainState, panels: int = 0) -> None:
-        """Evaluates the held-out views and records a row; draws `panels` of them."""
+        """Evaluate the held-out views, add a row to metrics.csv, and draw `panels` panels."""
         self._require_folder()
         start = perf_counter()
         writer = None
@@ -109,7 +109,7 @@ class Session:
         setup.hook.crossgrad_evaluation(report=report)
 
     def save(self, setup: Setup, state: TrainState) -> None:
-        """Writes a checkpoint."""
+        """Write a checkpoint unless this step is already saved."""
         if self._saved_step == state.step:
             return
         self._require_folder()
@@ -123,14 +123,14 @@ class Session:
 
     @property
     def gone(self) -> bool:
-        """Whether the folder was moved or removed meanwhile."""
+        """True if the folder was moved or removed meanwhile."""
         return not self.folder.is_dir()
 
     def _require_folder(self) -> None:
-        """Makes no second folder where that of the run was moved or removed meanwhile.
+        """Refuse to create a second folder if the run's folder was moved or removed.
 
         Raises:
-            UserError: It is not there.
+            UserError: The folder does not exist.
         """
         if self.gone:
             raise UserError(
@@ -141,30 +141,30 @@ class Session:
             )
 
     def rewind(self, setup: Setup, step: int) -> None:
-        """Drops rows and checkpoints of steps that training went back behind."""
+        """Drop rows and checkpoints after `step`, because training was rolled back to it."""
         self._table = MetricsCsv.resume(self.folder, columns_of(setup), step)
         drop_later(self.folder, step)
         self._saved_step = self._evaluated_step = -1
 
     def renew(self, setup: Setup, step: int) -> None:
-        """Drops the row of `step`, whose state has changed, and lets it be saved once more."""
+        """Drop the row of `step`, whose state has changed, so that it can be saved again."""
         if self.has_row(step):
             self._table = MetricsCsv.resume(self.folder, columns_of(setup), step - 1)
         self._saved_step = self._evaluated_step = -1
 
     def align(self, setup: Setup, state: TrainState) -> None:
-        """Drops what was recorded after the state's step, if anything was."""
+        """Drop rows and checkpoints after the state's step, if there are any."""
         if max(self._saved_step, self._evaluated_step) > state.step:
             self.rewind(setup, state.step)
 
     def write_views(self, state: TrainState) -> None:
-        """Writes per_view.csv, where the state was evaluated."""
+        """Write per_view.csv if the state was evaluated."""
         result = self.result(state.step)
         if result is not None:
             write_per_view(self.folder, result)
 
     def draw(self, setup: Setup, state: TrainState) -> None:
-        """Draws curve.png, where there is anything to draw."""
+        """Draw curve.png if there are rows to draw."""
         rows = read_metrics(self.folder)
         if rows:
             with reporting(state):
@@ -172,7 +172,7 @@ class Session:
                 draw_curve(self.folder, rows, title(setup), counts)
 
     def export(self, setup: Setup, state: TrainState) -> None:
-        """Writes the trained scene and says what the file is."""
+        """Write the trained scene and log a description of the file."""
         path = self.folder / f"{CLOUD}.{setup.selection.exporter.suffix}"
         with reporting(state):
             self._exported = export_scene(setup, state, path)
@@ -183,7 +183,7 @@ class Session:
     def summarise(
         self, setup: Setup, state: TrainState, status: Status, error: str | None = None
     ) -> None:
-        """Writes what describes the run as a whole."""
+        """Write summary.json, which describes the run as a whole."""
         with reporting(state):
             machine = self.machine.figures(state.clock.train)
         summary = Summary(
@@ -206,14 +206,14 @@ class Session:
 
 @contextmanager
 def reporting(state: TrainState) -> Iterator[None]:
-    """Counts the seconds of the block as reporting."""
+    """Add the seconds of the block to the reporting time."""
     start = perf_counter()
     yield
     state.clock.report += perf_counter() - start
 
 
 def totals(setup: Setup, state: TrainState) -> Totals:
-    """What the run has cost so far."""
+    """Return what the run has cost so far."""
     losses = state.last.losses if state.last is not None else ()
     return Totals(
         step=state.step,
@@ -229,17 +229,17 @@ def totals(setup: Setup, state: TrainState) -> Totals:
 
 
 def regimes_of(setup: Setup) -> list[str]:
-    """The regimes of the held-out views."""
+    """Return the sorted regimes of the held-out views."""
     return sorted({view.regime for view in setup.scene.test_views})
 
 
 def columns_of(setup: Setup) -> tuple[str, ...]:
-    """The columns of metrics.csv."""
+    """Return the columns of metrics.csv."""
     return columns_for(regimes_of(setup), [metric.figure for metric in setup.metrics])
 
 
 def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
-    """Number of held-out views overall and per regime: measured ones, where that is known."""
+    """Return the number of held-out views overall and per regime; of measured views if known."""
     if result is not None:
         regimes = {regime: means.views for regime, means in result.regimes.items()}
         return {"overall": result.overall.views, **regimes}
@@ -249,7 +249,7 @@ def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]
 
 
 def title(setup: Setup) -> str:
-    """What the curve is called."""
+    """Return the title of the curve."""
     names = setup.selection.names
     parts = f"{names['backbone']}, {names['sampler']}, {names['operator']}"
     return f"{setup.scene.name}: {parts}, K = {setup.selection.views}"

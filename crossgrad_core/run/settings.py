@@ -1,7 +1,7 @@
-"""Settings of a run from a file, from options and from `--set`, in this order of precedence.
+"""Settings of a run from a file, from options and from `--set`; later sources win.
 
 The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`, which validates
-it: unknown keys and values out of bounds are found there.
+it and finds unknown keys and values out of bounds.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,11 +27,11 @@ from crossgrad_core.wording import listed, plural, singular, with_article
 
 Settings: TypeAlias = dict[str, Any]
 
-#: Options that add to a list of components, by the setting that they add to.
+#: Setting that holds a list of components -> the option that adds to the list.
 ADDING: Final = {"observers": "--observe", "metrics": "--metrics"}
-#: Settings that name one component (or a chain of operators) and hold its options.
+#: Settings that name one component (or a chain of operators) and contain its options.
 CHOICES: Final = tuple(singular(slot) for slot in GROUPS if slot not in MANY)
-#: Settings that say how long a run is.
+#: Settings that determine the length of a run.
 LENGTHS: Final = tuple(
     (name,)
     for name in (
@@ -39,9 +39,9 @@ LENGTHS: Final = tuple(
         *("planned_seconds", "planned_views"),
     )
 )
-#: Other settings that a recipe decides by, for which it is asked anew.
+#: Other settings on which a recipe's decisions depend; if one changes, the recipe decides again.
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
-#: Settings that hold settings.
+#: Settings that contain settings.
 GROUPS_OF_SETTINGS: Final = ("data",)
 _FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
 #: Options of the command line -> their setting.
@@ -51,12 +51,12 @@ _PLACES: Final = {option.name: option.path for option in OPTIONS}
 def merged(
     config: Path | None, options: Mapping[str, object], assignments: Sequence[str]
 ) -> Settings:
-    """The settings that a user asked for.
+    """Return the settings that a user asked for.
 
     Args:
         config: YAML file, or None.
-        options: Option name -> value; None and empty lists where the user did not give it. A name
-            may be that of a component's option, as in `operator.c`.
+        options: Option name -> value; None and empty lists if the user did not give it. A name may
+            be the option of a component, as in `operator.c`.
         assignments: `KEY=VALUE` texts, values in YAML.
 
     Raises:
@@ -71,13 +71,13 @@ def merged(
 def name_file(
     error: UserError, config: Path, options: Mapping[str, object], assignments: Sequence[str]
 ) -> None:
-    """Lets an error say which configuration file made the setting that it is about.
+    """Add the configuration file to an error if the file made the setting of the error.
 
     Args:
-        error: About the settings of `merged`.
-        config: The file, as given to `merged`; likewise the others.
-        options: Settings given beside the file, which are not the file's.
-        assignments: Likewise.
+        error: An error about the settings of `merged`; changed in place.
+        config: The file, as given to `merged`.
+        options: The options, as given to `merged`.
+        assignments: The assignments, as given to `merged`.
     """
     key = error.where.removeprefix("--").split(".")[0].replace("-", "_")
     beside = {path[0] for path in [*_places(options), *(_parsed(each)[0] for each in assignments)]}
@@ -87,13 +87,13 @@ def name_file(
 
 
 def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
-    """Settings of which the later ones win over the earlier ones, in their long form.
+    """Return the settings of several layers in their long form; later layers win.
 
     Args:
-        layers: What the options of `crossgrad run` or the keys of a configuration file are called
-            -> value. A layer that chooses another component drops the options that earlier layers
-            gave to the one before; a length replaces that of earlier layers.
-        assignments: `KEY=VALUE` texts as after `--set`, values in YAML, which win over all layers.
+        layers: Name of an option of `crossgrad run`, or key of a configuration file -> value. A
+            layer that chooses another component drops the options that earlier layers gave to the
+            previous component. A length replaces the length of earlier layers.
+        assignments: `KEY=VALUE` texts as after `--set`, values in YAML; they win over all layers.
 
     Raises:
         UserError: An assignment, or a key with a dot, makes no sense.
@@ -106,7 +106,9 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
 
 
 def with_recipe(settings: Mapping[str, Any]) -> Settings:
-    """The settings over those that their recipe fixes; what a run wrote down has these already.
+    """Return the settings on top of the settings that their recipe fixes.
+
+    A configuration that a run wrote already contains the fixed settings.
 
     Raises:
         UserError: There is no such recipe.
@@ -119,7 +121,7 @@ def with_recipe(settings: Mapping[str, Any]) -> Settings:
 
 
 def parsed(settings: Mapping[str, Any]) -> RunConfig:
-    """The validated configuration.
+    """Return the validated configuration.
 
     Raises:
         UserError: A setting does not exist or has a wrong value.
@@ -136,7 +138,7 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
 
 
 def _flat(layer: Mapping[str, object]) -> Settings:
-    """The layer with one entry for each setting of a group, which is no component: `data`."""
+    """Return the layer with one entry per setting of a group such as `data`."""
     flat: Settings = {}
     for name, value in layer.items():
         if name in GROUPS_OF_SETTINGS and isinstance(value, dict):
@@ -147,7 +149,7 @@ def _flat(layer: Mapping[str, object]) -> Settings:
 
 
 def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
-    """Place of a setting -> what the user gave; None and empty lists stand for nothing."""
+    """Return path of a setting -> the user's value, without None and empty lists."""
     places: dict[tuple[str, ...], object] = {}
     for name, value in options.items():
         if not (value is None or (isinstance(value, list) and not value)):
@@ -160,10 +162,10 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
 
 
 def _rules(option: str, value: object) -> Mapping[str, object]:
-    """Name of a rule -> its options, or whether it is used.
+    """Return name of a rule -> its options, or True or False for its use.
 
     Raises:
-        UserError: There is something else than a rule.
+        UserError: A value is not a rule.
     """
     if isinstance(value, Mapping) and "name" not in value:
         return {str(name): _plain(each) for name, each in value.items()}
@@ -188,17 +190,17 @@ def _overlaid(
     chosen: Mapping[tuple[str, ...], object],
     assigned: Sequence[tuple[tuple[str, ...], object]],
 ) -> Settings:
-    """The settings with those that were given later."""
+    """Return the settings, overridden by the settings that were given later."""
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
     had = {(key,) for key, value in settings.items() if value is not None} & {*LENGTHS}
     if lengths:
-        # A new length replaces the earlier one as a whole: with what it counted, and where it was
-        # to stop on the way.
+        # A new length replaces the earlier one as a whole, including its clock and the step at
+        # which it was to stop.
         timed = bool(had & {("seconds",), ("planned_seconds",)}) and ("seconds",) not in lengths
         gone = had | ({("stop_after",)} if had else set()) | ({("clock",)} if timed else set())
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
     settings = _opened(settings, [*chosen, *(path for path, _ in assigned)])
-    # Names first: choosing another component drops the options of the one it replaces.
+    # Names first: the choice of another component drops the options of the previous one.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
             _assign(settings, path, value)
@@ -206,9 +208,9 @@ def _overlaid(
 
 
 def _opened(settings: Settings, paths: Sequence[tuple[str, ...]]) -> Settings:
-    """The settings of a file, of which those that a recipe decided are open where they must be.
+    """Return the settings, with decisions of the recipe removed if they must be made again.
 
-    They are decided anew if something changes that says how long or what the run is.
+    All decisions are made again if a setting changes that determines the length or kind of the run.
     """
     opened = dict(settings)
     if {path[0] for path in paths} & {*_DECIDING, *(name for (name,) in LENGTHS)}:
@@ -224,7 +226,7 @@ def _named_by_default(settings: Settings) -> Settings:
 
 
 def _with_default_name(key: str, value: object) -> object:
-    """A choice of options alone is meant for the component that a run takes by default."""
+    """Return the choice with a name; options without a name belong to the default component."""
     if key not in CHOICES or not isinstance(value, dict) or "name" in value:
         return value
     default = RunConfig.model_fields[key].default
@@ -232,12 +234,12 @@ def _with_default_name(key: str, value: object) -> object:
 
 
 def _of_file(path: Path) -> Settings:
-    """The settings of a file."""
+    """Return the settings of a file."""
     return unmarked(_normalized(read_mapping(path, *_FILE)), path)
 
 
 def _normalized(settings: Settings) -> Settings:
-    """The settings with every choice of components in its long form."""
+    """Return the settings with every choice of components in its long form."""
     named = {current_name(key, settings): value for key, value in settings.items()}
     return {key: _long_form(key, value) for key, value in named.items()}
 
@@ -251,13 +253,13 @@ def _long_form(key: str, value: object) -> object:
 
 
 def _choice(key: str, value: object) -> object:
-    """`a` -> one choice, `a+b` or a list -> a list of choices."""
+    """Return one choice for `a`; a list of choices for `a+b` or a list."""
     chain = isinstance(value, list | tuple) or (isinstance(value, str) and "+" in value)
     return [_named(key, each) for each in _items(value)] if chain else _named(key, value)
 
 
 def _items(value: object) -> Iterable[object]:
-    """The parts of a chain or list; a mapping name -> options counts as a list, too."""
+    """Return the parts of a chain or list; a mapping name -> options also counts as a list."""
     match value:
         case str():
             return value.split("+")
@@ -270,14 +272,14 @@ def _items(value: object) -> Iterable[object]:
 
 
 def _with_name(name: str, options: object) -> object:
-    """The choice `name` with its options; options that are none are left for the validation."""
+    """Return the choice `name` with its options; the validation later refuses invalid options."""
     if options is None:
         return {"name": name}
     return {"name": name, **options} if isinstance(options, dict) else {name: options}
 
 
 def _named(key: str, value: object) -> object:
-    """A choice `{"name": ..., option: ...}`; what is no choice is left for the validation."""
+    """Return a choice `{"name": ..., option: ...}`; the validation later refuses other values."""
     if isinstance(value, str):
         return {"name": value.strip()}
     kind = value if isinstance(value, type) else type(value)
@@ -285,10 +287,10 @@ def _named(key: str, value: object) -> object:
 
 
 def _component(key: str, kind: type[Component], value: object) -> Settings:
-    """The choice of a component that is given as a class, or as an instance with its options.
+    """Return the choice of a component given as a class, or as an instance with its options.
 
     Raises:
-        UserError: It fills another slot, or no installed package offers it.
+        UserError: It belongs to another slot, or no installed package offers it.
     """
     slot = key if key in MANY else plural(key)
     where = f"{key}, {kind.__module__}:{kind.__qualname__}"
@@ -315,7 +317,7 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
 
 
 def _plain(value: object) -> object:
-    """A copy of a value as YAML would give it: numbers of numpy become Python's."""
+    """Return a copy of a value as YAML would read it: NumPy numbers become Python numbers."""
     match value:
         case Path():
             return str(value)
@@ -355,7 +357,7 @@ def _is_name(path: tuple[str, ...]) -> bool:
 
 
 def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
-    """Puts a value in its place; a newly chosen component keeps none of the old one's options."""
+    """Set the value at a path; a newly chosen component drops the options of the previous one."""
     path = (current_name(path[0]), *path[1:])
     key, *rest = path
     if key in CHOICES and rest in ([], ["name"]) and isinstance(value, str | type):
@@ -374,7 +376,7 @@ def _assign(settings: Settings, path: tuple[str, ...], value: object) -> None:
 
 
 def _listed(settings: Settings, key: str) -> object:
-    """A list of components as it is so far: that of a run by default, where none was given."""
+    """Return the current list of components; the default list if none was given."""
     given = settings.get(key)
     if given is not None:
         return given
@@ -386,12 +388,12 @@ def _in_list(value: object) -> list[object]:
 
 
 def _links(value: object) -> list[Settings]:
-    """The choices in a setting: of one component, of a chain, of observers."""
+    """Return the choices in a setting: one component, a chain, or observers."""
     return [each for each in _in_list(value) if isinstance(each, dict)]
 
 
 def _renamed(old: object, new: object) -> object:
-    """The new choice; a link that was chosen before under the same name keeps its options."""
+    """Return the new choice; a link with the same name as before keeps its options."""
     renamed = [
         _with_options(_links(old), each) if isinstance(each, dict) else each
         for each in _in_list(new)
@@ -400,7 +402,7 @@ def _renamed(old: object, new: object) -> object:
 
 
 def _with_options(old: list[Settings], new: Settings) -> Settings:
-    """Options without a name belong to whatever is chosen later, so they are kept as well."""
+    """Return the new link with its old options; options without a name belong to any new link."""
     for link in old:
         if link.get("name", new["name"]) == new["name"]:
             return {**link, **new}
@@ -408,9 +410,9 @@ def _with_options(old: list[Settings], new: Settings) -> Settings:
 
 
 def _extended(old: list[object], new: object) -> list[object]:
-    """The old list and the new choices; options of a choice that is in both are put together.
+    """Return the old list with the new choices; options of a choice in both are merged.
 
-    What is no choice, and a name that is new twice, is left for the validation.
+    Values that are not choices, and new names that occur twice, are left for the validation.
     """
     extended, names = list(old), [link.get("name") for link in _links(new)]
     named = [(row, each) for row, each in enumerate(old) if isinstance(each, dict)]
@@ -427,7 +429,7 @@ def _extended(old: list[object], new: object) -> list[object]:
 
 
 def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
-    """The dictionary that holds the last part of a path; made where there is none yet."""
+    """Return the dictionary that holds the last part of a path; create it if it is missing."""
     place: object = settings
     for depth in range(len(path) - 1):
         place = _inner(place, path, depth)
@@ -441,7 +443,7 @@ def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
 
 
 def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
-    """What `path[depth]` names inside a place."""
+    """Return the value that `path[depth]` names inside a place."""
     part = path[depth]
     match place:
         case dict():

@@ -1,6 +1,6 @@
-"""A trained run as an object: its figures, its views, its files.
+"""A trained run as an object: its metrics, its views, its files.
 
-Figures are read without torch; it is imported by what renders.
+Metrics are read without torch; torch is imported by methods that render.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: Name -> [E] numbers, integers where all of them are.
+#: Column name -> [E] numbers, integers if all of them are.
 Columns: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 
 
 class Run:
     """A run and its folder.
 
-    What is read from the folder (`metrics`, `summary`) is read anew each time, so that a run that
-    is training can be watched. The scene and the newest checkpoint are loaded when they are first
+    Properties that read the folder (`metrics`, `summary`) read it anew each time, so that a run can
+    be watched while it trains. The scene and the newest checkpoint are loaded when they are first
     needed, and kept.
 
     Args:
         folder: The run's folder.
-        device: Where tensors live; the run's own by default.
+        device: Device of the tensors; the run's own by default.
         threads: CPU threads; all by default.
-        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+        accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """
 
     def __init__(
@@ -57,10 +57,10 @@ class Run:
 
     @property
     def metrics(self) -> "Columns":
-        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN where there is none.
+        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN if there is no value.
 
         Raises:
-            UserError: There is no metrics.csv, or it does not hold numbers.
+            UserError: There is no metrics.csv, or it does not contain numbers.
         """
         rows = read_metrics(self.folder)
         names = list(rows[0]) if rows else []
@@ -71,7 +71,7 @@ class Run:
         """The content of summary.json.
 
         Raises:
-            UserError: There is none: the run has not ended, or its process was killed.
+            UserError: There is no file: the run has not ended, or its process was killed.
         """
         return read_summary(self.folder)
 
@@ -80,12 +80,12 @@ class Run:
         """The scene as the run sees it, in its local frame.
 
         Raises:
-            UserError: It cannot be read, or is another one than the run was trained on.
+            UserError: It cannot be read, or the run was trained on another scene.
         """
         return self._open()[0].scene
 
     def render(self, view: "str | Camera") -> NDArray[np.float32]:
-        """What a camera sees, drawn as an evaluation does but not rounded to 8 bits.
+        """Render the image of a camera, as an evaluation does but not rounded to 8 bits.
 
         Args:
             view: Name of a view of the scene, or a camera in the scene's local frame, such as
@@ -95,7 +95,8 @@ class Run:
             [H, W, 3] in 0..1.
 
         Raises:
-            UserError: There is no view of that name, it is no camera, or the run has no checkpoint.
+            UserError: There is no view of that name, `view` is not a valid camera, or the run has
+                no checkpoint.
         """
         import torch
 
@@ -112,7 +113,7 @@ class Run:
             return np.asarray(image.clamp(0.0, 1.0).cpu().numpy(), dtype=np.float32)
 
     def evaluate(self) -> "EvaluationResult":
-        """Evaluates the held-out views again and renews per_view.csv, as `crossgrad eval` does.
+        """Evaluate the held-out views again and rewrite per_view.csv, as `crossgrad eval` does.
 
         Raises:
             UserError: The run has no checkpoint, or its scene is another one.
@@ -126,12 +127,12 @@ class Run:
     def export(
         self, path: Path | str, camera: str | None = None, coordinates: str = "input"
     ) -> Path:
-        """Writes the trained scene with the run's exporter, as `crossgrad export` does.
+        """Write the trained scene with the run's exporter, as `crossgrad export` does.
 
         Args:
             path: The file.
-            camera: Name of the view to bake what depends on the view for; by default the average
-                over the training views.
+            camera: Name of the view for which view-dependent parts are baked; by default the
+                average over the training views.
             coordinates: input, local, enu, utm or epsg:N (docs/coordinates.md).
 
         Returns:
@@ -165,20 +166,20 @@ class Run:
             return self._opened.open(self.folder)
 
 
-def open(  # noqa: A001 - `cg.open` is the one that users see
+def open(  # noqa: A001 - users call it as `cg.open`
     folder: Path | str,
     *,
     device: str | None = None,
     threads: int | None = None,
     accept_scene: bool = False,
 ) -> Run:
-    """A run that was trained before, or is being trained.
+    """Open a run that was trained before, or is still training.
 
     Args:
         folder: The run's folder.
-        device: Where tensors live; the run's own by default.
+        device: Device of the tensors; the run's own by default.
         threads: CPU threads; all by default.
-        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+        accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
 
     Raises:
         UserError: It is not the folder of a run.
@@ -194,14 +195,14 @@ def _column(numbers: Sequence[float | None]) -> NDArray[np.float64] | NDArray[np
 
 
 class _Opened:
-    """Opens a run once for each of its checkpoints; see `Run` for the arguments."""
+    """A cache of one opened run, reloaded for each new checkpoint; see `Run` for the arguments."""
 
     def __init__(self, device: str | None, threads: int | None, accept_scene: bool) -> None:
         self._how = device, threads, accept_scene
         self._kept: tuple[int, tuple[Setup, TrainState]] | None = None
 
     def open(self, folder: Path) -> "tuple[Setup, TrainState]":
-        """The run's setup and its newest state."""
+        """Return the run's setup and its newest state."""
         from crossgrad_core.run.postprocess.open_options import How
 
         newest = max(named_checkpoints(folder / CHECKPOINTS), default=0)

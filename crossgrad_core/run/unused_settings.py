@@ -1,6 +1,6 @@
-"""Settings of a new run that would change nothing are refused, with the reason and the way out.
+"""Refusal of settings of a new run that would change nothing, with the reason and the way out.
 
-A run that goes on is not asked: what it has lived with so far must not keep it from going on.
+A resumed run is not checked: its settings were accepted when it began.
 """
 
 from collections.abc import Iterator
@@ -27,10 +27,10 @@ _TIMES = ("densify_from", "densify_until", "densify_every", "min_refinements")
 
 
 def refuse_labels_for_nothing(setup: Setup) -> None:
-    """Asks the components again, now that it is known which labels the training views have.
+    """Validate the selection again, now that the labels of the training views are known.
 
     Raises:
-        IncompatibleSelectionError: Some component looks for labels that no view has.
+        IncompatibleSelectionError: A component needs labels that no view has.
     """
     if setup.groups is None:
         return
@@ -41,14 +41,14 @@ def refuse_labels_for_nothing(setup: Setup) -> None:
 
 
 def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
-    """Refuses what the user set and what does nothing in this run.
+    """Refuse settings of the user that have no effect in this run.
 
     Args:
-        config: What the user set, before anything was decided.
+        config: The settings of the user, before anything was decided.
         setup: The assembled run.
 
     Raises:
-        UserError: Some setting would change nothing.
+        UserError: A setting would change nothing.
     """
     found = [
         *_of_components(config, setup),
@@ -77,7 +77,7 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
         yield from _of_choice(slot, slot, getattr(config, slot), setup)
     links = config.operators
     for link in links:
-        # A link of a chain is set by its name.
+        # An option of a link in a chain is set by the name of the link.
         place = "operator" if len(links) == 1 else f"operator.{link.name}"
         yield from _of_choice("operator", place, link, setup)
 
@@ -88,7 +88,7 @@ def _of_choice(
     if choice is None or not choice.options:
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
-    # As the user set it: fitted to the scene, it may have lost what the scene does not need.
+    # As the user set it: a component fitted to the scene may have lost unneeded options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{place}.{option}", why
@@ -101,7 +101,7 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
             yield setting, f"densifier {name} never edits"
     if config.growth == "budget" and not densifier.edits:
         yield "growth", f"densifier {name} never edits"
-    # A number bounds the start of points, too.
+    # A number also limits the initial points.
     if not densifier.edits and config.max_gaussians == AUTO:
         yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
     elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
@@ -111,13 +111,13 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.reset_every and not setup.densifier.resets:
         yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
-    # A run that follows the clock notes it once its length is known.
+    # A run that follows the clock reports this as a note once its length is known.
     if not (config.seconds or config.planned_seconds):
         yield from without_resets(config, setup)
 
 
 def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Options of the densifier that do nothing because opacities are not reset, each with why."""
+    """Yield options of the densifier that do nothing without opacity resets, with reasons."""
     if config.densifier is None or setup.schedule.reset_every is not None:
         return
     densifier, given = setup.densifier, config.densifier.options
@@ -128,7 +128,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """What depends on the views of a step."""
+    """Yield settings about the views of a step that do nothing."""
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):
@@ -148,7 +148,7 @@ def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
         yield "clock", "the length of the run is not in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
-    # A run within a budget may become longer.
+    # A run with a time budget may become longer.
     if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
         yield "stop_after", f"the run ends after step {total}"
     if config.min_refinements and not setup.schedule.min_refinements:
@@ -166,7 +166,7 @@ def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """A grouping that was named and is not read."""
+    """Yield the grouping if the user named one that nothing reads."""
     selection = setup.selection
     sampler, operator = selection.sampler, selection.operator
     watched = any(choice.name != PROGRESS for choice in config.observers)

@@ -1,4 +1,4 @@
-"""Memory of the C library: what is freed stays, and lies in large pages."""
+"""Memory of the C library: freed memory stays in the process and uses large pages."""
 
 import ctypes
 import mmap
@@ -10,24 +10,24 @@ from typing import Any, Final
 TRIM_THRESHOLD: Final = -1
 TOP_PAD: Final = -2
 MMAP_THRESHOLD: Final = -3
-#: What stays when it is freed, bytes; and the largest array that is part of it, glibc's bound.
+#: Bytes of freed memory that stay; and the largest array on the heap, the upper bound of glibc.
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
-#: What the heap grows by at first, so little that it is not given back at once, and later. The
-#: heaps of other threads are given back in such pieces only.
+#: Bytes by which the heap grows at first, and later. The first growth is small enough that it is
+#: not given back at once. The heaps of other threads are given back only in such pieces.
 FIRST: Final = KEPT - 2 * LARGEST
 LATER: Final = 16 << 20
-#: Bytes of a large page, and the advice to take them, which older headers may not have.
+#: Bytes of a large page, and the advice to use them, which older headers may lack.
 LARGE_PAGE: Final = 2 << 20
 _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Keeps up to 512 MiB of freed memory in the process, for the arrays of the next step.
+    """Keep up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
-    By itself glibc gives them back after every step, and the kernel clears each page again when the
-    next step first writes to it. Other C libraries are left as they are.
+    By default glibc returns it to the system after every step. The kernel then clears each page
+    again when the next step first writes to it. Other C libraries stay unchanged.
     """
     heap = _heap()
     if heap is not None:
@@ -36,11 +36,11 @@ def keep_freed_memory() -> None:
 
 
 def use_large_pages() -> None:
-    """Asks for large pages where the heap has grown since the last call; Linux with glibc only.
+    """Request large pages for the part of the heap that grew since the last call (Linux, glibc).
 
-    Steps read and write Gaussians here and there in arrays of many megabytes. With pages of 4 KiB
-    most of these need one that the processor does not have at hand. Only a request: the system may
-    not know large pages, or not hand them out.
+    Steps read and write Gaussians at scattered places in arrays of many megabytes. With pages of
+    4 KiB, most accesses miss the processor's table of pages (TLB). This is only a request: the
+    system may not support large pages, or may not provide them.
     """
     heap = _heap()
     if heap is not None:
@@ -59,7 +59,7 @@ class _Heap:
         self._asked = library.sbrk(0)
 
     def keep(self) -> None:
-        """Keeps what is freed, and lets the heap grow: what is not written to costs nothing."""
+        """Keep freed memory, and let the heap grow: memory that is not written to costs nothing."""
         self._library.mallopt(TRIM_THRESHOLD, KEPT)
         self._library.mallopt(MMAP_THRESHOLD, LARGEST)
         self._library.mallopt(TOP_PAD, FIRST)
@@ -67,7 +67,7 @@ class _Heap:
         self._library.mallopt(TOP_PAD, LATER)
 
     def use_large_pages(self) -> None:
-        """Asks for them from where it ended at the last call."""
+        """Request large pages from the end of the heap at the last call."""
         end = self._library.sbrk(0)
         begin = -(-self._asked // LARGE_PAGE) * LARGE_PAGE
         if begin < end:
@@ -77,6 +77,6 @@ class _Heap:
 
 @cache
 def _heap() -> _Heap | None:
-    """The heap; None where the C library is another one."""
+    """Return the heap; None if the C library is not glibc."""
     library = ctypes.CDLL(None) if sys.platform == "linux" else None
     return _Heap(library) if hasattr(library, "mallopt") else None

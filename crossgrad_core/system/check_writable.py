@@ -1,4 +1,4 @@
-"""Whether results can be written, asked before the work that leads to them; nothing stays."""
+"""Checks before the work that results can be written; they leave no files behind."""
 
 import os
 import tempfile
@@ -15,19 +15,19 @@ from crossgrad_core.system.files import (
     unfinished_name,
 )
 
-#: Bytes of the longest path of a file below a folder of results.
+#: Bytes that a path of a file below a folder of results may add.
 _BELOW: Final = 200
 
 
 def check_folder(folder: Path, needed: int = 0) -> None:
-    """Refuses a folder that cannot be made or written to, or whose disk is too full.
+    """Refuse a folder that cannot be created or written to, or whose disk is too full.
 
     Args:
-        folder: The folder, which need not exist yet.
+        folder: The folder; it need not exist yet.
         needed: Bytes that will be written.
 
     Raises:
-        UserError: What is in the way, and what to do.
+        UserError: The folder cannot be used; the message tells why and what to do.
     """
     place = folder.absolute()
     while not os.path.lexists(place):
@@ -41,17 +41,17 @@ def check_folder(folder: Path, needed: int = 0) -> None:
             todo="choose another place, or remove that file",
         )
     try:
-        # Permission bits do not tell the truth on network file systems; writing does.
+        # Permission bits are not reliable on network file systems; a test file is.
         with disk_errors(folder), tempfile.TemporaryFile(dir=place) as probe:
             probe.write(b"crossgrad")
-    except OSError as error:  # Of a kind of its own, as in /proc.
+    except OSError as error:  # A special kind of error, as in /proc.
         raise read_only(folder) from error
     if needed and free_bytes(place) < needed:
         raise disk_full(folder, needed)
 
 
 def _check_length(folder: Path, place: Path) -> None:
-    """Refuse a folder whose path leaves no room for those of the files in it."""
+    """Refuse a folder whose path is too long for the paths of the files in it."""
     name, path = (
         os.pathconf(place, limit) if hasattr(os, "pathconf") else default
         for limit, default in (("PC_NAME_MAX", 255), ("PC_PATH_MAX", 4096))
@@ -62,12 +62,12 @@ def _check_length(folder: Path, place: Path) -> None:
 
 
 def check_own(path: Path) -> None:
-    """Refuses what stands in place of a file that is written where it is.
+    """Refuse a link, pipe or device in place of a file that is written in place.
 
-    What a link leads to would be overwritten, and a pipe waited for without an end.
+    The target of a link would be overwritten, and a pipe would block forever.
 
     Raises:
-        UserError: There is a link, a pipe or a device.
+        UserError: There is a link, a pipe, a device or a folder.
     """
     if path.is_symlink() or (path.exists() and not path.is_file()):
         found = f"a link to {path.resolve()}" if path.is_symlink() else "a pipe, device or folder"
@@ -80,10 +80,10 @@ def check_own(path: Path) -> None:
 
 
 def check_new(*paths: Path) -> None:
-    """Refuses files that are there already: nothing of the user's is overwritten.
+    """Refuse files that already exist, so that no file of the user is overwritten.
 
     Raises:
-        UserError: The first of them.
+        UserError: A file exists; the message names the first one.
     """
     for path in paths:
         with disk_errors(path):
@@ -93,7 +93,7 @@ def check_new(*paths: Path) -> None:
 
 
 def check_name(path: Path) -> None:
-    """Refuse a file whose name leaves no room for that of its unfinished form.
+    """Refuse a file whose name is too long for the name of its unfinished form.
 
     Raises:
         UserError: The name or the path is too long.
@@ -103,10 +103,10 @@ def check_name(path: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Refuses a file that cannot be written because of its folder or because it is one.
+    """Refuse a file that is a folder, or whose folder is missing or not writable.
 
     Raises:
-        UserError: What is in the way, and what to do.
+        UserError: The file cannot be written; the message tells why and what to do.
     """
     check_name(path)
     if path.is_dir():

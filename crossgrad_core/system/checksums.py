@@ -1,7 +1,7 @@
-"""SHA256SUMS: the digests of files that are final, in the format of the program `sha256sum`.
+"""SHA256SUMS: the digests of final files, in the format of the program `sha256sum`.
 
-A file that was damaged or edited afterwards is found by its digest. A folder without the file, or a
-file that it does not list, is not checked.
+The digest reveals a file that was damaged or edited afterwards. A folder without SHA256SUMS, and a
+file that SHA256SUMS does not list, are not checked.
 """
 
 import logging
@@ -19,10 +19,10 @@ from crossgrad_core.system.input_files import open_file, read_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: The file in a folder of results.
+#: The name of the file in a folder of results.
 SUMS: Final = "SHA256SUMS"
 _LINE: Final = re.compile(r"([0-9a-f]{64})  (.+)")
-#: Names with these signs would need escapes in the file.
+#: Names with these characters would need escapes in SHA256SUMS.
 _UNLISTED: Final = re.compile(r"[\n\r\\]")
 
 
@@ -37,10 +37,10 @@ def digest_of(path: Path) -> str:
 
 
 def write_checksums(folder: Path, paths: Iterable[Path]) -> None:
-    """Write SHA256SUMS with the digests of these files, which are below the folder.
+    """Write SHA256SUMS with the digests of files below the folder.
 
     Raises:
-        UserError: The disk is full, or the folder may not be written to.
+        UserError: The disk is full, or the folder is not writable.
     """
     with disk_errors(folder / SUMS):
         digests = {path.relative_to(folder).as_posix(): digest_of(path) for path in paths}
@@ -55,9 +55,9 @@ def drop_checksums(folder: Path) -> None:
 
 @contextmanager
 def relisted(folder: Path, *names: str) -> Iterator[None]:
-    """Let the block replace files of the folder; SHA256SUMS lists what they are afterwards.
+    """Let the block replace files of the folder; afterwards SHA256SUMS lists the new digests.
 
-    A process that is killed inside the block leaves the files unlisted. A folder without SHA256SUMS
+    If the process is killed inside the block, the files stay unlisted. A folder without SHA256SUMS
     gets none.
 
     Args:
@@ -78,17 +78,17 @@ def relisted(folder: Path, *names: str) -> Iterator[None]:
 
 
 def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """Return the digests of some files, and of those in some folders."""
+    """Return the digests of files, and of all files in folders."""
     places = [folder / name for name in names]
     found = [path for place in places for path in (place, *place.rglob("*")) if path.is_file()]
     return {path.relative_to(folder).as_posix(): digest_of(path) for path in found}
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Return name -> digest of the listed files; empty where there is no SHA256SUMS.
+    """Return name -> digest of the listed files; empty if there is no SHA256SUMS.
 
     Raises:
-        UserError: A line is not one of `sha256sum`.
+        UserError: A line does not have the format of `sha256sum`.
     """
     path = folder / SUMS
     try:
@@ -111,7 +111,7 @@ def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]
 
     Args:
         folder: The folder.
-        names: The files to look at; all that are listed by default.
+        names: The files to check; by default all listed files.
 
     Raises:
         UserError: SHA256SUMS or a file cannot be read.
@@ -122,15 +122,15 @@ def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]
 
 
 def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
-    """Refuse files that are not what SHA256SUMS says.
+    """Refuse files whose digest differs from SHA256SUMS.
 
     Args:
         folder: The folder.
-        names: The files that are going to be read; those that are not listed pass.
-        todo: How to get them again.
+        names: The files that are going to be read; unlisted files pass.
+        todo: Advice on how to restore them.
 
     Raises:
-        UserError: Names the first of them.
+        UserError: A file differs; the message names the first one.
     """
     for name in changed_files(folder, names):
         raise UserError(
@@ -143,7 +143,7 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 
 
 def warn_if_changed(path: Path) -> None:
-    """Warn of a file that differs from the SHA256SUMS beside it; another program may edit it."""
+    """Warn about a file that differs from SHA256SUMS in its folder; another program may edit it."""
     if changed_files(path.parent, [path.name]):
         _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
 

@@ -22,7 +22,7 @@ _INFO = "option of the command line"
 
 
 def argument(metavar: str, help: str, default: Any = MISSING) -> Any:  # noqa: A002, ANN401 - typer's
-    """Return a field that is an argument of the command, required if it has no default."""
+    """Return a dataclass field for an argument of the command, required if it has no default."""
     info = typer.Argument(metavar=metavar, help=help, show_default=False)
     return field(default=default, metadata={_INFO: info})
 
@@ -36,14 +36,14 @@ def option(
     flag: str = "",
     **bounds: float,
 ) -> Any:  # noqa: ANN401
-    """Return a field that is an option of the command.
+    """Return a dataclass field for an option of the command.
 
     Args:
         default: Its value if the user does not give it.
-        help: Its help.
-        metavar: What the help shows for its value.
-        heading: The heading of the help below which it is listed.
-        flag: Its name, if it is not the field's.
+        help: Its help text.
+        metavar: The placeholder of its value in the help.
+        heading: The heading of the help under which it is listed.
+        flag: Its name, if it differs from the field's name.
         **bounds: `min` and `max` of a number.
     """
     known: dict[str, Any] = {"metavar": metavar, "rich_help_panel": heading, **bounds}
@@ -54,10 +54,10 @@ def option(
 def command_of(
     options: type[_Given],
 ) -> Callable[[Callable[[_Given], None]], Callable[..., None]]:
-    """Return a decorator that makes a command of a function.
+    """Return a decorator that turns a function into a command.
 
     Args:
-        options: A dataclass whose fields are `argument`s and `option`s. The function gets one.
+        options: A dataclass whose fields are `argument`s and `option`s. The function receives one.
     """
     kinds = get_type_hints(options)
     parameters = [
@@ -87,7 +87,7 @@ class GroupedCommand(TyperCommand):
 
     @override
     def format_options(self, ctx: "Context", formatter: "HelpFormatter") -> None:
-        """Writes arguments, groups of options in the order of their declaration, and the rest."""
+        """Write arguments, groups of options in the order of their declaration, and the rest."""
         groups: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         others: list[tuple[str, str]] = []
         for parameter in self.get_params(ctx):
@@ -107,7 +107,7 @@ def print_all_options(context: typer.Context, wanted: bool) -> None:
 
     Args:
         context: The command.
-        wanted: Whether the user asked for it.
+        wanted: True if the user gave the option.
     """
     if wanted:
         for parameter in context.command.params:

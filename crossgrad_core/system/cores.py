@@ -1,4 +1,4 @@
-"""How many cores this process may use, and which of them a thread does."""
+"""The number of cores that this process may use, and the placement of its threads."""
 
 import math
 import os
@@ -12,13 +12,13 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 
 
 def available_cores() -> int:
-    """Cores this process may use: its affinity, at most its container's CPU quota rounded up."""
+    """Return the cores of this process: its affinity, at most the CPU quota rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, _quota(_CGROUP_LIMIT)))
 
 
 def _quota(limit: Path) -> int:
-    """CPU quota of a cgroup-v2 `cpu.max` file ("quota period" or "max period"), in whole cores."""
+    """Return the CPU quota of a cgroup-v2 `cpu.max` file ("quota period") in whole cores."""
     try:
         quota, period = limit.read_text(encoding="ascii").split()
         return max(1, math.ceil(int(quota) / int(period)))
@@ -27,24 +27,24 @@ def _quota(limit: Path) -> int:
 
 
 def let_idle_threads_sleep() -> None:
-    """Lets torch's threads sleep when they have nothing to do, unless the environment says more.
+    """Let torch's idle threads sleep, unless the environment already sets a policy.
 
-    OpenMP's threads spin for milliseconds on cores that other threads of a step wait for, ours and
-    those of other programs. Heard only before torch is imported.
+    OpenMP threads spin for milliseconds on cores that other threads need, ours and those of other
+    programs. This has an effect only before torch is imported.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def current_core() -> int | None:
-    """Number of the core that the calling thread runs on; None where the system does not tell."""
+    """Return the core that the calling thread runs on; None if the system does not report it."""
     tell = _sched_getcpu()
     return None if tell is None else int(tell())
 
 
 def keep_off(core: int | None, threads: Iterable[int]) -> None:
-    """Lets threads (native numbers) run on all cores that this thread may use but `core`.
+    """Let threads (native numbers) run on all cores of this thread except `core`.
 
-    Nothing changes where that leaves none, where `core` is None, or for a thread that has ended.
+    Nothing changes if no core is left, if `core` is None, or for a thread that has ended.
     """
     if core is None:
         return
@@ -60,5 +60,5 @@ def _sched_getcpu() -> Callable[[], int] | None:
         return None
     import ctypes
 
-    # The lock is kept: the call takes less than letting it go does.
+    # PyDLL keeps Python's lock: the call is faster than releasing the lock.
     return getattr(ctypes.PyDLL(None), "sched_getcpu", None)

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and disk errors in words that a user understands."""
+"""Files that appear complete or not at all, and disk errors as messages for users."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ _IN_THE_WAY = frozenset({errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ELOOP}
 
 
 def size_text(count: int) -> str:
-    """A number of bytes for people, in KiB, MiB or GiB."""
+    """Format a number of bytes in KiB, MiB or GiB."""
     if count < 2**20:
         return f"{count / 2**10:,.1f} KiB"
     if count < 2**30:
@@ -28,15 +28,15 @@ def size_text(count: int) -> str:
 
 
 def free_bytes(path: Path) -> int:
-    """Free bytes of the file system that `path`, which need not exist yet, lies or will lie on."""
+    """Return the free bytes of the file system of `path`, which need not exist yet."""
     place = path.absolute()
-    while not os.path.exists(place):  # Not of Path, which raises an error for a long name.
+    while not os.path.exists(place):  # `Path.exists` raises an error for a long name.
         place = place.parent
     return shutil.disk_usage(place).free
 
 
 def disk_full(path: Path, needed: int | None) -> UserError:
-    """The error for a full disk; `needed` is the size in bytes of what should be written."""
+    """Return the error for a full disk; `needed` is the size in bytes of the file to write."""
     return UserError(
         "not enough disk space",
         where=path,
@@ -47,7 +47,7 @@ def disk_full(path: Path, needed: int | None) -> UserError:
 
 
 def read_only(path: Path) -> UserError:
-    """The error for a place that must not be written to."""
+    """Return the error for a place that is not writable."""
     return UserError(
         "cannot write here",
         where=path,
@@ -57,7 +57,7 @@ def read_only(path: Path) -> UserError:
 
 
 def path_too_long(path: object) -> UserError:
-    """Return the error for a path that the file system cannot hold."""
+    """Return the error for a path that is too long for the file system."""
     return UserError(
         "the path is too long for the file system",
         where=path,
@@ -68,22 +68,22 @@ def path_too_long(path: object) -> UserError:
 
 
 def is_too_long(error: OSError) -> bool:
-    """Whether a path is longer than the file system takes."""
+    """Return True if the error means that a path is too long for the file system."""
     return error.errno == errno.ENAMETOOLONG
 
 
 def is_full(error: OSError) -> bool:
-    """Whether there is no room for what should have been written."""
+    """Return True if the error means that the disk or quota is full."""
     return error.errno in _FULL
 
 
 @contextmanager
 def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
-    """Turn a full disk, no permission, a wrong kind of file or a long path into a `UserError`.
+    """Turn errors about disk space, permissions, file kinds and long paths into a `UserError`.
 
     Args:
-        path: What is being written.
-        needed: Its size in bytes, where known.
+        path: The file that is being written.
+        needed: Its size in bytes, if known.
     """
     try:
         yield
@@ -102,13 +102,13 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
 
 @contextmanager
 def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
-    """A binary file that takes the place of `path` when the block ends without an error.
+    """Yield a binary file that replaces `path` when the block ends without an error.
 
     The bytes reach the disk before the name does, so that a crash leaves either the old file or
     the new one.
 
     Raises:
-        UserError: The disk is full or the folder may not be written to; an old file is untouched.
+        UserError: The disk is full or the folder is not writable; an old file stays unchanged.
     """
     temporary = unfinished_name(path)
     with disk_errors(path, needed):
@@ -126,12 +126,12 @@ def atomic_file(path: Path, needed: int | None = None) -> Iterator[BinaryIO]:
 
 
 def unfinished_name(path: Path) -> Path:
-    """Return what a file is called until it is whole."""
+    """Return the name of a file until it is complete."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether `atomic_file` left this behind in a process that was killed, or is writing it now."""
+    """Return True for the name of an unfinished file, of a killed process or of a current write."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
@@ -140,7 +140,7 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
     Args:
         folder: The folder.
-        shared: Whether other processes may write into it: then a file stays while its process runs.
+        shared: True if other processes may write into it; then files of live processes stay.
     """
     for path in folder.glob(".*.tmp"):
         named = _TEMPORARY.fullmatch(path.name)
@@ -149,7 +149,7 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether another process of this machine has that number."""
+    """Return True if another process of this machine has that number."""
     if process == os.getpid():  # Left by an earlier process with this number, as in a container.
         return False
     try:
@@ -162,27 +162,27 @@ def _is_alive(process: int) -> bool:
 
 
 def text_bytes(text: str) -> bytes:
-    r"""Return a text in UTF-8; a byte of a file name that is not becomes `\udc80` or the like.
+    r"""Return a text in UTF-8; bytes of a file name that are not UTF-8 become `\udc80` or similar.
 
-    In JSON and YAML this is an escape, from which the name is read again.
+    In JSON and YAML this is an escape that restores the name when it is read.
     """
     return text.encode(errors="backslashreplace")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a whole file through `atomic_file`."""
+    """Write a whole file through `atomic_file`."""
     with atomic_file(path, len(content)) as file:
         file.write(content)
 
 
 def sync_file(path: Path) -> None:
-    """Makes sure that a written file's content is on the disk."""
+    """Wait until the content of a written file is on the disk."""
     with path.open("rb+") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes sure that new names in the folder are on the disk, where the system can do that."""
+    """Wait until new names in the folder are on the disk, if the system supports this."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

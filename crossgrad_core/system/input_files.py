@@ -1,6 +1,6 @@
-"""Files from outside: regular ones only, of bounded size, so that none blocks or fills the memory.
+"""Input files: only regular files of bounded size, so that none blocks or fills the memory.
 
-Links are followed; docs/reliability.md says which names may lead where.
+Links are followed; docs/reliability.md lists where names may lead.
 """
 
 import os
@@ -12,15 +12,15 @@ from typing import Final
 
 from crossgrad_core.system.files import size_text
 
-#: Bytes of a file that is parsed as a whole. What Python makes of it may take some times as many.
+#: Most bytes of a file that is parsed as a whole. Its values may take `GROWS` times as much memory.
 LARGEST: Final = 64 << 20
 GROWS: Final = 8
-#: Bytes of a character in Python's widest texts.
+#: Bytes per character of Python's widest strings.
 _WIDEST: Final = 4
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a regular file, or a link to one; no file has a name that is too long."""
+    """Return True for a regular file or a link to one; False if the name is too long."""
     try:
         return path.is_file()
     except OSError:
@@ -28,10 +28,10 @@ def is_file(path: Path) -> bool:
 
 
 def open_file(path: Path) -> BufferedReader:
-    """Opens a file to be read.
+    """Open a file for reading.
 
     Raises:
-        OSError: It cannot be, or is a pipe or a device, which might never open or end.
+        OSError: It cannot be opened, or is a pipe or a device, which might never open or end.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("a folder, pipe or device in place of a file")
@@ -39,12 +39,12 @@ def open_file(path: Path) -> BufferedReader:
 
 
 def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int = LARGEST) -> bytes:
-    """The content of a file that is parsed as a whole.
+    """Return the content of a file that is parsed as a whole.
 
     Args:
         path: The file.
-        weights: Sign -> bytes of memory that go into what one of it stands for.
-        most: Bytes that it may have; values may take `GROWS` times as many in memory.
+        weights: Character -> bytes of memory of the value that one occurrence stands for.
+        most: Most bytes of the file; values may take `GROWS` times as many in memory.
 
     Raises:
         OSError: See `open_file`; or it is too large, or would become too large.

@@ -1,7 +1,7 @@
-"""Ctrl-C, `kill` and a closed terminal end a command with one line, whatever it is doing.
+"""Handling of Ctrl-C, `kill` and a closed terminal: a command ends with one line at any time.
 
 The exit code is 128 and the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
-SIGTERM, 129 after SIGHUP. This module is the first that the command imports, and imports little.
+SIGTERM, 129 after SIGHUP. The command imports this module first, so it imports little.
 """
 
 import os
@@ -11,48 +11,48 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-#: What asks a command to end, where the system has it.
+#: Signals that request the end of a command, if the system has them.
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-#: How to go on after an end at once: lines for the user, the newest last.
+#: Lines for the user about how to continue after an immediate end, the newest last.
 _WAYS_ON: list[str] = []
-#: Files that are being written; they are deleted where the process ends at once.
+#: Files that are being written; they are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
-#: Numbers of the processes that write such files; they end first.
+#: Numbers of the processes that write such files; they are ended first.
 HELPERS: set[int] = set()
 
 
 def exit_code(number: int) -> int:
-    """The exit code of a command that a signal ended."""
+    """Return the exit code of a command that a signal ended."""
     return 128 + number
 
 
 def signal_names() -> list[int]:
-    """The signals that are not ignored; `nohup` and background jobs of scripts ignore some."""
+    """Return the signals that are not ignored; `nohup` and background jobs ignore some."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def tell(text: str, *, alone: bool = True) -> None:
-    """Writes one line to stderr, from a signal handler too.
+    """Write one line to stderr; also safe in a signal handler.
 
     Args:
         text: The line.
-        alone: Whether the cursor of a terminal may stand behind "^C" or a progress bar.
+        alone: True to begin on a new line of a terminal, after "^C" or a progress bar.
     """
     line = f"\n{text}\n" if alone and sys.stderr.isatty() else f"{text}\n"
     try:
         sys.stderr.write(line)
         sys.stderr.flush()
-    except RuntimeError:  # The handler came while stderr was being written to.
+    except RuntimeError:  # The signal came during another write to stderr.
         with suppress(OSError):
             os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
-        pass  # There is nowhere left to say it.
+        pass  # There is no place left to report it.
 
 
 def end_at_once(number: int, _frame: FrameType | None) -> None:
-    """Ends the process without unwinding: an exception may be lost in a callback of a library."""
+    """End the process without unwinding, because a library's callback may swallow an exception."""
     tell("interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}")
     for line in _WAYS_ON[-1:]:
         tell(line, alone=False)
@@ -70,7 +70,7 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def resume_hint(text: str) -> Iterator[None]:
-    """Inside the block an end at once is followed by this line."""
+    """Print this line after an immediate end inside the block."""
     _WAYS_ON.append(text)
     try:
         yield
@@ -80,13 +80,13 @@ def resume_hint(text: str) -> Iterator[None]:
 
 @contextmanager
 def ended_quietly() -> Iterator[None]:
-    """Ends the process at once when it is asked to inside the block, and quietly after it."""
+    """End the process at once on a signal inside the block, and silently after the block."""
     numbers = signal_names()
     for number in numbers:
         signal.signal(number, end_at_once)
     try:
         yield
     finally:
-        # Nothing is left to do but to leave; Python's own handler would print a traceback.
+        # Only the exit is left; Python's own handler would print a traceback.
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""The vertices of a PLY file as named columns: ascii or binary, any property order and type."""
+"""Reading of PLY vertices as named columns: ascii or binary, any property order and type."""
 
 import os
 import re
@@ -36,7 +36,7 @@ _TYPES = {
     "float64": "f8",
 }
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-# Not `isdigit`, which knows other scripts; and no file holds 10^18 records.
+# Not `isdigit`, which accepts digits of other scripts; and no file holds 10^18 records.
 _COUNT = re.compile(r"[0-9]{1,18}")
 _LONGEST_HEADER_LINE = 65_536
 _MOST_HEADER_LINES = 10_000
@@ -44,7 +44,7 @@ _MOST_HEADER_LINES = 10_000
 
 @dataclass(frozen=True)
 class Element:
-    """A kind of record of a PLY file; `fields` is None where it has list properties."""
+    """A kind of record of a PLY file; `fields` is None if it has list properties."""
 
     name: str
     count: int
@@ -61,7 +61,7 @@ class _Draft:
     lists: bool = False
 
     def done(self) -> Element:
-        """The element."""
+        """Return the finished element."""
         return Element(self.name, self.count, None if self.lists else tuple(self.fields.items()))
 
 
@@ -83,7 +83,7 @@ class Vertices:
 
 
 def read_vertices(path: Path) -> Vertices:
-    """Reads the element `vertex` of a PLY file.
+    """Read the element `vertex` of a PLY file.
 
     Raises:
         UserError: The file is missing, is not a PLY file, has no vertices or ends too early.
@@ -107,7 +107,7 @@ def read_vertices(path: Path) -> Vertices:
 
 
 def vertex_properties(path: Path) -> tuple[str, ...]:
-    """Names of the properties of the element `vertex`, from the header alone.
+    """Return the names of the properties of the element `vertex`, from the header alone.
 
     Raises:
         UserError: The file is missing or is not a PLY file.
@@ -231,7 +231,7 @@ def _read_binary(
         found = f"{size_text(max(there, 0))} ({max(there, 0):,} bytes)"
         expected = f"{size_text(needed)} ({needed:,} bytes) for {vertex.count:,} vertices"
         raise _truncated(path, expected, found)
-    if dtype.itemsize == 0:  # An element without properties takes no room at all.
+    if dtype.itemsize == 0:  # An element without properties takes no space.
         return {}
     file.seek(start)
     rows = np.fromfile(file, dtype=dtype, count=vertex.count)
@@ -245,7 +245,7 @@ def _read_ascii(
         _dtype(vertex, header, path)
     names = [name for name, _ in vertex.fields or ()]
     skip = sum(item.count for item in before)
-    # Every line takes a byte at least, so that a count that cannot be true is not counted to.
+    # Every line has at least one byte, so an impossible count is refused without reading lines.
     possible = skip + vertex.count <= path.stat().st_size
     lines = list(islice(file, skip, skip + vertex.count)) if possible else []
     if len(lines) < vertex.count:

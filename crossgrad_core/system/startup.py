@@ -1,7 +1,7 @@
-"""Progress of a command: a line for each stage, a clock while kernels compile, counts.
+"""Progress of a command: a line for each stage, a clock while kernels compile, and counts.
 
-Listens to the log of the package; what takes long says so there (`reading scene ...`), and so does
-the cache of kernels before it compiles one. Nothing heavy is imported.
+This module listens to the package's log. Slow stages write there (`reading scene ...`), and so does
+the kernel cache before it compiles a kernel. Nothing heavy is imported.
 """
 
 import logging
@@ -16,19 +16,19 @@ from crossgrad_core.system.terminal import controls_of, is_live
 from crossgrad_core.system.version import VERSION
 from crossgrad_core.wording import one_line
 
-#: The logger that speaks of kernels, and how its messages begin.
+#: The logger of the kernel cache.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
-#: Seconds between lines about compiling where stderr is no terminal, and where it is one.
+#: Seconds between lines about compiling: if stderr is not a terminal, and if it is one.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
 _EXPLANATION = "compiling for this machine, before the first start only (about a minute)"
 
 
 def announce(*, quiet: bool = False) -> None:
-    """Says at once that the command has started, and from now on what it does.
+    """Report at once that the command has started, and from then on its stages.
 
     Args:
-        quiet: Only warnings are shown.
+        quiet: Show only warnings.
     """
     finish()
     logger = logging.getLogger(_PACKAGE)
@@ -39,7 +39,7 @@ def announce(*, quiet: bool = False) -> None:
 
 
 def finish() -> None:
-    """Ends what `announce` began, before a result or an error is shown."""
+    """End the reports that `announce` began, before a result or an error is shown."""
     logger = logging.getLogger(_PACKAGE)
     for handler in [each for each in logger.handlers if isinstance(each, _Startup)]:
         handler.close()
@@ -48,7 +48,7 @@ def finish() -> None:
 
 
 class _Startup(logging.Handler):
-    """Shows stages as lines, and compiling with the seconds that it has taken."""
+    """A log handler that shows stages as lines, and compiling with its seconds so far."""
 
     def __init__(self, level: int) -> None:
         super().__init__(level)
@@ -56,7 +56,7 @@ class _Startup(logging.Handler):
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
-        """Shows a record."""
+        """Show a record."""
         text = record.getMessage()
         if record.levelno >= logging.WARNING:
             _say(f"note: {text}")
@@ -71,15 +71,15 @@ class _Startup(logging.Handler):
 
     @override
     def close(self) -> None:
-        """Says nothing more."""
+        """Stop all output."""
         self._compiling.stop()
         super().close()
 
 
 class _Compiling:
-    """Shows the seconds of compiling, from a thread, because one kernel may take ten seconds.
+    """A clock of compiling that runs in a thread, because one kernel may take ten seconds.
 
-    On a terminal all is one line. A kernel that another one calls is compiled inside it.
+    On a terminal, everything is one line. Compiling a kernel may compile other kernels inside.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class _Compiling:
         self._thread: Thread | None = None
 
     def begin(self) -> None:
-        """A kernel is going to be compiled."""
+        """Note that a kernel is going to be compiled."""
         if self._thread is None:
             _say(_EXPLANATION, stays=not is_live(sys.stderr))
             self._over.clear()
@@ -99,20 +99,20 @@ class _Compiling:
         self._depth += 1
 
     def done(self) -> None:
-        """The kernel that began last is compiled."""
+        """Note that the kernel that began last is compiled."""
         self._depth -= 1
         if not self._depth:
             self._seconds += monotonic() - self._began
 
     def end(self) -> None:
-        """Say what all kernels took."""
+        """Show the total seconds of all kernels."""
         if not self.stop():
             return
         _say(f"compiled in {self._seconds:.0f} s")
         self._seconds = 0.0
 
     def stop(self) -> bool:
-        """End the clock; return whether there was one."""
+        """End the clock; return True if it was running."""
         if self._thread is None:
             return False
         self._over.set()
@@ -129,21 +129,21 @@ class _Compiling:
 
 
 def _say(text: str, *, stays: bool = True) -> None:
-    """Writes a line; one that does not stay is overwritten by the next."""
+    """Write a line; the next line overwrites it unless `stays` is True."""
     clear = "\r\x1b[K" if is_live(sys.stderr) else ""
     try:
         stream = controls_of(sys.stderr)
         stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
         stream.flush()
     except (OSError, ValueError):
-        pass  # It is no longer read.
+        pass  # Nobody reads it any more.
 
 
 class Progress:
-    """Lines on stderr that begin with three dots, one at most in so many seconds.
+    """Lines on stderr that begin with three dots, at most one per pause.
 
     Args:
-        pause: Seconds between two lines; 0 shows all of them. A pause begins at once.
+        pause: Seconds between two lines; 0 shows all lines. The first pause begins at once.
     """
 
     def __init__(self, pause: float = 0.0) -> None:
@@ -152,11 +152,11 @@ class Progress:
 
     @property
     def due(self) -> bool:
-        """Whether a line would be shown now, for texts that take long to make."""
+        """True if a line would be shown now; useful if the text is slow to make."""
         return monotonic() - self._last >= self._pause
 
     def tell(self, text: str) -> None:
-        """Shows a line where one is due."""
+        """Show a line if one is due."""
         if self.due:
             self._last = monotonic()
             sys.stderr.write(f"... {one_line(text)}\n")

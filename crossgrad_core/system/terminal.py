@@ -10,9 +10,9 @@ from crossgrad_core.wording import showable
 
 
 class PlainText(io.TextIOWrapper):
-    """A text stream that writes control characters out, as Python does in a string.
+    """A text stream that writes control characters as escapes, as Python does in a string.
 
-    A name from a file could otherwise move the cursor or recolour the terminal. Code that moves the
+    Otherwise a name from a file could move the cursor or recolour the terminal. Code that moves the
     cursor itself writes to `controls_of` the stream.
     """
 
@@ -22,12 +22,12 @@ class PlainText(io.TextIOWrapper):
 
     @override
     def write(self, text: str, /) -> int:
-        """Write the text with its control characters as escapes, line ends excepted."""
+        """Write the text with its control characters as escapes, except line ends."""
         return super().write(showable(text))
 
 
 class _Controls:
-    """The same stream for text with control characters."""
+    """The same stream, without escaping control characters."""
 
     def __init__(self, stream: PlainText) -> None:
         self._stream = stream
@@ -46,22 +46,22 @@ def controls_of(stream: TextIO) -> TextIO:
 
 
 def shows_bar(stream: TextIO) -> bool:
-    """Whether a progress bar can move on the stream: on a live terminal, and below a notebook cell.
+    """Return True if a progress bar can move on the stream: a live terminal or a notebook cell.
 
-    A notebook goes back to the start of a line, but knows no other sequence of a terminal.
+    A notebook can return to the start of a line, but supports no other terminal sequence.
     """
     return is_live(stream) or type(stream).__module__.startswith("ipykernel.")
 
 
 def is_live(stream: TextIO) -> bool:
-    """Whether the stream is a terminal on which a line can be overwritten.
+    """Return True if the stream is a terminal on which a line can be overwritten.
 
-    A terminal of no columns (`docker exec -t`, some editors and CI systems) has no room for a
-    progress bar, and a dumb one cannot go back to the start of a line.
+    A terminal with 0 columns (`docker exec -t`, some editors and CI systems) has no space for a
+    progress bar. A dumb terminal cannot return to the start of a line.
     """
     if not stream.isatty() or os.environ.get("TERM") == "dumb":
         return False
     try:
         return os.get_terminal_size(stream.fileno()).columns > 0
-    except (OSError, ValueError):  # It does not tell its size.
+    except (OSError, ValueError):  # The terminal does not report its size.
         return True

@@ -1,4 +1,4 @@
-"""CSV and JSON files: read so that every fault is one error, and CSV tables written atomically."""
+"""CSV and JSON files: reading with one error for every fault, and atomic writing of CSV tables."""
 
 import csv
 import io
@@ -12,10 +12,10 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.input_files import LARGEST, read_file
 
-# `int` and `float` also take digits of other scripts, digit groups and spaces.
+# `int` and `float` also accept digits of other scripts, digit groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Bytes of a list, a cell, an object with one member, and of a value with its place or key.
+# Bytes in memory of a list, a cell, an object with one member, and a value with its place or key.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
@@ -23,14 +23,14 @@ _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 def read_rows(
     path: Path, what: str, todo: str, *, whole: bool = False, delimiter: str = ","
 ) -> list[list[str]]:
-    """The rows of a CSV file in UTF-8; empty lines are rows without cells.
+    """Return the rows of a CSV file in UTF-8; empty lines are rows without cells.
 
     Args:
         path: The file.
-        what: What cannot be read, should it be so, such as `the list of labels`.
-        todo: What to do about it.
-        whole: Leave out a last line that has no end.
-        delimiter: The sign between two cells.
+        what: Name of the content for an error message, such as `the list of labels`.
+        todo: Advice for an error message.
+        whole: Leave out a last line without a line end.
+        delimiter: The character between two cells.
 
     Raises:
         UserError: The file is missing or is not CSV, or too large.
@@ -46,11 +46,11 @@ def read_rows(
 
 
 def read_json(path: Path, most: int = LARGEST) -> object:
-    """The value in a JSON file in UTF-8, with or without a byte order mark.
+    """Return the value in a JSON file in UTF-8, with or without a byte order mark.
 
     Args:
         path: The file.
-        most: Bytes that it may have.
+        most: Most bytes of the file.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -68,10 +68,10 @@ def read_json(path: Path, most: int = LARGEST) -> object:
 
 
 def parse_number(text: str) -> int | float:
-    """A whole number as int, any other as float.
+    """Return a whole number as int, any other number as float.
 
     Raises:
-        ValueError: The text is no number, or has more digits than one can have.
+        ValueError: The text is not a number, or has too many digits.
     """
     if len(text) > _LONGEST_NUMBER or not _NUMBER.fullmatch(text):
         raise ValueError(f"not a number: {text!r}")
@@ -82,9 +82,9 @@ def parse_number(text: str) -> int | float:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> None:
-    """Writes rows with the union of their columns, in the order in which those occur.
+    """Write rows with the union of their columns, in the order of their first occurrence.
 
-    A number has nine digits; one that is NaN, and a cell that a row lacks, are left empty.
+    Numbers have nine significant digits. NaN and missing cells become empty cells.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -93,16 +93,16 @@ def write_table(path: Path, rows: Sequence[Mapping[str, str | int | float]]) -> 
 
 
 def table_bytes(rows: Sequence[Mapping[str, str | int | float]]) -> bytes:
-    """What `write_table` writes."""
+    """Return the bytes that `write_table` writes."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     lines = ([_rounded(row.get(name)) for name in columns] for row in rows)
     return csv_bytes([columns, *lines])
 
 
 def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
-    """Lines of cells as they stand in a file: UTF-8, commas, a line feed behind each line."""
+    """Return lines of cells as in a file: UTF-8, commas, a line feed after each line."""
     rows = _Rows()
-    # With this line end both of its signs are quoted in a cell.
+    # With this line end, cells that contain one of its two characters are quoted.
     csv.writer(rows, lineterminator="\r\n").writerows(lines)
     return text_bytes("".join(row.removesuffix("\r\n") + "\n" for row in rows))
 
@@ -115,7 +115,7 @@ class _Rows(list[str]):
 
 
 def as_cell(value: float | str | None) -> str:
-    """A value with all its digits; an empty cell where there is none."""
+    """Return a value with all its digits; an empty cell for None."""
     return "" if value is None else str(value)
 
 

@@ -1,9 +1,9 @@
 """YAML as users mean it: `1e-3` is a number, `no` is a word, a key that occurs twice is an error.
 
 PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. It also builds
-whatever a text asks for: numbers without an end, lists within lists until the stack is full, and,
-through aliases, a billion copies of one list in a few hundred bytes. Here the values are built from
-its parse tree, in bounded number and depth.
+values without limits: endless numbers, nested lists until the stack is full, and, through aliases,
+a billion copies of one list from a few hundred bytes. This module builds the values from PyYAML's
+parse tree, with bounds on their number and depth.
 """
 
 import re
@@ -20,8 +20,8 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.input_files import open_file
 
-#: Bounds of a text: bytes, values (each alias counts as what it stands for), lists within lists,
-#: digits of a number.
+#: Bounds of a text: bytes, values (an alias counts like the value that it copies), depth of nested
+#: lists, digits of a number.
 MOST_BYTES: Final = 1 << 18
 MOST_VALUES: Final = 10_000
 DEEPEST: Final = 32
@@ -43,7 +43,7 @@ _IMPOSSIBLE = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads scalars by the core schema of YAML 1.2 and does not follow a text without bounds."""
+    """A loader with the core schema of YAML 1.2 and bounds on the number and depth of values."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -52,7 +52,7 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def compose_node(self, parent: Node | None, index: int) -> Node | None:
-        """The next node; raises where there are too many, within each other or in all."""
+        """Return the next node; raise an error if there are too many nodes or levels."""
         mark: Mark | None = self.peek_event().start_mark  # type: ignore[no-untyped-call]
         self._depth += 1
         self._values += 1
@@ -66,7 +66,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts quotes around words that YAML 1.1 or 1.2 takes for something else."""
+    """A dumper that quotes words to which YAML 1.1 or 1.2 gives another meaning."""
 
     @override
     def ignore_aliases(self, data: object) -> bool:
@@ -74,7 +74,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represented(dumper: _Dumper, text: str) -> ScalarNode:
-    # In other styles PyYAML writes line ends of Unicode as they are, and reads them as spaces.
+    # In other styles, PyYAML writes Unicode line ends unescaped and reads them as spaces.
     style = '"' if _LINE_ENDS.search(text) else None
     return dumper.represent_scalar(f"{_TAG}str", text, style)
 
@@ -91,11 +91,11 @@ for _class in (_Loader, _Dumper):
 
 
 def read_yaml(text: str) -> object:
-    """The value that a YAML text describes: plain data, of which no two parts are one object.
+    """Return the value of a YAML text: plain data in which no two parts are the same object.
 
     Raises:
-        yaml.YAMLError: The text is not YAML, is larger than a run's settings can be, a key occurs
-            twice, or a value is none that a setting can have.
+        yaml.YAMLError: The text is not YAML, is larger than a run's settings can be, contains a key
+            twice, or contains a value that a setting cannot have.
     """
     if len(text) > MOST_BYTES:
         raise yaml.YAMLError(f"more than {MOST_BYTES // 1024} KiB")
@@ -104,22 +104,22 @@ def read_yaml(text: str) -> object:
         node = loader.get_single_node()
         return None if node is None else _Values().of(node, 0)
     except (ValueError, OverflowError) as error:
-        # PyYAML's own, for escapes beyond Unicode and endless version numbers.
+        # PyYAML raises these for escapes beyond Unicode and for endless version numbers.
         raise yaml.YAMLError(f"an escape or number that does not exist ({error})") from error
     finally:
         loader.dispose()
 
 
 def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
-    """The mapping in a YAML file, read as configuration files are; none where it is empty.
+    """Return the mapping in a YAML file, read like a configuration file; empty for an empty file.
 
     Args:
         path: The file.
-        what: What cannot be read, should it be so, such as `the grid`.
-        todo: What to do about it.
+        what: Name of the content for an error message, such as `the grid`.
+        todo: Advice for an error message.
 
     Raises:
-        UserError: The file is missing, not YAML, or holds something else than a mapping.
+        UserError: The file is missing, is not YAML, or contains something other than a mapping.
     """
     try:
         with open_file(path) as file:
@@ -144,7 +144,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
 
 
 def described(error: yaml.YAMLError) -> str:
-    """What is wrong with a YAML text, in one line with its place."""
+    """Describe the fault in a YAML text in one line, with its place."""
     if not isinstance(error, yaml.MarkedYAMLError):
         return " ".join(str(error).split())
     text = ", ".join(part for part in (error.context, error.problem) if part)
@@ -153,19 +153,19 @@ def described(error: yaml.YAMLError) -> str:
 
 
 def write_yaml(settings: Mapping[str, Any]) -> str:
-    """The text from which `read_yaml` gets plain data back."""
+    """Return the text from which `read_yaml` restores plain data."""
     text: str = yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     return text
 
 
 class _Values:
-    """Builds plain data from nodes; aliases are copied, and every copy counts."""
+    """A builder of plain data from nodes; aliases are copied, and every copy counts."""
 
     def __init__(self) -> None:
         self._count = 0
 
     def of(self, node: Node, depth: int) -> object:
-        """The value of a node."""
+        """Return the value of a node."""
         self._count += 1
         if self._count > MOST_VALUES:
             raise _error(f"more than {MOST_VALUES:,} values, counting aliases", node.start_mark)
@@ -206,14 +206,14 @@ def _integer(text: str) -> int:
 
 
 def _float(text: str) -> float:
-    # `.inf` is `inf` to Python.
+    # Python writes `.inf` as `inf`.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
         raise ValueError("not a number, which no setting can be")
     return value
 
 
-#: Name of a tag -> what its values look like, and how they are built.
+#: Name of a tag -> pattern of its values, and the function that builds them.
 _SCALARS: Final[dict[str, tuple[re.Pattern[str], Callable[[str], object]]]] = {
     "str": (re.compile("", re.DOTALL), _word),
     "null": (_NULL, lambda _: None),

@@ -1,1 +1,1 @@
-"""Figures, pictures and files of a run that was trained."""
+"""Evaluation, pictures and files of a trained run."""

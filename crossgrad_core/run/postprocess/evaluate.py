@@ -1,4 +1,4 @@
-"""Figures of a run that was trained: of its held-out views, of a file, of another capture."""
+"""Evaluation of a trained run: on its held-out views, of a file, or on another capture."""
 
 import logging
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ _LOG = logging.getLogger(__name__)
 def evaluate(
     folder: Path, how: Opens = AS_IT_IS, ply: Path | None = None, on: Path | None = None
 ) -> None:
-    """Evaluates the held-out views of a run again, or others; prints the table.
+    """Evaluate the held-out views of a run again, or other views; print the table.
 
     Args:
         folder: The run's folder.
-        how: How the run is opened.
-        ply: A file that is drawn instead of the run's model.
-        on: Another capture of the place, whose views are drawn instead of the held-out ones.
+        how: The way of opening the run.
+        ply: A file whose Gaussians are drawn instead of the run's model.
+        on: Another capture of the place; its views are drawn instead of the held-out ones.
 
     Raises:
         UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
@@ -55,18 +55,18 @@ def evaluate(
 def evaluated_on(
     folder: Path, on: Path, how: Opens = AS_IT_IS
 ) -> tuple[EvaluationResult, Elsewhere]:
-    """Evaluates a run on another capture of its place; writes per_view_on_<name>.csv.
+    """Evaluate a run on another capture of its place; write per_view_on_<name>.csv.
 
-    Views that the run was trained on are left out. Renders have no exposure: nothing is known of
-    those of other photos.
+    Views that the run was trained on are left out. Renders have no exposure, because the exposure
+    of other photos is unknown.
 
     Args:
         folder: The run's folder.
-        on: The other scene, in the coordinates of the run's.
-        how: How the run is opened.
+        on: The other scene, in the coordinates of the run's scene.
+        how: The way of opening the run.
 
     Raises:
-        UserError: See `elsewhere`; or it is no run, or it has no checkpoint.
+        UserError: See `elsewhere`; or the folder is not a run, or the run has no checkpoint.
     """
     require_checkpoint(folder)
     with writing_if_possible(folder, "evaluating") as writes:
@@ -85,23 +85,23 @@ def evaluated_on(
 def evaluated_file(
     folder: Path, ply: Path, how: Opens = AS_IT_IS, on: Path | None = None
 ) -> tuple[EvaluationResult, int, Elsewhere | None]:
-    """Evaluates Gaussians of a PLY on the held-out views of a run, exposures of the run included.
+    """Evaluate the Gaussians of a PLY on the held-out views of a run, with the run's exposures.
 
     Nothing is written.
 
     Args:
         folder: The run's folder.
-        ply: The file, in the coordinates of the scene's input; this or another program wrote it.
-        how: How the run is opened.
+        ply: The file, in the coordinates of the scene's input; any program may have written it.
+        how: The way of opening the run.
         on: Another capture of the place, whose views are drawn instead, without exposures; see
             `evaluated_on`.
 
     Returns:
-        The figures, the number of Gaussians, and the other capture where there is one.
+        The metrics, the number of Gaussians, and the other capture if there is one.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, or the file cannot be read; see also
-            `elsewhere`.
+        UserError: The folder is not a run, the run has no checkpoint, or the file cannot be read;
+            see also `elsewhere`.
     """
     require_checkpoint(folder)
     setup, state = how.open(folder)
@@ -117,15 +117,16 @@ def evaluated_file(
 
 
 def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, Totals]:
-    """Evaluates the held-out views of a run again and renews per_view.csv, if they are its own.
+    """Evaluate the held-out views of a run again, and rewrite per_view.csv.
 
-    The folder of a run that is training, and one that may not be written to, is only read; so is
-    one whose per_view.csv has figures that cannot be measured here.
+    The results get another file name if the scene has changed, or if summary.json describes another
+    step. The folder is only read if the run is training, if the folder is not writable, or if
+    per_view.csv has values that cannot be measured here.
 
     Raises:
-        UserError: It is no run, or it has no checkpoint.
+        UserError: The folder is not a run, or the run has no checkpoint.
     """
-    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    require_checkpoint(folder)  # Before the lock, which must not be written into any other folder.
     with writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points
@@ -136,14 +137,15 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
             if name != PER_VIEW or not _loses_figures(folder, result):
                 with relisted(folder, name):
                     write_per_view(folder, result, name)
-        return result, replace(totals(setup, state), peak_memory_mib=None)  # It is not the run's.
+        # The peak memory of this process is not the run's.
+        return result, replace(totals(setup, state), peak_memory_mib=None)
 
 
 def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
-    """Whether per_view.csv has figures that could not be measured now; then says that it stays."""
+    """Return True, with a warning, if per_view.csv has values that could not be measured now."""
     try:
         before = read_per_view(folder)
-    except UserError:  # A damaged one is written anew.
+    except UserError:  # A damaged file is replaced.
         return False
     lost = _known(before) - _known(result.views)
     if lost:
@@ -152,5 +154,5 @@ def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
 
 
 def _known(views: Sequence[ViewMetrics]) -> set[str]:
-    """The figures that some view has."""
+    """Return the names of the metrics that have a value for some view."""
     return {name for view in views for name, value in view.values.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Files of Gaussians of a run that was trained."""
+"""Export of the Gaussians of a trained run to files."""
 
 from pathlib import Path
 from typing import Final
@@ -18,7 +18,7 @@ from crossgrad_core.system.files import clear_leftovers
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import one_line
 
-#: Files of Gaussians by the names that programs give them: none holds what another one's says.
+#: Suffixes of Gaussian file formats; a file must not have the suffix of another format.
 _OF_FORMATS: Final = frozenset({".ply", ".splat", ".ksplat", ".spz", ".sog", ".rad", ".usdz"})
 
 
@@ -31,7 +31,7 @@ def export(
     coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """As `exported`; prints what is in the file."""
+    """Like `exported`, and print a description of the file."""
     path, content = exported(
         folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )
@@ -49,24 +49,24 @@ def exported(
     coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> tuple[Path, Exported]:
-    """Writes the trained scene to a file that viewers open.
+    """Write the trained scene to a file that viewers open.
 
     Args:
         folder: The run's folder.
-        file_format: Name of an exporter; None takes the run's own.
-        out: The file; by default one in the run's folder that summary.json does not describe as
-            something else.
+        file_format: Name of an exporter; None for the run's own.
+        out: The file; by default a file in the run's folder. Its name is never one that
+            summary.json describes with another content.
         camera: Name of the view to bake for; by default the average over the training views.
-        coordinates: Of the file, as `check_coordinates` takes them.
-        how: How the run is opened.
+        coordinates: Coordinates of the file, as `check_coordinates` accepts them.
+        how: The way of opening the run.
 
     Returns:
-        The file and what is in it.
+        The file, and a description of its content.
 
     Raises:
-        UserError: There is no such format, it is no run, it has no checkpoint, the file exists,
-            there is no such view or nothing to bake for it, the scene cannot be put into these
-            coordinates, or the run is training and no other file is named.
+        UserError: There is no such format, the folder is not a run, the run has no checkpoint, the
+            file exists, there is no such view or nothing to bake for it, the scene cannot be put
+            into these coordinates, or the run is training and `out` is not given.
     """
     check_coordinates(coordinates)
     if file_format is not None:
@@ -77,7 +77,7 @@ def exported(
             check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
-        exporter = setup.selection.exporter  # With the run's own options, where it is the run's.
+        exporter = setup.selection.exporter  # With the run's own options, if it is the run's.
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
@@ -106,5 +106,5 @@ def exported(
 
 
 def _flat(setup: Setup, camera: str) -> str:
-    """The view's name as a part of a file name; that of no view as it is, to be refused later."""
+    """Return a view's name as a part of a file name; an unknown view is refused later."""
     return flat_names([view.name for view in setup.scene.views]).get(camera, "view")

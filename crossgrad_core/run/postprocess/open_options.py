@@ -1,4 +1,4 @@
-"""How a run that was trained is opened."""
+"""Ways of opening a trained run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +13,18 @@ class Opens(Protocol):
     """A way of opening a run."""
 
     def open(self, folder: Path) -> tuple[Setup, TrainState]:
-        """The run's setup and its newest state."""
+        """Return the run's setup and its newest state."""
         ...
 
 
 @dataclass(frozen=True)
 class How:
-    """How a run is opened.
+    """Options for opening a run.
 
     Attributes:
-        device: Where tensors live; the run's own by default.
+        device: Device of the tensors; the run's own by default.
         threads: CPU threads; all by default.
-        accept_scene: Take a scene of which photos, masks, points or held-out views have changed.
+        accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """
 
     device: str | None = None
@@ -32,11 +32,11 @@ class How:
     accept_scene: bool = False
 
     def open(self, folder: Path) -> tuple[Setup, TrainState]:
-        """The run's setup and its newest state."""
+        """Return the run's setup and its newest state."""
         given = {"device": self.device, "threads": self.threads}
         machine = {name: value for name, value in given.items() if value is not None}
         return opened(folder, machine, accept_scene=self.accept_scene)
 
 
-#: On the run's own device, with all threads and its own scene.
+#: The run's own device, all threads, and an unchanged scene.
 AS_IT_IS = How()

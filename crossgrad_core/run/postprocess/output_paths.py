@@ -1,4 +1,4 @@
-"""Where results of a run go that are made afterwards: nothing is replaced that is described."""
+"""Output paths for later results of a run; files that summary.json describes are kept."""
 
 import logging
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
-    """Locks the run's folder, or says why it is only read; answers which."""
+    """Lock the run's folder and yield True; if it can only be read, warn and yield False."""
     with ExitStack() as stack:
         try:
             stack.enter_context(locked(folder, doing))
@@ -33,8 +33,8 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
 
 @contextmanager
 def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
-    """Locks the run's folder, unless what is written goes elsewhere."""
-    require_checkpoint(folder)  # Before a lock is laid into a folder that is no run's.
+    """Lock the run's folder, unless the results go to `out`."""
+    require_checkpoint(folder)  # Before the lock, which must not be written into any other folder.
     if out is not None:
         yield
         return
@@ -49,14 +49,14 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
 
 
 def is_changed(setup: Setup) -> bool:
-    """Whether the scene is not that of the run: what summary.json describes is left alone."""
+    """Return True if the scene has changed; then files that summary.json describes are kept."""
     return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
 
 
 def own_name(folder: Path, name: str, step: int) -> str:
-    """A file name for results of a step, other than that of a file which describes another one.
+    """Return a file name for results of a step that replaces no file of another step.
 
-    The run may have gone on, and been killed, after summary.json and its files were written.
+    The run may have continued, and been killed, after summary.json and its files were written.
     """
     described = summarised_step(folder)
     if described in {None, step}:

@@ -1,4 +1,4 @@
-"""Pictures and videos of a run that was trained."""
+"""Pictures and videos of a trained run."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,18 +35,19 @@ def render(
     how: Opens = AS_IT_IS,
     on: Path | None = None,
 ) -> None:
-    """Draws photo | render | error of the views of a run, or of another capture of its place.
+    """Draw photo | render | error of the views of a run, or of another capture of its place.
 
     Args:
         folder: The run's folder.
-        split: Which of its views: test, train or all.
-        out: Where the pictures go; by default into the run's folder.
-        how: How the run is opened.
+        split: The views to draw: test, train or all.
+        out: Folder of the pictures; by default a folder inside the run's folder.
+        how: The way of opening the run.
         on: The other capture, whose views are drawn instead; see `evaluated_on`.
 
     Raises:
-        UserError: It is no run, it has no checkpoint, the split is empty, the named folder holds a
-            picture of that name, or it is training and none is named; see also `elsewhere`.
+        UserError: The folder is not a run, the run has no checkpoint, the split is empty, `out`
+            already contains such a picture, or the run is training and `out` is not given; see also
+            `elsewhere`.
     """
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
@@ -84,19 +85,19 @@ def render_path(
     out: Path | None,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Draws what cameras along a path see, as pictures and, beside them, as a video.
+    """Draw the images of cameras along a path, as pictures and as a video in the same folder.
 
     Args:
         folder: The run's folder.
         path: See `camera_path`.
-        frames: How many a zoom path has, `FRAMES` by default.
-        out: Where the pictures go; by default into the run's folder.
-        how: How the run is opened.
+        frames: Number of frames of a zoom path, `FRAMES` by default.
+        out: Folder of the pictures; by default a folder inside the run's folder.
+        how: The way of opening the run.
 
     Raises:
-        UserError: See `camera_path`; or it is no run, it has no checkpoint, it is training and no
-            other folder is named, the named one holds a video or such frames, or there are frames
-            for a path from a file.
+        UserError: See `camera_path`; or the folder is not a run, the run has no checkpoint, the run
+            is training and `out` is not given, `out` already contains a video or such frames, or
+            `frames` is given for a path from a file.
     """
     if frames is not None and path != ZOOM:
         raise UserError(
@@ -124,7 +125,7 @@ def render_path(
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
             for video in video_files(out) if own else ():
-                if video != made:  # Of other frames.
+                if video != made:  # A video of other frames.
                     video.unlink(missing_ok=True)
         told = f"video {made}" if made else f"no video: too many or too large without {ENCODER}"
         print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201

@@ -1,4 +1,4 @@
-"""config.yaml: the resolved configuration, which repeats the run, and the version that it names."""
+"""config.yaml: the resolved configuration, which repeats the run, and the version that wrote it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from crossgrad_core.system.yaml_values import read_mapping, write_yaml
 from crossgrad_core.wording import listed
 
 FILE = "config.yaml"
-#: Settings of every run.
+#: Settings that the file of every run contains.
 _ALWAYS: Final = ("scene", "seed")
 #: The key that names the version that wrote a configuration, and the version of this one.
 KEY: Final = "crossgrad"
@@ -22,8 +22,11 @@ NOTES: Final = "notes"
 
 
 def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> None:
-    """Writes what repeats the run, with its first notes; one that follows the clock renews it."""
-    config = config.model_copy(update={"stop_after": None})  # It is about one start alone.
+    """Write the configuration that repeats the run, and its first notes.
+
+    A run that follows the clock rewrites the file.
+    """
+    config = config.model_copy(update={"stop_after": None})  # It concerns only one start.
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))
 
@@ -32,8 +35,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Return the settings in a run's config.yaml.
 
     Raises:
-        UserError: There is none, so it is not the folder of a run, it is damaged, or of another
-            version.
+        UserError: There is no such file, so the folder is not a run; or the file is damaged or of
+            another version.
     """
     path = folder / FILE
     if not path.is_file():
@@ -62,7 +65,7 @@ def read_notes(folder: Path) -> tuple[str, ...]:
 
 
 def as_yaml(config: RunConfig) -> str:
-    """The configuration as a user would write it, and the version that writes it."""
+    """Return the configuration as a user would write it, with the version that writes it."""
     return write_yaml(marked(config.model_dump(mode="json")))
 
 
@@ -76,7 +79,7 @@ def marked(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unmarked(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the settings of a file without version and notes; a file by hand names no version.
+    """Return the settings of a file without version and notes; the version may be absent.
 
     Args:
         settings: The content of the file.

@@ -29,7 +29,7 @@ _LONGEST_IN_TWO_COLUMNS = 48  # characters of a legend entry
 
 
 class _Line(NamedTuple):
-    """One line of a chart: what it is called and how it looks."""
+    """One line of a chart: its label and its looks."""
 
     label: str
     column: str
@@ -41,7 +41,7 @@ class _Line(NamedTuple):
 def draw_curve(
     folder: Path, rows: Sequence[Row], title: str, views: Mapping[str, int] | None = None
 ) -> Path:
-    """Draws curve.png; with no held-out views it shows the training loss instead.
+    """Draw curve.png; without held-out views it shows the training loss instead.
 
     Args:
         folder: The run's folder.
@@ -89,7 +89,7 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
 
 
 def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> str:
-    """A name with its number of views and its final figures."""
+    """Return a name with its number of views and its final PSNR and SSIM."""
     count = views.get(name)
     label = _literal(name)
     if count is not None:
@@ -99,7 +99,7 @@ def _labelled(name: str, column: str, last: Row, views: Mapping[str, int]) -> st
 
 
 def _literal(text: str) -> str:
-    """Text that matplotlib shows as it is: it hides a leading _ and reads formulas between $."""
+    """Return text that matplotlib shows literally, without hidden _ or formulas between $."""
     text = one_line(text).replace("$", r"\$")
     return f"'{text}'" if text.startswith("_") else text
 
@@ -125,7 +125,7 @@ def _draw(ax: "Axes", rows: Sequence[Row], metric: str, lines: Sequence[_Line]) 
 
 
 def _add_view_axis(ax: "Axes", rows: Sequence[Row]) -> None:
-    """Rendered views at round numbers on a second scale above the chart."""
+    """Add a second scale above the chart with rendered views at round numbers."""
     from matplotlib.ticker import MaxNLocator
 
     known = [(row["train_seconds"], row["views"]) for row in rows]

@@ -1,4 +1,4 @@
-"""The output folder of a run: named, new, writable and with room, before any work is done."""
+"""The output folder of a run, checked before any work: new, writable and on a disk with space."""
 
 import re
 import tempfile
@@ -21,7 +21,7 @@ from crossgrad_core.system.files import (
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
-#: Where runs are kept, below the working folder.
+#: Folder of all runs, relative to the working folder.
 RUNS = Path("runs")
 _UNSAFE = re.compile(r"[^\w.+-]+")
 
@@ -55,17 +55,17 @@ class RunName:
 def create_run_folder(
     name: RunName, out: Path | None = None, root: Path = RUNS, needed: int = SMALLEST_NEED
 ) -> Path:
-    """Creates the output folder of a new run.
+    """Create the output folder of a new run.
 
     Args:
-        name: Gives the folder its name below `root`; of two runs that start in the same second
-            the later one gets the suffix -2.
-        out: The folder itself, where the user named one; it must be new or empty.
-        root: Where runs are kept.
+        name: The name of the folder below `root`; if two runs start in the same second, the later
+            one gets the suffix -2.
+        out: The folder itself if the user named one; it must be new or empty.
+        root: Folder of all runs.
         needed: Bytes that the run may write.
 
     Raises:
-        UserError: `out` holds something, the folder cannot be written to, or the disk is too full.
+        UserError: `out` is not empty, the folder is not writable, or the disk is too full.
     """
     check_out(out)
     wanted = out if out is not None else root / name.folder
@@ -73,16 +73,16 @@ def create_run_folder(
         raise disk_full(wanted, needed)
     with disk_errors(wanted):
         folder = _made(wanted, taken=out is not None)
-        # Permission bits do not tell the truth on network file systems; writing does.
+        # Permission bits are not reliable on network file systems; a test file is.
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(b"crossgrad")
     return folder
 
 
 def check_out(out: Path | None) -> None:
-    """Refuses a folder that holds something; makes nothing, so that it can be asked at once.
+    """Refuse a folder that is not empty; create nothing, so that this can be checked early.
 
-    What a run leaves that was killed before it wrote anything does not count.
+    Files of a run that was killed before it wrote results do not count.
 
     Raises:
         UserError: `out` is a file or is not empty.
@@ -110,20 +110,20 @@ def check_out(out: Path | None) -> None:
 
 
 def clear_half_written(folder: Path) -> None:
-    """Delete what killed processes left half-written in the locked folder of a run."""
+    """Delete half-written files of killed processes in the locked folder of a run."""
     renders = (path for path in (folder / RENDERS).rglob("*") if path.is_dir())
     for place in (folder, folder / RENDERS, *renders):
         clear_leftovers(place)
 
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
-    """Bytes that a run of that size writes: SH degree 3, two Adam moments, one PLY file."""
+    """Estimate the bytes that a run writes: SH degree 3, two Adam moments, one PLY file."""
     floats = 59 * 3 * (checkpoints + 1) + 62  # one more checkpoint exists while it is written
     return max(SMALLEST_NEED, 4 * floats * primitives)
 
 
 def _safe(part: str) -> str:
-    """A path component that every file system takes."""
+    """Return a path component that every file system accepts."""
     return _UNSAFE.sub("_", part).strip(".") or "_"
 
 

@@ -1,4 +1,4 @@
-"""Files of a run that its checkpoints hold too, so that damage is repaired or noticed."""
+"""Files of a run that its checkpoints also store, so that damage is repaired or noticed."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,23 +16,23 @@ from crossgrad_core.wording import listed
 
 #: The scalar of a checkpoint that holds the texts: name of a file -> its content.
 KEY: Final = "files"
-#: What a run that follows the clock writes anew.
+#: Settings that a run which follows the clock rewrites.
 _REVISED: Final = frozenset({"steps", "revisions"})
 
 
 def kept_files(folder: Path) -> dict[str, Json]:
-    """Return the texts of the files that a checkpoint holds, as far as they are there."""
+    """Return the texts of the files that a checkpoint stores, if they exist."""
     found = {name: _content(folder / name) for name in (CONFIG, METRICS)}
     return {name: text.decode(errors="replace") for name, text in found.items() if text is not None}
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
-    """Bring metrics.csv to what it was at a checkpoint; rows that were added later are dropped.
+    """Restore metrics.csv as it was at a checkpoint; rows that were added later are dropped.
 
     Args:
         folder: The run's folder.
         scalars: The scalars of the checkpoint.
-        step: Its step.
+        step: The step of the checkpoint.
 
     Returns:
         A note if the file was damaged.
@@ -49,7 +49,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a note where config.yaml has other contents than when the checkpoint was written."""
+    """Return a note if config.yaml differs from its content when the checkpoint was written."""
     text = (scalars.get(KEY) or {}).get(CONFIG)
     if text is None:
         return ()

@@ -1,4 +1,4 @@
-"""One writer per run folder: a lock that dies with its process."""
+"""One writer per run folder: a lock that ends with its process."""
 
 import errno
 import json
@@ -18,24 +18,24 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: The file that is locked. It stays when its process is gone; then no process holds the lock on it.
+#: The locked file. It stays when its process has ended; then no process holds the lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
-# Windows locks ranges of bytes, which no other process can read: one far behind the content.
+# Windows locks ranges of bytes that other processes cannot read, so lock one far after the content.
 _FAR = 2**30
-_MOST = 4096  # bytes of a holder
+_MOST = 4096  # most bytes of a holder's description
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds the lock.
+    """The process that holds the lock.
 
     Attributes:
         pid: Number of the process.
         host: Name of its machine.
         since: Local time, to the second.
-        doing: What it does in the folder.
+        doing: Its work in the folder.
     """
 
     pid: int
@@ -45,7 +45,7 @@ class Holder:
 
     @classmethod
     def me(cls, doing: str) -> "Holder":
-        """This process, now."""
+        """Return the description of this process, now."""
         now = datetime.now().astimezone()
         return cls(os.getpid(), platform.node(), now.strftime("%Y-%m-%d %H:%M:%S"), doing)
 
@@ -61,25 +61,25 @@ class RunInUseError(UserError):
 
 @contextmanager
 def locked(folder: Path, doing: str) -> Iterator[bool]:
-    """Keeps every other process from writing into a run's folder inside the block.
+    """Keep other processes from writing into a run's folder inside the block.
 
-    The lock lies on an open file, so that it is gone when its process is, however that ends.
+    The lock belongs to an open file, so that it ends with its process, however the process ends.
 
     Args:
         folder: The run's folder.
-        doing: What this process does there, for those that are refused.
+        doing: The work of this process there, for messages to refused processes.
 
     Yields:
-        Whether the folder is locked: some network file systems have no locks.
+        True if the folder is locked, False if its file system has no locks (some network ones).
 
     Raises:
-        RunInUseError: Another process holds the lock; says which and since when.
-        UserError: The folder may not be written to, or the lock is no file.
+        RunInUseError: Another process holds the lock; the message names it and its start.
+        UserError: The folder is not writable, or the lock is not a regular file.
     """
     path = folder / FILE
     check_own(path)
     with disk_errors(path):
-        # Unbuffered: what a full disk did not take would be written again as the file is closed.
+        # Unbuffered: a buffer would write again on close what a full disk had refused.
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
     with file:
         taken = _take(file)
@@ -95,7 +95,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
 
 def writer_of(folder: Path) -> str | None:
-    """Which process writes into the folder now; None where none does, or it cannot be told."""
+    """Describe the process that writes into the folder now; None if none does or is known."""
     try:
         with (folder / FILE).open("r+b") as file:
             return _named(_read(file)) if _take(file) == "by another" else None
@@ -117,7 +117,7 @@ def _named(holder: Holder | None) -> str:
 
 
 def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:
-    """Who has the lock after we tried to take it; no process on file systems without locks."""
+    """Try to take the lock and return its owner; `not at all` on file systems without locks."""
     try:
         _lock(file)
     except OSError as error:
@@ -144,7 +144,7 @@ def _write(file: BinaryIO, text: str) -> None:
 
 
 def _read(file: BinaryIO) -> Holder | None:
-    """What the holder wrote; None where it has not written yet, or something else did."""
+    """Return the description of the holder; None if it is not written yet or not valid."""
     file.seek(0)
     try:
         return Holder(**json.loads(file.read(_MOST)))

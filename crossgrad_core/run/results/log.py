@@ -1,4 +1,4 @@
-"""log.txt: plain text of what the terminal showed, with the time of day."""
+"""log.txt: the text that the terminal showed, with the time of day."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,9 +11,9 @@ from crossgrad_core.recipe.table import full_lines
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.wording import showable
 
-#: Share of a new value in the smoothed loss and step rate.
+#: Weight of a new value in the smoothed loss and step rate.
 SMOOTHING = 0.05
-#: A length that changed by a smaller share is no news.
+#: A change of the length by a smaller share is not reported.
 NEWS_SHARE = 0.1
 
 
@@ -27,8 +27,8 @@ class Pace:
         record: The last step; None before the first.
         loss: Exponentially smoothed mean loss of the step's views.
         seconds: Exponentially smoothed training seconds of a step; None after a single one.
-        psnr: Overall PSNR of the last evaluation, None where there was none yet.
-        planned: Steps that were planned first, where that changed; None elsewhere.
+        psnr: Overall PSNR of the last evaluation; None before the first.
+        planned: Number of steps of the first plan if the length has changed; None otherwise.
     """
 
     total: int
@@ -40,7 +40,7 @@ class Pace:
     planned: int | None = None
 
     def after(self, record: StepRecord) -> "Pace":
-        """The figures with one more step."""
+        """Return the figures after one more step."""
         loss = sum(record.losses) / len(record.losses)
         if self.record is None:
             return replace(self, first=record.step - 1, record=record, loss=loss)
@@ -52,12 +52,12 @@ class Pace:
         )
 
     def with_length(self, total: int) -> "Pace":
-        """The figures of a run that is now to have `total` steps."""
+        """Return the figures of a run that now has `total` steps."""
         planned = self.total if self.planned is None else self.planned
         return replace(self, total=total, planned=planned)
 
     def evaluated(self, report: EvaluationReport) -> "Pace":
-        """The figures after an evaluation."""
+        """Return the figures after an evaluation."""
         psnr = report.row.get("psnr")
         return replace(self, psnr=float(psnr)) if isinstance(psnr, int | float) else self
 
@@ -75,7 +75,7 @@ class Pace:
 
 
 def progress_line(pace: Pace) -> str:
-    """Step, share, loss, PSNR, primitives, rate and time left; empty before the first step."""
+    """Return step, share, loss, PSNR, primitives, rate and time left; empty before step 1."""
     record = pace.record
     if record is None:
         return ""
@@ -88,7 +88,7 @@ def progress_line(pace: Pace) -> str:
 
 
 def length_lines(pace: Pace) -> list[str]:
-    """What became of the planned length, where that is worth a line."""
+    """Return a line about a changed length, if the change is large enough."""
     planned = pace.planned
     if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
         return []
@@ -96,7 +96,7 @@ def length_lines(pace: Pace) -> list[str]:
 
 
 def figures(pace: Pace) -> list[str]:
-    """Loss, PSNR and primitives, for the end of a progress bar too."""
+    """Return loss, PSNR and primitives; also used at the end of a progress bar."""
     parts = [f"loss {pace.loss:.4f}"]
     if pace.psnr is not None:
         parts.append(f"PSNR {pace.psnr:.2f}")
@@ -106,7 +106,7 @@ def figures(pace: Pace) -> list[str]:
 
 
 def evaluation_line(report: EvaluationReport) -> str:
-    """The metrics of an evaluation with those of each regime."""
+    """Return the metrics of an evaluation, overall and of each regime."""
     row = report.row
     parts = [_metric("PSNR", row.get("psnr"), ".2f", " dB"), _metric("SSIM", row.get("ssim"))]
     if len(report.regimes) > 1:
@@ -116,7 +116,7 @@ def evaluation_line(report: EvaluationReport) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as 45 s, 12:05 or 3:07:09."""
+    """Format seconds as 45 s, 12:05 or 3:07:09."""
     whole = round(seconds)
     minutes, rest = divmod(whole, 60)
     hours, minutes = divmod(minutes, 60)
@@ -126,7 +126,7 @@ def duration(seconds: float) -> str:
 
 
 def roughly(seconds: float) -> str:
-    """An estimate in whole minutes, with hours where there are several."""
+    """Format an estimate in whole minutes, from two hours on with hours."""
     minutes = max(1, round(seconds / 60.0))
     if minutes < 120:  # noqa: PLR2004 - two hours
         return f"about {minutes} min"
@@ -150,7 +150,7 @@ def _number(value: float | str | None, form: str) -> str:
 
 
 FILE = "log.txt"
-#: Progress goes into the log so many times in a run.
+#: Number of progress lines in the log of a run.
 PROGRESS_LINES = 20
 
 
@@ -159,10 +159,10 @@ def _now() -> datetime:
 
 
 class RunLog:
-    """Appends to log.txt; a plugin that the loop registers beside the selected ones.
+    """The writer of log.txt; a plugin that the loop registers in addition to the selected ones.
 
     Args:
-        folder: The run's folder; a log that is there already is continued.
+        folder: The run's folder; an existing log is continued.
         clock: The local time.
 
     Raises:
@@ -178,16 +178,16 @@ class RunLog:
         self._missing = ""
 
     def write(self, text: str) -> None:
-        """Appends a text of one or more lines, each with the time of day.
+        """Append a text of one or more lines, each with the time of day.
 
-        A log that cannot be written (a full disk) ends no run: lines are left out, and the next one
-        that can be written says so.
+        A failure to write (a full disk) does not end the run. The lines are left out, and the next
+        line that can be written reports the gap.
         """
         stamp = self._clock().strftime("%H:%M:%S")
         gap = [f"(lines are missing here: {self._missing})"] if self._missing else []
         lines = [f"{stamp}  {line}".rstrip() for line in (*gap, *showable(text).splitlines())]
         try:
-            # Opened for every entry, so that the file is complete whenever the run is interrupted.
+            # Opened for every entry, so that the file is complete even if the run is interrupted.
             with self._path.open("a", encoding="utf-8", errors="backslashreplace") as file:
                 file.write("\n".join([*lines, ""]))
             self._missing = ""
@@ -196,7 +196,7 @@ class RunLog:
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Writes the date, the scene and the notes."""
+        """Write the date, the scene and the notes."""
         self._pace = Pace(run.schedule.total)
         self._interval = max(1, self._pace.total // PROGRESS_LINES)
         self.write(f"{self._clock():%Y-%m-%d}, scene {run.scene.name}, {self._pace.total} steps")
@@ -205,30 +205,30 @@ class RunLog:
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Writes progress now and then."""
+        """Write a progress line at regular steps."""
         self._pace = self._pace.after(record)
         if record.step % self._interval == 0:
             self.write(progress_line(self._pace))
 
     @hookimpl
     def crossgrad_length_changed(self, total: int) -> None:
-        """Notes the length that progress is now measured against."""
+        """Use the new length for later progress lines."""
         self._pace = self._pace.with_length(total)
 
     @hookimpl
     def crossgrad_evaluation(self, report: EvaluationReport) -> None:
-        """Writes the metrics."""
+        """Write the metrics."""
         self._pace = self._pace.evaluated(report)
         self.write(evaluation_line(report))
 
     @hookimpl
     def crossgrad_log(self, text: str) -> None:
-        """Writes what the run says."""
+        """Write a message of the run."""
         self.write(text)
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Writes how the run ended."""
+        """Write the status of the run."""
         for line in length_lines(self._pace):
             self.write(line)
         self.write(f"run {status}")

@@ -1,4 +1,4 @@
-"""How busy the machine was while a run trained, and how fast it is."""
+"""The load of the machine while a run trained, and the speed of the machine."""
 
 import os
 import platform
@@ -15,13 +15,13 @@ from crossgrad_core.contract.component import hookimpl
 from crossgrad_core.contract.contexts import StepRecord
 from crossgrad_core.system.version import VERSION
 
-#: Seconds between two looks at the load.
+#: Seconds between two readings of the load.
 LOOK_SECONDS = 1.0
 #: Seconds that a calibration takes.
 CALIBRATION_SECONDS = 2.0
-#: Runs that trained for less are not calibrated: it would take as long as they did.
+#: Runs that trained for fewer seconds are not calibrated, because calibration takes too long then.
 WORTH_A_CALIBRATION = 20.0
-#: Numbers that a pass of the fixed workload goes over, and passes between two looks at the clock.
+#: Numbers in the fixed workload, and passes over them between two readings of the clock.
 _NUMBERS, _PASSES = 1 << 16, 8
 
 
@@ -30,9 +30,9 @@ class Calibration:
     """The rate of a fixed workload on one thread.
 
     Attributes:
-        seconds: How long it ran.
-        rate: Passes in a second of the clock on the wall.
-        cpu_rate: Passes in a second of CPU time: the machine's speed, however busy it is.
+        seconds: Duration of the calibration.
+        rate: Passes per second of wall-clock time.
+        cpu_rate: Passes per second of CPU time: the machine's speed, independent of its load.
     """
 
     seconds: float
@@ -41,7 +41,7 @@ class Calibration:
 
 
 def calibrated(seconds: float = CALIBRATION_SECONDS) -> Calibration:
-    """Runs the workload: products, exponentials and roots of 65,536 numbers in float32."""
+    """Run the workload: products, exponentials and roots of 65,536 numbers in float32."""
     numbers = np.linspace(0.0, 1.0, _NUMBERS, dtype=np.float32)
     room = np.empty_like(numbers)
     passes, start, cpu = 0, perf_counter(), thread_time()
@@ -56,7 +56,7 @@ def calibrated(seconds: float = CALIBRATION_SECONDS) -> Calibration:
 
 
 class Machine:
-    """The machine's load during the steps of a session; a plugin of the run."""
+    """A recorder of the machine's load during the steps of a session; a plugin of the run."""
 
     def __init__(self) -> None:
         self._looked = 0.0
@@ -65,17 +65,17 @@ class Machine:
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Notes the load, at most once in a second."""
+        """Record the load, at most once per second."""
         now = perf_counter()
         if now - self._looked >= LOOK_SECONDS and hasattr(os, "getloadavg"):
             self._looked = now
             self._loads.append(os.getloadavg()[0])
 
     def figures(self, train_seconds: float) -> dict[str, Json]:
-        """What summary.json says of the machine: `load` and `calibration`, null where unknown.
+        """Return the machine's entries for summary.json: `load` and `calibration`, null if unknown.
 
         Args:
-            train_seconds: How long the run trained: a short one is not calibrated.
+            train_seconds: Training seconds of the run; a short run is not calibrated.
         """
         if self._calibration is None and train_seconds >= WORTH_A_CALIBRATION:
             self._calibration = calibrated()
@@ -98,7 +98,7 @@ _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-image", "pycolmap", "pl
 def environment(device: str = "cpu") -> dict[str, Json]:
     """Return the machine, the device, the threads and the versions as plain data.
 
-    No package is imported for it.
+    This imports no package except torch.
 
     Args:
         device: Torch device that the run used.
@@ -121,9 +121,9 @@ def environment(device: str = "cpu") -> dict[str, Json]:
 
 
 def commit(package: Path = Path(__file__).parents[2]) -> str | None:
-    """The commit of the checkout that the code comes from, with a `+` where files differ from it.
+    """Return the commit of the checkout that contains the code, with a `+` if files differ from it.
 
-    None of an installed package, wherever that lies, and where there is no git.
+    Return None for an installed package, and if git is not available.
 
     Args:
         package: Folder of the package `crossgrad_core`.
@@ -140,7 +140,7 @@ def commit(package: Path = Path(__file__).parents[2]) -> str | None:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    # Without locks: a run only looks on while others may commit.
+    # Without locks: others may commit while a run only reads.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
     return done.stdout.strip()

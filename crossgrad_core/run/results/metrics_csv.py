@@ -1,4 +1,4 @@
-"""metrics.csv: one row per evaluation, on the disk as soon as it is known."""
+"""metrics.csv: one row per evaluation, written to the disk at once."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from crossgrad_core.system.text_files import as_cell, csv_bytes, parse_number, r
 
 @dataclass(frozen=True)
 class Totals:
-    """The cost side of an evaluation.
+    """The cost of a run up to an evaluation.
 
     Attributes:
         step: Optimizer steps.
@@ -23,10 +23,10 @@ class Totals:
         backward_passes: Backward passes.
         train_seconds: Training seconds; compiling, loading, evaluating and reporting excluded.
         primitives: Number of primitives.
-        peak_memory_mib: Peak memory, MiB; None where the system does not say.
+        peak_memory_mib: Peak memory, MiB; None if the system does not report it.
         loss: Mean photometric loss of the last step, None before the first.
         cpu_seconds: CPU seconds of the process in the training seconds, all threads together.
-        peak_primitives: The most primitives that there were after a step; None where unknown.
+        peak_primitives: Largest number of primitives after a step; None if unknown.
     """
 
     step: int
@@ -41,7 +41,7 @@ class Totals:
 
 
 FILE = "metrics.csv"
-#: Column -> value; None where it was not measured.
+#: Column -> value; None if it was not measured.
 Row: TypeAlias = dict[str, int | float | None]
 _FIRST = ("step", "views", "backward_passes", "train_seconds", "cpu_seconds")
 _LAST = ("primitives", "peak_memory_mib", "loss")
@@ -49,14 +49,14 @@ _TODO = "restore the file, or repeat the run: crossgrad run --config config.yaml
 
 
 def columns_for(regimes: Sequence[str], figures: Sequence[Figure]) -> tuple[str, ...]:
-    """The columns of a run whose test views fall into these regimes."""
+    """Return the columns for a run whose test views belong to these regimes."""
     split = [figure for figure in figures if figure.per_regime]
     of_regimes = [figure.column(regime) for regime in sorted(regimes) for figure in split]
     return (*_FIRST, *(figure.name for figure in figures), *of_regimes, *_LAST)
 
 
 def metrics_row(totals: Totals, result: EvaluationResult) -> Row:
-    """The row of one evaluation."""
+    """Return the row of one evaluation."""
     row: Row = dict(asdict(totals))
     for name, digits in (("train_seconds", 3), ("cpu_seconds", 3), ("peak_memory_mib", 1)):
         if (value := row[name]) is not None:
@@ -81,14 +81,14 @@ class MetricsCsv:
 
     @classmethod
     def create(cls, folder: Path, columns: tuple[str, ...]) -> "MetricsCsv":
-        """A new table with its header and no row."""
+        """Create a table with its header and no row."""
         table = cls(folder / FILE, columns)
         table.rewrite(())
         return table
 
     @classmethod
     def resume(cls, folder: Path, columns: tuple[str, ...], step: int) -> "MetricsCsv":
-        """The table of a run that continues after `step`: rows beyond it are dropped.
+        """Open the table of a run that continues after `step`; later rows are dropped.
 
         Raises:
             UserError: The table cannot be read, or has other columns, so it belongs to another run.
@@ -114,7 +114,7 @@ class MetricsCsv:
         return table
 
     def append(self, row: Mapping[str, int | float | str | None]) -> None:
-        """Writes a row and waits until it is on the disk; a row that does not fit leaves nothing.
+        """Write a row and wait until it is on the disk; a failed write leaves nothing behind.
 
         Raises:
             ValueError: The row has a column that the table lacks.
@@ -129,15 +129,15 @@ class MetricsCsv:
             _append(self.path, line)
 
     def rewrite(self, lines: Sequence[Sequence[str]]) -> None:
-        """Replaces the whole table by the header and these rows."""
+        """Replace the whole table by the header and these rows."""
         write_atomically(self.path, csv_bytes([self.columns, *lines]))
 
 
 def read_metrics(folder: Path) -> tuple[Row, ...]:
-    """The rows of a run's metrics.csv in order.
+    """Return the rows of a run's metrics.csv in order.
 
     Raises:
-        UserError: There is none, or it does not hold numbers.
+        UserError: There is no such file, or it does not contain numbers.
     """
     path = folder / FILE
     if not path.is_file():
@@ -167,7 +167,7 @@ def _rows(path: Path, header: Sequence[str], lines: Sequence[Sequence[str]]) -> 
 
 
 def _is_step(number: float | None) -> bool:
-    """Whether a run can have been there; a cell may be empty."""
+    """Return True if the value can be a step; the cell may be empty."""
     return number is None or (isinstance(number, int) and number >= 0)
 
 
@@ -180,7 +180,7 @@ def _append(path: Path, content: bytes) -> None:
         size = file.tell()
         try:
             left = memoryview(content)
-            while left:  # The system may take a part of it only.
+            while left:  # The system may write only a part of it.
                 left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError:
@@ -189,7 +189,7 @@ def _append(path: Path, content: bytes) -> None:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    """All whole lines: one that a crash cut short has no end."""
+    """Return all complete lines; a line that a crash cut short has no end and is left out."""
     return read_rows(path, FILE, _TODO, whole=True)
 
 
@@ -203,7 +203,7 @@ _RESTORE_VIEWS = "restore the file, or write it again: crossgrad eval RUN"
 
 
 def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW) -> None:
-    """Writes one line per view: name, regime, metrics; an empty cell where one is not known.
+    """Write one line per view: name, regime, metrics; an empty cell if a metric is unknown.
 
     Raises:
         UserError: The disk is full.
@@ -217,10 +217,10 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW)
 
 
 def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
-    """The figures of every held-out view of a run, in the order of the scene.
+    """Return the metrics of every held-out view of a run, in the order of the scene.
 
     Returns:
-        The views; none where there is no such file, as before the first evaluation.
+        The views; empty if there is no such file, as before the first evaluation.
 
     Raises:
         UserError: The file is damaged.

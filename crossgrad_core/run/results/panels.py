@@ -28,9 +28,9 @@ _LONGEST = 120  # bytes
 
 
 def flat_names(names: Sequence[str]) -> dict[str, str]:
-    """View name -> file name without folders and suffix, unique even where case does not count.
+    """Return view name -> file name without folders and suffix, unique even if case is ignored.
 
-    `aerial/0001.jpg` becomes `aerial__0001`; what would clash gets -2, -3 and so on.
+    `aerial/0001.jpg` becomes `aerial__0001`; a name that is already used gets -2, -3 and so on.
     """
     flat: dict[str, str] = {}
     taken: set[str] = set()
@@ -48,17 +48,17 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def ending(name: str) -> str:
-    """The end of a name that is too long to be a part of another one."""
+    """Return the end of a name that is too long to be a part of a file name."""
     return name.encode()[-_LONGEST:].decode(errors="ignore")
 
 
 def chosen_views(views: "Sequence[View]", count: int) -> "tuple[View, ...]":
-    """`count` views, or all: every regime in turn, evenly spread over each regime's views."""
+    """Choose `count` views (or all): from every regime in turn, evenly spread within the regime."""
     regimes = sorted({view.regime for view in views})
     groups = [[view for view in views if view.regime == regime] for regime in regimes]
     share = [0] * len(groups)
     for _ in range(min(count, len(views))):
-        # The first of those that have the fewest so far, and one more.
+        # The first of the regimes with the fewest chosen views gets one more.
         unused = [i for i, group in enumerate(groups) if share[i] < len(group)]
         share[min(unused, key=share.__getitem__)] += 1
     chosen = {
@@ -84,7 +84,7 @@ _TODO = "draw the panels again: crossgrad render RUN, or remove the file"
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes in pixels, all derived from the size of the (enlarged) image."""
+    """Sizes of a panel in pixels, all derived from the size of the (enlarged) image."""
 
     width: int
     height: int
@@ -96,12 +96,12 @@ class Layout:
 
     @property
     def margin(self) -> int:
-        """Around everything."""
+        """Space around the whole panel."""
         return self.font
 
     @property
     def gap(self) -> int:
-        """Between two images."""
+        """Space between two images."""
         return max(4, self.font // 2)
 
     @property
@@ -127,12 +127,12 @@ class Layout:
         return width, self.top + self.height + self.margin
 
     def left(self, column: int) -> int:
-        """Left edge of the photo (0), render (1), error (2) and colour bar (3)."""
+        """Return the left edge of the photo (0), render (1), error (2) and colour bar (3)."""
         return self.margin + column * (self.width + self.gap)
 
     @classmethod
     def in_canvas(cls, size: tuple[int, int]) -> "Layout | None":
-        """The layout of a panel of this width and height; None where no panel has that size."""
+        """Return the layout of a panel of this width and height; None if no panel has that size."""
         for width in range(size[0] // 3, 0, -1):
             outside = cls(width, 0)
             if outside.canvas[0] == size[0]:
@@ -142,17 +142,17 @@ class Layout:
 
 
 def enlargement(width: int) -> int:
-    """The factor by which an image of this width is enlarged."""
+    """Return the factor by which an image of this width is enlarged."""
     return -(-_NARROWEST // width)
 
 
 def folder_of(run: Path, step: int) -> Path:
-    """Where the panels of an evaluation lie."""
+    """Return the folder of the panels of an evaluation."""
     return run / FOLDER / f"{step:06d}"
 
 
 def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
-    """View name -> picture of its photo, render and error, of those held-out views that have one.
+    """Return view name -> picture of its photo, render and error, for views that have a picture.
 
     Args:
         run: The run's folder.
@@ -165,10 +165,10 @@ def panels_of(run: Path, step: int, names: Sequence[str]) -> dict[str, Path]:
 
 
 def read_panel(path: Path) -> "dict[str, Image]":
-    """The images in such a picture by name: `photo`, `render` and `error`.
+    """Return the images in a panel by name: `photo`, `render` and `error`.
 
     Raises:
-        UserError: It is no such picture.
+        UserError: The file is not such a panel.
     """
     from PIL import Image
 
@@ -197,7 +197,7 @@ def _unreadable(path: Path, found: str) -> UserError:
     )
 
 
-#: Errors of this size and above have the last colour; fixed, so that panels compare.
+#: Errors of this size and above get the last colour; fixed, so that panels are comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
@@ -208,7 +208,7 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PanelWriter:
-    """Writes panels of some held-out views during an evaluation; pass `write` as `on_view`.
+    """A writer of panels for some views during an evaluation; pass `write` as `on_view`.
 
     Attributes:
         folder: renders/<step> of the run.
@@ -222,13 +222,13 @@ class PanelWriter:
 
     @classmethod
     def of(cls, run: Path, step: int, views: Sequence[View], count: int) -> "PanelWriter":
-        """For at most `count` of these views, spread over the regimes."""
+        """Return a writer for at most `count` of these views, spread over the regimes."""
         names = flat_names([view.name for view in views])
         chosen = {view.name: names[view.name] for view in chosen_views(views, count)}
         return cls(folder_of(run, step), chosen, step)
 
     def write(self, evaluated: Evaluated) -> None:
-        """Writes the panel of a view, if it gets one.
+        """Write the panel of a view, if the view is chosen.
 
         Raises:
             UserError: The disk is full.
@@ -244,7 +244,7 @@ class PanelWriter:
 
 
 def draw_panel(evaluated: Evaluated, step: int) -> "Image":
-    """Photo | render | error with labels, a colour legend and masked pixels hatched."""
+    """Draw photo | render | error with labels and a colour legend; masked pixels are hatched."""
     from PIL import Image, ImageDraw
 
     photo, render = (
@@ -270,13 +270,13 @@ def draw_panel(evaluated: Evaluated, step: int) -> "Image":
 
 
 def error_map(photo: Pixels, render: Pixels) -> Pixels:
-    """[H, W, 3] colours of the absolute error, mean over the channels of [H, W, 3] images."""
+    """Return [H, W, 3] colours of the mean absolute error over the channels of [H, W, 3] images."""
     error = np.abs(photo.astype(np.int16) - render.astype(np.int16)).mean(axis=2) / 255.0
     return _colored(error / LARGEST_ERROR)
 
 
 def _colored(values: NDArray[np.float64]) -> Pixels:
-    """Colours [..., 3] of values, clipped to [0, 1]."""
+    """Return the colours [..., 3] of values, clipped to [0, 1]."""
     from matplotlib import colormaps
 
     table = (colormaps[_COLORMAP](np.arange(256))[:, :3] * 255.0).round().astype(np.uint8)
@@ -292,7 +292,7 @@ def _enlarged(image: Pixels) -> Pixels:
 
 
 def _hatched(image: Pixels, mask: Pixels | None, period: int) -> Pixels:
-    """The image with diagonal grey stripes where the mask is False."""
+    """Return the image with diagonal grey stripes where the mask is False."""
     if mask is None:
         return image
     y, x = np.indices(mask.shape)
@@ -301,7 +301,7 @@ def _hatched(image: Pixels, mask: Pixels | None, period: int) -> Pixels:
 
 
 def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
-    """Matplotlib's own DejaVu Sans: on every machine, with signs for names in most scripts."""
+    """Load Matplotlib's DejaVu Sans: it is on every machine and covers most scripts."""
     from matplotlib import get_data_path
     from PIL import ImageFont
 
@@ -331,7 +331,7 @@ def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -
 
 
 def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
-    """The colours of the error map right of it, as shares of the full scale."""
+    """Draw the colours of the error map to its right, with error values."""
     from PIL import Image
 
     font = _font(round(0.85 * layout.font))
@@ -347,7 +347,7 @@ def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
 
 
 def _mask_key(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
-    """What the hatching means, right-aligned above the error map."""
+    """Draw the key of the hatching, right-aligned above the error map."""
     from PIL import Image
 
     size, font = layout.font, _font(layout.font)

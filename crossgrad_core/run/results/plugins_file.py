@@ -1,4 +1,4 @@
-"""plugins.json: the packages that train a run, crossgrad included, and their versions."""
+"""plugins.json: the packages that train a run, including crossgrad, and their versions."""
 
 import json
 import logging
@@ -26,8 +26,8 @@ class Package(BaseModel):
     """A package that trains a run.
 
     Attributes:
-        versions: The versions that trained it, one after the other.
-        components: Its components in the run, such as `operator pcgrad`; none of crossgrad's own.
+        versions: The versions that trained the run, in order.
+        components: Its components in the run, such as `operator pcgrad`; empty for crossgrad.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -42,7 +42,7 @@ _PACKAGES: Final = TypeAdapter(Packages)
 
 
 def packages_of(setup: Setup) -> Packages:
-    """The packages of all components of a run, those inside other components included."""
+    """Return the packages of all components of a run, including components inside others."""
     found = [installed_as(type(part)) for part in _parts(setup.plugins)]
     found.append(entries("readers").get(setup.selection.names["reader"]))
     packages = {OURS: Package(versions=(VERSION,))}
@@ -55,7 +55,7 @@ def packages_of(setup: Setup) -> Packages:
 
 
 def write_plugins(folder: Path, packages: Packages) -> None:
-    """Writes a run's plugins.json.
+    """Write a run's plugins.json.
 
     Raises:
         UserError: The disk is full.
@@ -65,7 +65,7 @@ def write_plugins(folder: Path, packages: Packages) -> None:
 
 
 def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
-    """The packages that trained a run; None, with a note unless `quiet`, if that is not known."""
+    """Return the packages that trained a run; None, with a note unless `quiet`, if unknown."""
     path = folder / FILE
     try:
         return _PACKAGES.validate_json(read_file(path))
@@ -79,7 +79,7 @@ def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
 
 
 def with_present(known: Packages | None, present: Packages) -> Packages:
-    """The known packages and the present ones; a version that is new comes after the others."""
+    """Merge the known packages with the present ones; a new version is added at the end."""
     known = known or {}
     packages = {**known}
     for name, package in present.items():
@@ -90,7 +90,7 @@ def with_present(known: Packages | None, present: Packages) -> Packages:
 
 
 def history(packages: Packages) -> tuple[str, ...]:
-    """A note on each package of which several versions trained the run."""
+    """Return a note on each package of which several versions trained the run."""
     return tuple(
         f"trained with {name} {', then '.join(package.versions)} (--accept-plugins)"
         f"{': ' if package.components else ''}{', '.join(package.components)}"
@@ -100,7 +100,7 @@ def history(packages: Packages) -> tuple[str, ...]:
 
 
 def without_outdated(notes: Iterable[str], packages: Packages) -> Iterator[str]:
-    """The notes but those that name a single version of a package of which there were several."""
+    """Drop notes that name one version of a package if several versions trained the run."""
     outdated = tuple(
         f"from {name} {version}: "
         for name, package in packages.items()
@@ -113,11 +113,11 @@ def without_outdated(notes: Iterable[str], packages: Packages) -> Iterator[str]:
 def refuse_missing(
     folder: Path, packages: Packages | None, optional: Container[str] = frozenset()
 ) -> None:
-    """Refuses a run of which components are not installed, and names their packages.
+    """Refuse a run whose components are not installed, and name their packages.
 
     Args:
         folder: The run's folder.
-        packages: What trained it; None if that is not known.
+        packages: The packages that trained it; None if they are unknown.
         optional: Slots (singular words) whose components are not needed.
 
     Raises:
@@ -140,7 +140,7 @@ def refuse_missing(
 
 
 def changes(packages: Packages | None) -> dict[str, str]:
-    """Return the packages with another version than that which trained last: then -> now."""
+    """Return the packages whose version differs from the last one that trained: then -> now."""
     found = {}
     for name, package in (packages or {}).items():
         was = f"{name} {package.versions[-1]}"
@@ -155,7 +155,7 @@ def changes(packages: Packages | None) -> dict[str, str]:
 
 
 def refuse_changed(folder: Path, packages: Packages | None) -> None:
-    """Refuses to go on with other versions of packages than those that trained a run.
+    """Refuse to continue a run if the versions of its packages have changed.
 
     Raises:
         UserError: A package has another version, or a component comes from another package.
@@ -171,13 +171,13 @@ def refuse_changed(folder: Path, packages: Packages | None) -> None:
 
 
 def report_changed(packages: Packages | None) -> None:
-    """Tells those who look at a run that other versions of packages trained it."""
+    """Warn that other versions of packages trained the run."""
     for was, now in changes(packages).items():
         _LOG.warning("the run was trained with %s; installed is %s", was, now)
 
 
 def _parts(value: object) -> Iterator[Component]:
-    """The components in a value, those in the options of other components included."""
+    """Yield the components in a value, including components in the options of others."""
     if isinstance(value, Component):
         yield value
     inner: Iterable[object] = ()
@@ -196,7 +196,7 @@ def _described(entry: Entry) -> str:
 
 
 def _entry(component: str) -> Entry | None:
-    """The entry of a component such as `operator pcgrad`; None if it is not installed."""
+    """Return the entry of a component such as `operator pcgrad`; None if it is not installed."""
     word, _, name = component.partition(" ")
     return entries(plural(word)).get(name) if plural(word) in GROUPS else None
 
@@ -206,7 +206,7 @@ def _lacks(component: str, optional: Container[str]) -> bool:
 
 
 def _found(package: str) -> str:
-    """What there is of a package whose components are missing."""
+    """Describe the installed state of a package whose components are missing."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

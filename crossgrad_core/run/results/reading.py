@@ -1,6 +1,6 @@
-"""Reads results back to compare them: configuration, metrics.csv, summary.json, views.
+"""Reading of a run's results for comparisons: configuration, metrics.csv, summary.json, views.
 
-Imports no torch, so that a table of many runs is there at once.
+Imports no torch, so that a table of many runs appears at once.
 """
 
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
-#: What the scene of a run is known by; results/scene_file.py writes it.
+#: The file with the fingerprint of a run's scene; results/scene_file.py writes it.
 SCENE = "scene.json"
-#: What is read of a run.
+#: The files of a run that are read.
 _READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)
 
 
@@ -34,8 +34,8 @@ class RunResults:
         folder: The folder.
         config: The resolved configuration as plain data.
         rows: The rows of metrics.csv in order.
-        summary: The content of summary.json; None of a run that has not ended yet.
-        views: The figures of each held-out view; none before the run has ended.
+        summary: The content of summary.json; None if the run has not ended yet.
+        views: The metrics of each held-out view; empty before the run has ended.
     """
 
     folder: Path
@@ -46,12 +46,12 @@ class RunResults:
 
     @cached_property
     def regimes(self) -> tuple[str, ...]:
-        """The regimes of the held-out views by name; none before the run has ended."""
+        """The regimes of the held-out views by name; empty before the run has ended."""
         return tuple((self.summary or {}).get("regimes") or ())
 
     @cached_property
     def scene_marks(self) -> Mapping[str, Any] | None:
-        """What the scene is known by: views with split, camera and photo; None of an older run.
+        """The fingerprint of the scene: views with split, camera and photo; None for older runs.
 
         Raises:
             UserError: The file is damaged.
@@ -72,7 +72,7 @@ class RunResults:
         )
 
     def figure(self, name: str, regime: str | None = None) -> float | None:
-        """A figure of the last evaluation, overall or of one regime; None where there is none."""
+        """Return a metric of the last evaluation, overall or of one regime; None if missing."""
         summary = self.summary or {}
         of = summary.get("overall") if regime is None else summary.get("regimes", {}).get(regime)
         value = (of or {}).get(name)
@@ -81,17 +81,17 @@ class RunResults:
     def curve(
         self, name: str, regime: str | None = None, over: str = "train_seconds"
     ) -> list[tuple[float, float]]:
-        """Another column, training seconds, and a figure of every evaluation that has both."""
+        """Return (`over`, metric) of every evaluation that has both values."""
         column = name if regime is None else f"{name}_{regime}"
         points = [(row.get(over), row.get(column)) for row in self.rows]
         return [(float(x), float(y)) for x, y in points if x is not None and y is not None]
 
 
 def read_run(folder: Path) -> RunResults:
-    """What a run wrote, of any version; it may be training meanwhile. Imports no torch.
+    """Return the results of a run, which may still be training. Imports no torch.
 
     Raises:
-        UserError: It is not the folder of a run, or one of its files is damaged.
+        UserError: The folder is not a run, or one of its files is damaged.
     """
     check_unchanged(folder, _READ, f"restore it, or let crossgrad run --resume {folder} repair it")
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
@@ -100,5 +100,5 @@ def read_run(folder: Path) -> RunResults:
 
 
 def find_runs(root: Path) -> tuple[Path, ...]:
-    """The folders of runs at or below a folder, sorted; imports no torch."""
+    """Return the folders of runs at or below a folder, sorted; imports no torch."""
     return tuple(sorted(path.parent for path in root.rglob(CONFIG)))

@@ -14,7 +14,7 @@ from crossgrad_core.system.checksums import changed_files
 from crossgrad_core.system.files import write_atomically
 from crossgrad_core.system.input_files import read_file
 
-#: What to do about the heaviest difference; None stands for one that can be accepted.
+#: Advice for the most serious difference; None is the key for a difference that can be accepted.
 _WAYS_OUT = {
     None: "put it back as it was, or add --accept-scene to go on with it as it is",
     Weight.HELD_OUT: "put it back as it was; eval, render and export take it with --accept-scene, "
@@ -22,13 +22,13 @@ _WAYS_OUT = {
     Weight.PLACE: "put it back as it was, or start a new run: the parameters of this one would be "
     "in the wrong place, or views that it was trained on would be measured",
 }
-#: How the note on an accepted scene begins.
+#: The beginning of the note on an accepted scene.
 ACCEPTED: Final = "the scene is not the one that the run was trained on, accepted: "
 _LOG = logging.getLogger(__name__)
 
 
 def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
-    """Writes a run's scene.json, one line for each view.
+    """Write a run's scene.json, one line for each view.
 
     Raises:
         UserError: The disk is full.
@@ -41,7 +41,7 @@ def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
 
 
 def read_scene_file(folder: Path) -> Fingerprint | None:
-    """The scene that a run was trained on; None, with a note, where that cannot be told."""
+    """Return the scene that a run was trained on; None, with a note, if it is unknown."""
     path = folder / FILE
     why = f"{path} is damaged, or of another version"
     try:
@@ -59,19 +59,19 @@ def read_scene_file(folder: Path) -> Fingerprint | None:
 def check_scene(
     folder: Path, now: Fingerprint, tolerated: Weight, *, accept: bool
 ) -> tuple[str, ...]:
-    """Holds the scene as it is against the one that the run was trained on.
+    """Compare the present scene with the scene that the run was trained on.
 
     Args:
         folder: The run's folder.
-        now: The scene as it is.
-        tolerated: The heaviest differences that the command can live with ...
-        accept: ... where the user says so (`--accept-scene`).
+        now: The present scene.
+        tolerated: The most serious difference that the command can accept.
+        accept: True if the user accepts such differences (`--accept-scene`).
 
     Returns:
         A note on the differences, if there are any.
 
     Raises:
-        UserError: The scene differs in more than is tolerated, or the user did not accept it.
+        UserError: The scene differs by more than is tolerated, or the user did not accept it.
     """
     was = read_scene_file(folder)
     found = [] if was is None else differences(was, now)

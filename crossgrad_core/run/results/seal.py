@@ -11,7 +11,7 @@ from crossgrad_core.run.results.sources import FILE as SOURCES
 from crossgrad_core.system.checksums import SUMS, write_checksums
 from crossgrad_core.system.files import is_leftover
 
-#: What is written after the run ends, and the checkpoints, which have digests of their own.
+#: Files that change after the run ends, and the checkpoints, which contain their own digests.
 _UNSEALED: Final = frozenset({SUMS, LOCK, LOG, CHECKPOINTS, SOURCES})
 
 

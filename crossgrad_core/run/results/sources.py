@@ -1,6 +1,6 @@
-"""Names in a run's folder for what came from elsewhere: other scenes, and camera paths.
+"""Names in a run's folder for outside sources: other scenes and camera paths.
 
-Two folders may have one name, and their results must not take each other's place.
+Two sources may have the same name; their results must not replace each other.
 """
 
 from json import dumps
@@ -10,19 +10,19 @@ from typing import Final
 from crossgrad_core.system.files import text_bytes, write_atomically
 from crossgrad_core.system.text_files import read_json
 
-#: Which name stands for which place.
+#: The file with name -> path of the source.
 FILE: Final = "sources.json"
-#: The path that comes from no file.
+#: The name of the camera path that comes from no file.
 RESERVED: Final = ("zoom",)
 
 
 def name_for(folder: Path, name: str, source: Path) -> str:
-    """The name, or that name with a number where it stands for another place already.
+    """Return the name, with a number added if the name already belongs to another source.
 
     Args:
-        folder: The run's folder, which remembers it.
-        name: What the place is called.
-        source: The place.
+        folder: The run's folder, which stores the names.
+        name: Name of the source.
+        source: Path of the source.
 
     Raises:
         UserError: The disk is full.

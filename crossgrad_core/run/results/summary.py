@@ -1,4 +1,4 @@
-"""summary.json: the final figures of a run with all that is needed to understand them."""
+"""summary.json: the final results of a run with everything that is needed to understand them."""
 
 import json
 import math
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FILE = "summary.json"
 Status = Literal["finished", "stopped", "failed"]
-#: What holds for every metric; figures compare only with those of the same definition.
+#: Note for every metric; values are comparable only under the same definition.
 RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
 
@@ -31,19 +31,19 @@ class Summary:
     """The contents of summary.json.
 
     Attributes:
-        status: How the run ended.
+        status: Status of the run at its end.
         scene: Name of the scene.
         totals: Steps, views, backward passes, training seconds, primitives, memory.
-        result: The last evaluation; None where there was none.
+        result: The last evaluation; None if there was none.
         rows: All rows of metrics.csv, to find the best one.
-        seconds: Wall-clock seconds by what they were spent on, those of training by phase too.
-        config: The resolved configuration as plain data, the seed included.
+        seconds: Wall-clock seconds by activity; training seconds also by phase.
+        config: The resolved configuration as plain data, including the seed.
         environment: Machine and versions.
-        ply: What is in the PLY; None where none was written.
-        notes: What was chosen or left out, and why.
+        ply: Description of the PLY; None if none was written.
+        notes: Choices and omissions, with their reasons.
         decisions: The table of decided settings.
-        check: Figures of the check of the scene against itself; None without one.
-        error: Why the run failed; None otherwise.
+        check: Results of the check of the scene against itself; None without a check.
+        error: The reason of the failure; None if the run did not fail.
     """
 
     status: Status
@@ -62,7 +62,7 @@ class Summary:
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
-    """Writes summary.json; numbers that JSON does not know (NaN, infinite) become null.
+    """Write summary.json; numbers that JSON cannot hold (NaN, infinity) become null.
 
     Raises:
         UserError: The disk is full.
@@ -72,10 +72,10 @@ def write_summary(folder: Path, summary: Summary) -> None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """The content of a run's summary.json.
+    """Return the content of a run's summary.json.
 
     Raises:
-        UserError: There is none, or it is not JSON.
+        UserError: There is no such file, or it is not JSON.
     """
     path = folder / FILE
     if not path.is_file():
@@ -100,7 +100,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def summarised_step(folder: Path, status: Status | None = None) -> int | None:
-    """The step that summary.json and the files beside it describe; None without that status."""
+    """Return the step of summary.json and the files with it; None if the status differs."""
     try:
         summary = read_summary(folder)
     except UserError:
@@ -147,7 +147,7 @@ def _definitions(figures: Sequence[Figure]) -> dict[str, str]:
 
 
 def best_of(rows: Sequence[Row]) -> dict[str, Any] | None:
-    """Step, training seconds and PSNR of the evaluation with the highest PSNR."""
+    """Return step, training seconds, PSNR and SSIM of the evaluation with the highest PSNR."""
     scored = [(psnr, row) for row in rows if (psnr := row.get("psnr")) is not None]
     valid = [(psnr, row) for psnr, row in scored if not math.isnan(psnr)]
     if not valid:
@@ -176,13 +176,13 @@ def final_table(result: EvaluationResult | None, totals: Totals) -> str:
 
 
 def metric_lines(result: EvaluationResult) -> list[str]:
-    """Metrics overall and per regime, and why one is missing."""
+    """Return the metrics overall and per regime, and the reason for each missing one."""
     reasons = (f"no {metric}: {reason}" for metric, reason in _shown(result))
     return [*_aligned(_rows(result)), *reasons]
 
 
 def cost_line(totals: Totals) -> str:
-    """Training seconds, steps, rendered views, primitives and memory in one line."""
+    """Return training seconds, steps, rendered views, primitives and memory in one line."""
     peak = totals.peak_memory_mib
     memory = "" if peak is None else f", peak memory {peak:,.0f} MiB"
     return (
@@ -193,7 +193,7 @@ def cost_line(totals: Totals) -> str:
 
 
 def _rows(result: EvaluationResult) -> list[tuple[str, ...]]:
-    # What is not defined for these views has no column.
+    # A metric that is not defined for these views gets no column.
     shown = [each for each in result.figures if result.reasons.get(each.name) != each.undefined]
     header = ("", "views", *(figure.label for figure in shown))
     rows = [header, _row("overall", result.overall, shown)]
@@ -213,7 +213,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _shown(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Why the figures that are told by regime are missing; of others that is no news."""
+    """Return reasons for missing metrics, only for metrics that are reported by regime."""
     told = [figure.name for figure in result.figures if figure.per_regime]
     return [(name, why) for name, why in result.reasons.items() if name in told]
 

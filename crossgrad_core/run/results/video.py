@@ -1,4 +1,4 @@
-"""Frames as files, and as a video."""
+"""Frames as image files and as a video."""
 
 import io
 import shutil
@@ -14,21 +14,21 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.files import atomic_file, disk_errors, write_atomically
 from crossgrad_core.system.interrupts import HELPERS
 
-#: A program that writes videos; where there is none, Pillow writes an animated picture.
+#: The program that writes videos; without it, Pillow writes an animated image.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
-#: Bytes of all frames of an animated picture, which are in memory at once.
+#: Most bytes of all frames of an animated image, which are in memory at once.
 _LARGEST: Final = 1 << 29
-#: Pixels that a side of one may have.
+#: Most pixels of a side of an animated image.
 _LONGEST: Final = 16_383
 
 
 def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
-    """Writes `00000.png` and so on; answers with the files in their order.
+    """Write `00000.png` and so on; return the files in order.
 
     Args:
-        images: Each [H, W, 3] float, need not be clamped.
-        folder: Made if need be.
+        images: Images [H, W, 3] float; need not be clamped.
+        folder: The folder; created if needed.
 
     Raises:
         UserError: The disk is full.
@@ -47,7 +47,7 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
 
 
 def drop_frames(folder: Path, count: int) -> None:
-    """Removes the frames from number `count` on, which a longer video left."""
+    """Remove the frames from number `count` on, which are left from a longer video."""
     number = count
     while (frame := folder / f"{number:05d}.png").is_file():
         frame.unlink()
@@ -55,14 +55,14 @@ def drop_frames(folder: Path, count: int) -> None:
 
 
 def video_files(folder: Path) -> tuple[Path, Path]:
-    """The video in a folder of frames: as an encoder writes it, and as Pillow does."""
+    """Return the paths of the video in a folder of frames: of the encoder, and of Pillow."""
     return folder / "video.mp4", folder / "video.webp"
 
 
 def write_video(frames: list[Path], fps: float) -> Path | None:
-    """Writes the frames as video.mp4 beside them where ffmpeg is installed, else as video.webp.
+    """Write the frames as video.mp4 if ffmpeg is installed, else as video.webp; return the file.
 
-    Frames that are too many or too large for an animated picture remain frames: None.
+    Return None, and write no video, if the frames are too many or too large for an animated image.
 
     Args:
         frames: PNG files named by their numbers from 0 on, in one folder.
@@ -80,10 +80,10 @@ def write_video(frames: list[Path], fps: float) -> Path | None:
 
 
 def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
-    # The folder may hold more frames, of a longer video.
+    # The folder may contain more frames from a longer video.
     source = ["-framerate", f"{fps:g}", "-i", str(frames[0].parent / "%05d.png")]
     count = ["-frames:v", str(len(frames))]
-    # Players want even sides and this pixel format.
+    # Players require even sides and this pixel format.
     shape = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
     command = [encoder, "-y", "-loglevel", "error", *source, *count, *shape, "-f", "mp4"]
     process = subprocess.Popen(
@@ -111,7 +111,7 @@ def _animated(frames: list[Path], path: Path, fps: float) -> Path | None:
     if size * len(frames) > _LARGEST or longest > _LONGEST:
         return None
     images = []
-    for frame in frames:  # Pillow wants them all at once.
+    for frame in frames:  # Pillow needs all frames at once.
         with Image.open(frame) as image:
             images.append(image.copy())
     with atomic_file(path) as file:

@@ -11,7 +11,7 @@ from typing_extensions import override
 from crossgrad_core.plugin import DensifyContext, PluginState, Selection, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 
-#: Criterion -> the thresholds that it compares with.
+#: Criterion -> the names of the thresholds that it uses.
 _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
     "abs": frozenset({"grad_threshold", "abs_threshold"}),
     "gsplat": frozenset({"gsplat_threshold"}),
@@ -20,13 +20,14 @@ _THRESHOLDS: Final[Mapping[str, frozenset[str]]] = {
 
 
 class AbsGradDensityControl(AxisSplit):
-    """Adaptive density control that pixels pulling in opposite directions cannot hide from.
+    """Adaptive density control with absolute gradients, so opposite pixel gradients do not cancel.
 
-    Beside the norm g of the projected mean's gradient, the pixels' absolute gradients are summed,
-    x and y apart, and their norm ga is averaged over the renders in which the Gaussian was visible.
-    Criteria: `abs` clones by g and splits by ga (AbsGS); `gsplat` clones and splits by ga alone;
-    `quantile` clones and splits where g is large enough, or ga among the largest of as many
-    Gaussians, with the 1-norm in place of the 2-norm (Mip-Splatting's code).
+    In addition to the norm g of the projected mean's gradient, it sums the pixels' absolute
+    gradients, separately for x and y. Their norm ga is averaged over the renders in which the
+    Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS). `gsplat` clones and
+    splits by ga alone. `quantile` clones and splits if g is above its threshold, or if ga is among
+    the equally many largest values; it uses the 1-norm instead of the 2-norm (Mip-Splatting's
+    code).
     """
 
     needs = frozenset({"abs_gradient"})
@@ -69,9 +70,10 @@ class AbsGradDensityControl(AxisSplit):
         return Growth(clone=clones & small, split=splits & ~small, strength=absolute)
 
     def _by_quantile(self, gradient: Tensor, absolute: Tensor) -> Tensor:
-        """[P] bool, g >= threshold, or ga >= its (1 - rho) quantile, rho the share of the first.
+        """Return [P] bool: g >= threshold, or ga >= its (1 - rho) quantile.
 
-        Where rho is 0 nothing grows, and what was never seen (ga = 0) does not grow either.
+        rho is the share of primitives with g >= threshold. If rho is 0, nothing grows. A primitive
+        that was never seen (ga = 0) does not grow either.
         """
         moves = gradient >= self.grad_threshold
         if not bool(moves.any()):
@@ -82,11 +84,13 @@ class AbsGradDensityControl(AxisSplit):
 
 
 def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -> dict[str, Tensor]:
-    """The sums [P] of g, of ga, and of the renders that showed a primitive, with this step's views.
+    """Return the sums [P] of g, of ga and of the renders that showed a primitive.
+
+    The sums include the views of this step.
 
     Args:
         context: The step.
-        state: With the sums of the steps before.
+        state: The state with the sums of earlier steps.
         order: The norm of ga.
     """
     totals = screen_statistics.sums(context, state, ("gradient", "absolute", "renders"))
@@ -104,7 +108,10 @@ def gradient_sums(context: DensifyContext, state: PluginState, order: int = 2) -
 
 
 def quantile(values: Tensor, share: float) -> Tensor:
-    """The quantile of `values` [P > 0] by linear interpolation; torch's own takes at most 2^24."""
+    """Return the quantile of `values` [P > 0] by linear interpolation.
+
+    `torch.quantile` accepts at most 2^24 values.
+    """
     ordered = values.sort().values
     place = share * (len(ordered) - 1)
     below = int(place)

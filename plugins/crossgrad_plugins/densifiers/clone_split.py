@@ -27,10 +27,11 @@ from crossgrad_core.plugin import (
     apply_to_parameters,
 )
 
-#: A split divides the scales by this (3DGS).
+#: A split divides the scales by this factor (3DGS).
 SPLIT_SHRINK = 1.6
-#: Length of a child on the axis, in parents. Two of these, so far to either side that they have the
-#: variance of the parent together, and so much fainter that they cover as much.
+#: Length of a child along the axis, as a share of the parent. Two children are placed `_APART` to
+#: either side, so that together they have the variance of the parent. Their opacity is multiplied
+#: by `_FAINTER`, so that together they cover as much as the parent.
 _KEPT: Final = 0.6
 _APART: Final = sqrt(1.0 - _KEPT**2)
 _FAINTER: Final = 1.0 / (2.0 * _KEPT)
@@ -38,12 +39,13 @@ _FAINTER: Final = 1.0 / (2.0 * _KEPT)
 
 @dataclass(frozen=True)
 class Growth:
-    """Which primitives grow.
+    """The primitives that grow.
 
     Attributes:
-        clone: [P] bool, to be duplicated in place.
-        split: [P] bool, to be replaced by two smaller ones; none of them is cloned too.
-        strength: [P], how much each asks for it: the strongest go first where room is short.
+        clone: [P] bool, primitives that are duplicated in place.
+        split: [P] bool, primitives that are replaced by two smaller ones; none of them is also
+            cloned.
+        strength: [P], priority of each primitive; the strongest grow first if the budget is short.
     """
 
     clone: Tensor
@@ -51,13 +53,13 @@ class Growth:
     strength: Tensor
 
     def among(self, may_grow: Tensor | None) -> "Growth":
-        """Those that may grow [P]; None: all may."""
+        """Return the growth limited to primitives that may grow [P]; None: all may grow."""
         if may_grow is None:
             return self
         return replace(self, clone=self.clone & may_grow, split=self.split & may_grow)
 
     def limited(self, room: int) -> tuple["Growth", int]:
-        """The strongest `room` of them, and how many were left out."""
+        """Return the growth of the `room` strongest primitives, and how many were left out."""
         wanted = self.clone | self.split
         left_out = max(0, int(wanted.sum()) - room)
         if left_out == 0:
@@ -84,7 +86,7 @@ class Plan:
 
     @classmethod
     def of(cls, growth: Growth) -> "Plan":
-        """The plan of a growth."""
+        """Return the plan of a growth."""
         stay = (~growth.split).nonzero().squeeze(1)
         clones = growth.clone.nonzero().squeeze(1)
         parents = growth.split.nonzero().squeeze(1)
@@ -94,10 +96,11 @@ class Plan:
 
 
 class CloneSplit(Densifier):
-    """Grows where a screen statistic asks for it; prunes faint and huge Gaussians.
+    """Grows primitives by a screen statistic; prunes faint and huge Gaussians.
 
-    A method says which statistics it gathers and which primitives grow; the rest is that of 3DGS.
-    The published rule by screen radius never fires in the original code and is left out.
+    A subclass defines the statistics to gather and the primitives that grow; the rest is as in
+    3DGS. The published pruning rule by screen radius never fires in the original code, so it is
+    left out.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
@@ -111,22 +114,29 @@ class CloneSplit(Densifier):
 
     @abstractmethod
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
-        """The statistics with the views of this step added, view by view in order."""
+        """Return the statistics with the views of this step added, in order of the views."""
 
     @abstractmethod
     def growth(self, context: DensifyContext, state: PluginState, small: Tensor) -> Growth:
-        """What grows, given the statistics and which primitives are small [P] (to be cloned)."""
+        """Return the primitives that grow.
+
+        Args:
+            context: The step.
+            state: The statistics.
+            small: [P] bool, primitives that are small and therefore cloned.
+        """
 
     def divided(self, context: DensifyContext, growth: Growth) -> Growth:
-        """What of it is cloned, and what split; by default as `growth` has it."""
+        """Return which growing primitives are cloned or split; by default `growth` itself."""
         return growth
 
     def grown_values(
         self, context: DensifyContext, state: PluginState, plan: Plan
     ) -> dict[str, Rows]:
-        """New values of rows of the plan; by default means and scales of the children.
+        """Return new values for rows of the plan; by default means and scales of the children.
 
-        Source: 3DGS: drawn from the parent's own Gaussian, scales divided by 1.6.
+        Source: 3DGS. The means are drawn from the parent's Gaussian, and the scales are divided by
+        1.6.
         """
         rows = plan.child.nonzero().squeeze(1)
         parents = plan.source[rows]
@@ -173,7 +183,7 @@ class CloneSplit(Densifier):
     def pruned(
         self, context: DensifyContext, state: PluginState, plan: Plan, values: Mapping[str, Rows]
     ) -> Tensor:
-        """[M] bool, primitives of the plan that go: by default those too faint or too large."""
+        """Return [M] bool, primitives of the plan to remove; by default the too faint or large."""
         opacities = sigmoid(_planned(context, plan, values, "opacities"))
         pruned = opacities < self.prune_opacity
         if context.schedule.prunes_large(context.step):
@@ -189,7 +199,7 @@ class CloneSplit(Densifier):
 
 
 def edited_parameters(context: DensifyContext, edit: Edit) -> Parameters:
-    """The parameters as they will be after an edit, derived tensors included."""
+    """Return the parameters after an edit, including derived tensors."""
     after = apply_to_parameters(edit, context.backbone.blocks(), context.parameters)
     if edit.source is None:
         return after
@@ -198,7 +208,7 @@ def edited_parameters(context: DensifyContext, edit: Edit) -> Parameters:
 
 
 def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:
-    """[R, 3] one draw from each parent's Gaussian, relative to its mean."""
+    """Return [R, 3] one sample of each parent's Gaussian, relative to its mean."""
     log_scales = context.parameters["scales"].detach()[parents]
     draws = context.rng.standard_normal((parents.shape[0], 3)).astype(np.float32)
     noise = torch.from_numpy(draws).to(log_scales)
@@ -207,7 +217,7 @@ def drawn_offsets(context: DensifyContext, parents: Tensor) -> Tensor:
 
 
 def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], name: str) -> Tensor:
-    """A parameter of the plan's primitives, with its new values."""
+    """Return a parameter of the plan's primitives, with new values filled in."""
     tensor = context.parameters[name].detach()[plan.source]
     if name in values:
         tensor[values[name].rows] = values[name].values
@@ -215,7 +225,7 @@ def _planned(context: DensifyContext, plan: Plan, values: Mapping[str, Rows], na
 
 
 def _compacted(values: Mapping[str, Rows], keep: Tensor) -> dict[str, Rows]:
-    """The values of rows that are kept [M], at their new places."""
+    """Return the values of the rows that are kept [M], with their new row numbers."""
     place = torch.cumsum(keep, 0) - 1
     compacted = {}
     for name, each in values.items():
@@ -231,11 +241,12 @@ def _zeroed(state: PluginState) -> PluginState:
 
 
 class AxisSplit(CloneSplit):
-    """Clones and splits as 3DGS does, or splits all that grows, side by side on its longest axis.
+    """Clones and splits as in 3DGS, or splits every growing Gaussian along its longest axis.
 
-    A clone lies where its parent does and has its gradients: both move as one until noise parts
-    them, and are more opaque together than the parent was. Children drawn at random leave holes.
-    Those side by side show what the parent showed, and differ from the first step on.
+    A clone has the same position and gradients as its parent. Both move together until noise
+    separates them, and together they are more opaque than the parent was. Children at random
+    positions leave holes. Children side by side on the axis look like the parent, and differ from
+    the first step on.
     """
 
     division: Literal["drawn", "axis"] = Field(
@@ -252,7 +263,7 @@ class AxisSplit(CloneSplit):
 
     @property
     def by_size(self) -> bool:
-        """Whether `split_scale` says more than what is cloned: by which statistic what grows."""
+        """Whether `split_scale` also selects the statistic that decides about growth."""
         return False
 
     @override
@@ -285,14 +296,15 @@ def child_on_axis(
     length: Tensor | float,
     opacity: Tensor | float,
 ) -> dict[str, Tensor]:
-    """New values of a child of each parent [S] on its longest axis.
+    """Return new values for one child of each parent [S], placed on the parent's longest axis.
 
     Args:
         context: The step.
         parents: Rows of the parents.
-        place: [S] of the child's middle from the parent's, standard deviations on the axis.
-        length: [S] logarithm of its length there over the parent's.
-        opacity: [S] logarithm of its opacity over the parent's.
+        place: [S] offset of the child's centre from the parent's, in standard deviations on the
+            axis.
+        length: [S] logarithm of the ratio of the child's length on the axis to the parent's.
+        opacity: [S] logarithm of the ratio of the child's opacity to the parent's.
 
     Source: fixed places on the longest axis as in Deng et al. 2024 (arXiv 2411.10133).
     """

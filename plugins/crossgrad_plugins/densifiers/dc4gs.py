@@ -1,4 +1,4 @@
-"""DC4GS: splits where the directions of a Gaussian's gradients disagree, and where they part."""
+"""DC4GS: splits Gaussians whose gradient directions disagree, at the best plane between them."""
 
 import numpy as np
 import torch
@@ -10,30 +10,31 @@ from typing_extensions import override
 from crossgrad_core.plugin import DensifyContext, PluginState, Rows, screen_statistics
 from crossgrad_plugins.densifiers.clone_split import CloneSplit, Growth, Plan, child_on_axis
 
-#: Candidate planes, across the longest axis at -2, -1, 0, 1, 2 standard deviations.
+#: Number of candidate planes across the longest axis: at -2, -1, 0, 1, 2 standard deviations.
 PLANES = 5
 
 
 def inconsistency(sums: Tensor) -> Tensor:
-    """[N] (1 - R) ga of pixels whose directions, absolute gradients and number are `sums`.
+    """Return [N] (1 - R) ga of the pixels of each Gaussian.
 
-    R is the length of the mean direction, 1 where there is no pixel; ga is the norm of the absolute
-    gradients. So nothing that pulls one way, or not at all, has any.
+    R is the length of the mean direction, or 0 if there is no pixel. ga is the norm of the absolute
+    gradients. The result is 0 if all gradients have the same direction or if all are zero.
 
     Args:
-        sums: [5, N] fields of `Screen.directions`, added up over bins.
+        sums: [5, N] fields of `Screen.directions`, summed over bins: direction (x, y), absolute
+            gradients (x, y), number of pixels.
 
     Source: DC4GS.
     """
     x, y, absolute_x, absolute_y, number = sums
-    # No pixel: 1 - 0 / 1 times a ga of 0. Rounding can make the mean longer than unit vectors.
+    # Without pixels: (1 - 0 / 1) times a ga of 0. Rounding can make the mean longer than 1.
     rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
     found: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     return found
 
 
 def plane_scores(bins: Tensor) -> Tensor:
-    """[5, N] mean of the inconsistencies on both sides of each plane.
+    """Return [5, N] mean of the inconsistencies on both sides of each plane.
 
     Args:
         bins: [6, 5, N] from `screen_statistics.directions`.
@@ -41,7 +42,8 @@ def plane_scores(bins: Tensor) -> Tensor:
     left, right = [bins[0]], [bins[-1]]
     for plane in range(1, PLANES):
         left.append(left[-1] + bins[plane])
-        # From the other end: the whole less the left would leave roundings where there is nothing.
+        # Sum from the other end. The total minus the left side would leave rounding errors for
+        # empty bins.
         right.append(right[-1] + bins[-1 - plane])
     sides = zip(left, reversed(right), strict=True)
     return torch.stack([(inconsistency(a) + inconsistency(b)) / 2.0 for a, b in sides])
@@ -49,15 +51,16 @@ def plane_scores(bins: Tensor) -> Tensor:
 
 #: The candidate planes as shares of the axis, which is six standard deviations long.
 NODES = np.arange(1, 6) / 6.0
-#: Where the polynomial is evaluated besides.
+#: Further positions at which the polynomial is evaluated.
 GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
 
 
 def split_positions(scores: Tensor) -> Tensor:
-    """[S] share p of the axis that the left child gets, in [1/12, 11/12].
+    """Return [S] share p of the axis for the left child, in [1/12, 11/12].
 
-    The polynomial of degree 4 through the scores is searched on a grid and at its nodes. Of equal
-    values the most central one counts, so that no preference means the middle.
+    The function searches the minimum of the polynomial of degree 4 through the scores, on a grid
+    and at the nodes. Of equal values the most central one is used, so equal scores split in the
+    middle.
 
     Args:
         scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.
@@ -71,7 +74,7 @@ def split_positions(scores: Tensor) -> Tensor:
 
 
 def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places [Q], the central ones first, and Lagrange's weights [5, Q] of the scores there."""
+    """Return positions [Q], central ones first, and the Lagrange weights [5, Q] there."""
     places = np.concatenate([NODES, GRID])
     places = places[np.argsort(np.abs(places - 0.5), kind="stable")]
     weights = np.ones((len(NODES), len(places)))
@@ -82,12 +85,12 @@ def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class DirectionalConsistency(CloneSplit):
-    """Clones by the mean gradient, splits by (1 - R) ga where the directions part.
+    """Clones by the mean gradient, and splits by (1 - R) ga if gradient directions disagree.
 
-    R is the length of the mean direction of the pixels' gradients and ga the norm of their absolute
-    values, per view; (1 - R) ga is averaged over the renders in which the Gaussian was visible.
-    The children of a split lie side by side on the longest axis, cut where both sides are most
-    consistent.
+    R is the length of the mean direction of the pixels' gradients. ga is the norm of their absolute
+    values. Both are computed per view; (1 - R) ga is averaged over the renders in which the
+    Gaussian was visible. The children of a split are side by side on the longest axis. The cut is
+    at the position where both sides are most consistent.
     """
 
     needs = frozenset({"directions"})
@@ -116,7 +119,7 @@ class DirectionalConsistency(CloneSplit):
         parting = screen_statistics.mean(state.per_primitive, "inconsistency", "renders")
         clone = (gradient >= self.grad_threshold) & small
         split = (parting >= self.split_threshold) & ~small
-        # In units of the thresholds clones and splits compare where room is short.
+        # In units of the thresholds, clones and splits can be compared if the budget is short.
         urge = torch.where(small, gradient / self.grad_threshold, parting / self.split_threshold)
         return Growth(clone=clone, split=split, strength=urge)
 
@@ -141,10 +144,10 @@ class DirectionalConsistency(CloneSplit):
 def _child(
     context: DensifyContext, parents: Tensor, position: Tensor, *, right: bool
 ) -> dict[str, Tensor]:
-    """New values of the left or right children of some parents [S], cut at `position` [S].
+    """Return new values for the left or right children of parents [S], cut at `position` [S].
 
-    The longest axis is six standard deviations long. The left child has the first share p of it,
-    and that share of the opacity: its middle is 3 (1 - p) deviations left of the parent's.
+    The longest axis is six standard deviations long. The left child gets the share p of the axis
+    and of the opacity. Its centre is 3 (1 - p) standard deviations left of the parent's centre.
     """
     share = 1.0 - position if right else position
     place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)

@@ -20,10 +20,10 @@ from crossgrad_core.plugin import (
     unit_range,
 )
 
-#: Sums per primitive and regime [P, R]: marked pixels, these times the view's loss, and renders
-#: that showed the primitive.
+#: Sums per primitive and regime [P, R]: marked pixels, marked pixels times the view's loss, and
+#: renders that showed the primitive.
 MARKED, ERROR, VISITS = "marked", "error", "visits"
-#: How many views of each regime were rendered.
+#: Number of rendered views of each regime.
 DRAWN = "drawn"
 #: The power of the visits in the rank of a primitive: between a sum (0) and a mean (1).
 VISITS_POWER = 0.75
@@ -31,12 +31,12 @@ VISITS_POWER = 0.75
 
 @dataclass(frozen=True)
 class MultiViewScore:
-    """The importance of P primitives by several views, regime by regime.
+    """The importance of P primitives in several views, per regime.
 
     Attributes:
-        marked: [P, R] erroneous pixels of the full photo, the mean over views.
-        error: [P, R] these times the view's loss, likewise.
-        rank: [P, R] what the primitives of a regime are ranked by.
+        marked: [P, R] erroneous pixels of the full photo, mean over views.
+        error: [P, R] erroneous pixels times the view's loss, mean over views.
+        rank: [P, R] value by which the primitives of a regime are ranked.
     """
 
     marked: Tensor
@@ -44,13 +44,17 @@ class MultiViewScore:
     rank: Tensor
 
     def above(self, threshold: float) -> Tensor:
-        """[P, R] bool, whole numbers of erroneous pixels above a threshold."""
+        """Return [P, R] bool: whether the whole number of erroneous pixels is above a threshold."""
         return self.marked.floor() > threshold
 
     def strength(self, grows: Tensor) -> Tensor:
-        """[P] minus the best place that a primitive has in any regime among those that grow [P, R].
+        """Return [P] the negative of the best rank of each growing primitive in any regime.
 
-        The regimes take turns: the first of each, then the second of each ...
+        The regimes alternate: first the best primitive of each regime, then the second of each, and
+        so on.
+
+        Args:
+            grows: [P, R] bool, primitives that grow.
         """
         ranked = torch.where(grows, self.rank, -torch.inf)
         order = ranked.argsort(dim=0, descending=True, stable=True)
@@ -61,7 +65,7 @@ class MultiViewScore:
 
     @property
     def pruning_score(self) -> Tensor:
-        """[P] in [0, 1], the error from the least to the largest; 0 where all have the same."""
+        """The error [P], scaled to [0, 1] from smallest to largest; 0 if all are equal."""
         error = self.error.sum(dim=1)
         if len(error) == 0:
             return error
@@ -70,11 +74,12 @@ class MultiViewScore:
 
 
 class CountsMarkedPixels(Densifier, ABC):
-    """A densifier that asks in how many erroneous pixels of several views a primitive is blended.
+    """A densifier that counts the erroneous pixels of each primitive over several views.
 
-    A pixel of a view is erroneous where its absolute difference from the photo, the mean over
-    channels, from the least to the largest of the view, is above `error_threshold`. Pixels are
-    those of the full photo, at whatever scale it is rendered.
+    A primitive's count is the number of erroneous pixels in which it is blended. The error of a
+    pixel is its absolute difference from the photo, averaged over channels and scaled to the range
+    of the view's errors. A pixel is erroneous if its error is above `error_threshold`. Counts are
+    in pixels of the full photo, at any scale of the render.
     """
 
     count: Literal["render", "running"] = Field(
@@ -97,7 +102,7 @@ class CountsMarkedPixels(Densifier, ABC):
     )
 
     def counted(self, context: DensifyContext, state: PluginState) -> PluginState:
-        """The counts with those that are due in this step."""
+        """Return the counts, including the counts that are due in this step."""
         edits = context.schedule.densifies(context.step)
         if self.count == "render":
             return self.rendered(context) if edits else PluginState()
@@ -109,7 +114,7 @@ class CountsMarkedPixels(Densifier, ABC):
 
     @torch.no_grad()
     def rendered(self, context: DensifyContext) -> PluginState:
-        """The counts of `views` training views, rendered as large as those of the step."""
+        """Return the counts of `views` training views, rendered at the scale of the step."""
         last = context.views[-1] if context.views else None
         scale, background = (last.scale, last.background) if last else (1.0, None)
         columns = [self._column(context, view) for view in context.scene.train_views]
@@ -122,10 +127,10 @@ class CountsMarkedPixels(Densifier, ABC):
         return PluginState({DRAWN: numbers.tolist()}, per_primitive=sums)
 
     def importance_of(self, state: PluginState) -> MultiViewScore:
-        """What the counts of a state say.
+        """Return the score of the counts of a state.
 
-        A mean is over the views that were rendered for it; in the running variant over the renders
-        that showed the primitive.
+        A mean is taken over the views that were rendered for the counts. In the running variant it
+        is taken over the renders that showed the primitive.
         """
         marked, error, visits = (state.per_primitive[name] for name in (MARKED, ERROR, VISITS))
         drawn = state.values.get(DRAWN)
@@ -134,7 +139,7 @@ class CountsMarkedPixels(Densifier, ABC):
         return MultiViewScore(marked / per, error / per, rank)
 
     def idle_counting(self, *, renders: bool) -> dict[str, str]:
-        """Options of the counting that change nothing beside the others.
+        """Return the counting options that have no effect, with the reason.
 
         Args:
             renders: Whether the running variant renders views, too.
@@ -145,7 +150,7 @@ class CountsMarkedPixels(Densifier, ABC):
         return {} if renders else {"views": why}
 
     def _sums(self, context: DensifyContext, state: PluginState) -> dict[str, Tensor]:
-        """Copies of the sums [P, R], zeros at first."""
+        """Return copies of the sums [P, R], or zeros if there are none."""
         blocks, have = context.backbone.blocks(), state.per_primitive
         name = next(block.tensors[0] for block in blocks if block.per_primitive)
         like = context.parameters[name].detach()
@@ -153,7 +158,7 @@ class CountsMarkedPixels(Densifier, ABC):
         return {each: have.get(each, zeros).clone() for each in (MARKED, ERROR, VISITS)}
 
     def _regimes(self, context: DensifyContext) -> list[str]:
-        """The regimes that are told apart."""
+        """Return the regimes that are counted separately."""
         names = {view.regime for view in context.scene.train_views} if self.regimes else {""}
         return sorted(names)
 
@@ -163,7 +168,7 @@ class CountsMarkedPixels(Densifier, ABC):
     def _add(
         self, context: DensifyContext, view: RenderedView, loss: float, sums: dict[str, Tensor]
     ) -> None:
-        """Adds the counts of a view to the sums, in place."""
+        """Add the counts of a view to the sums, in place."""
         if view.screen.count is None:
             raise RuntimeError("the rasterizer was asked for a count and gave none")
         column = self._column(context, view.view)
@@ -177,10 +182,10 @@ class CountsMarkedPixels(Densifier, ABC):
 
 
 def erroneous(view: RenderedView, threshold: float) -> Tensor:
-    """[H, W] bool, pixels whose error, from the view's least to its largest, is above a threshold.
+    """Return [H, W] bool: pixels whose error, scaled to the view's range, is above a threshold.
 
-    The error is the absolute difference from the photo, the mean over channels. Pixels that are
-    masked out are not, nor is any where all have the same error.
+    The error is the absolute difference from the photo, averaged over channels. Masked pixels are
+    never erroneous. If all pixels have the same error, none is erroneous.
     """
     photo = unit_range(view.photo, view.image.dtype)
     red, green, blue = (view.image - photo).abs().unbind(-1)
@@ -195,12 +200,12 @@ def erroneous(view: RenderedView, threshold: float) -> Tensor:
 
 
 def drawn_views(columns: Sequence[int], number: int, rng: np.random.Generator) -> list[int]:
-    """So many different views at random, of all groups as evenly as `number` goes, at least one.
+    """Return random different views, evenly from all groups and at least one from each.
 
     Args:
-        columns: The group of each view, from 0 on.
-        number: How many views.
-        rng: Draws.
+        columns: The group of each view, counted from 0.
+        number: Number of views.
+        rng: Random generator.
     """
     groups = max(columns) + 1
     drawn = []

@@ -31,23 +31,25 @@ from crossgrad_core.plugin import (
 #: Steepness of the gate and the opacity at which it is half open (3DGS-MCMC).
 GATE_STEEPNESS = 100.0
 GATE_OPACITY = 0.005
-#: Shifts below this share of a Gaussian's own size are left out: float32 knows no finer places.
+#: Shifts below this share of a Gaussian's own size are left out, because float32 cannot represent
+#: them.
 NEGLIGIBLE = 1e-7
 
 
 def position_noise(
     parameters: Mapping[str, Tensor], strength: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """The rows of `means` that noise moves, and by how much.
+    """Return the rows of `means` that noise moves, and their shifts.
 
     shift = Sigma n sig(-100 (o - 0.005)) strength, with n three standard normal numbers. No number
-    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale: every opaque
-    one, so that the noise costs little once training is under way.
+    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. This holds for
+    every opaque Gaussian, so the noise costs little after the first steps of training.
 
     Args:
-        parameters: With `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit) [N].
+        parameters: Parameters with `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit)
+            [N].
         strength: Learning rate of the positions times the noise's own factor, 1 / local units.
-        rng: The generator.
+        rng: Random generator.
 
     Returns:
         Rows [R] int64 and shifts [R, 3], local units.
@@ -70,9 +72,9 @@ def position_noise(
 
 
 def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
-    """Vectors [R, 3] turned by unit quaternions wxyz [R, 4], or back: v + w t + u x t, t = 2 u x v.
+    """Return vectors [R, 3] rotated by unit quaternions wxyz [R, 4], or by their inverses.
 
-    No matrices are formed.
+    The formula is v + w t + u x t with t = 2 u x v, without matrices.
     """
     w, u = quats[:, :1], quats[:, 1:]
     turned: Tensor = 2.0 * torch.linalg.cross(u, vectors)
@@ -80,17 +82,18 @@ def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
     return along - w * turned if back else along + w * turned
 
 
-#: More copies than these count as so many (the published bound).
+#: Larger numbers of copies are treated as this number (the published bound).
 MOST_COPIES = 51
-#: Step of the quadrature, in standard deviations. The integrand is entire, so the trapezoidal rule
-#: errs by a factor exp(-c / step): for 51 opaque copies 2e-12 at 0.2, less than rounding at 0.15.
+#: Step of the quadrature, in standard deviations. The integrand is entire, so the relative error of
+#: the trapezoidal rule is exp(-c / step). For 51 opaque copies it is 2e-12 at step 0.2, and below
+#: the rounding error at step 0.15.
 _STEP = 0.15
-#: Number of steps: at 9.6 standard deviations 51 copies are below 1e-18.
+#: Number of steps. At 9.6 standard deviations, the integrand of 51 copies is below 1e-18.
 _STEPS = 64
 
 
 def shared_opacity(opacity: Tensor, copies: Tensor) -> Tensor:
-    """Opacity of each of n copies that together are as opaque as one: 1 - (1 - o)^(1/n).
+    """Return the opacity of each of n copies that together are as opaque as one: 1 - (1 - o)^(1/n).
 
     Args:
         opacity: [R] float64 in [0, 1].
@@ -100,23 +103,23 @@ def shared_opacity(opacity: Tensor, copies: Tensor) -> Tensor:
 
 
 def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
-    """Factor of the scales of each of n copies, so that they together are as wide as one.
+    """Return the factor of the scales of n copies, so that together they are as wide as one.
 
-    With o' the shared opacity the published factor is o / D with the alternating sums
-    D = sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). They cancel to nothing for
-    many opaque copies, but 1 / sqrt(q+1) is the integral of a Gaussian to the power q+1, and under
-    the integral the sums close:
+    o' is the shared opacity. The published factor is o / D with the alternating sums D =
+    sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). For many opaque copies these sums
+    lose all precision by cancellation. But 1 / sqrt(q+1) is the integral of a Gaussian to the power
+    q+1, and the sums have a closed form under the integral:
 
-        D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx,
+        D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx.
 
-    a positive, smooth integrand. The trapezoidal rule sums it to rounding.
+    This integrand is positive and smooth. The trapezoidal rule is exact up to rounding.
 
     Args:
         opacity: [R] float64 in [0, 1], before it is shared.
         copies: [R] 1 <= n <= 51.
 
     Returns:
-        [R] in (0, 1]; 1, the limit, where the opacity is 0 or below the smallest normal number.
+        [R] in (0, 1]. If the opacity is 0 or below the smallest normal number, the limit 1.
     """
     nodes = _STEP * torch.arange(_STEPS + 1, dtype=opacity.dtype, device=opacity.device)
     weights = torch.full_like(nodes, 2.0 * _STEP / sqrt(2.0 * pi))
@@ -129,13 +132,13 @@ def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pool:
-    """Primitives of which some are copies of others.
+    """A set of primitives, some of which are copies of others.
 
     Attributes:
-        source: [M] int64, the old primitive of each.
+        source: [M] int64, index of the old primitive of each primitive.
         opacity: [M] float64.
-        scale: [M] float64, factor of its scales.
-        touched: [M] bool, whether it shares its source with others.
+        scale: [M] float64, factor of the scales.
+        touched: [M] bool, whether the primitive shares its source with others.
     """
 
     source: Tensor
@@ -145,17 +148,17 @@ class Pool:
 
     @classmethod
     def of(cls, opacity: Tensor) -> "Pool":
-        """The primitives as they are, of these opacities [M] (float64)."""
+        """Return the pool of the present primitives with opacities [M] (float64)."""
         source = torch.arange(opacity.shape[0], device=opacity.device)
         untouched = torch.zeros_like(source, dtype=torch.bool)
         return cls(source, opacity, torch.ones_like(opacity), untouched)
 
     def copied(self, index: Tensor, lowest: float) -> "Pool":
-        """The primitives at `index` [M']; those that occur more than once share.
+        """Return the primitives at `index` [M']; repeated primitives share their opacity.
 
         Args:
             index: [M'] int64.
-            lowest: A shared opacity is not below this, and below 1 by a float32 rounding.
+            lowest: Lower bound of a shared opacity; the upper bound is 1 minus the float32 epsilon.
         """
         copies = torch.bincount(index, minlength=self.source.shape[0]).clamp(max=MOST_COPIES)
         rows = (copies > 1).nonzero().squeeze(1)
@@ -172,11 +175,11 @@ LAST_EDIT_SHARE = 25 / 30
 
 
 class MarkovChainMonteCarlo(Densifier):
-    """Moves transparent Gaussians onto opaque ones and adds 5 % per pass up to a cap.
+    """Moves transparent Gaussians onto opaque Gaussians and adds 5 % per pass up to a cap.
 
-    Needs no screen statistics: Gaussians are samples of a distribution that training explores by
-    noise of the positions, and two regularisers make those transparent and small that are of no
-    use. There is no clone, split, prune or opacity reset.
+    It needs no screen statistics. Gaussians are samples of a distribution that training explores by
+    noise on the positions. Two regularisers make useless Gaussians transparent and small. It does
+    not clone, split, prune or reset opacities.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
@@ -226,7 +229,7 @@ class MarkovChainMonteCarlo(Densifier):
 
     @hookimpl
     def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
-        """Moves the positions by noise; the moments stay."""
+        """Move the positions by noise and keep the moments."""
         strength = self.noise * context.means_lr
         rows, shifts = position_noise(context.parameters, strength, context.rng)
         if rows.shape[0] == 0:
@@ -236,7 +239,7 @@ class MarkovChainMonteCarlo(Densifier):
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
-        """Mean opacity and mean scale, once per step however many views it has."""
+        """Return mean opacity and mean scale as a loss, once per step for any number of views."""
         opacities, scales = context.parameters["opacities"], context.parameters["scales"]
         if context.gaussians is not None or opacities.shape[0] == 0:
             return None
@@ -244,7 +247,7 @@ class MarkovChainMonteCarlo(Densifier):
         return RegularizeResult(opacity + self.scale_weight * torch.exp(scales).mean())
 
     def _relocated(self, pool: Pool, rng: np.random.Generator) -> tuple[Pool, int]:
-        """The pool with dead primitives moved onto live ones, and how many were moved."""
+        """Return the pool with dead primitives moved onto live ones, and their number."""
         dead = pool.opacity <= self.dead_opacity
         live = (~dead).nonzero().squeeze(1)
         moved = int(dead.sum())
@@ -255,7 +258,7 @@ class MarkovChainMonteCarlo(Densifier):
         return pool.copied(index, self.dead_opacity), moved
 
     def _grown(self, pool: Pool, added: int, rng: np.random.Generator) -> Pool:
-        """The pool with `added` copies, where there is anything to copy."""
+        """Return the pool with `added` copies; unchanged if no primitive can be copied."""
         if added == 0 or not bool((pool.opacity > 0.0).any()):
             return pool
         index = torch.arange(pool.opacity.shape[0], device=pool.opacity.device)
@@ -264,14 +267,14 @@ class MarkovChainMonteCarlo(Densifier):
 
 
 def drawn(weights: Tensor, number: int, rng: np.random.Generator) -> Tensor:
-    """[number] int64 indices, drawn independently with probability proportional to weights [M]."""
+    """Return [number] int64 random indices, with probability proportional to weights [M]."""
     shares = weights.cpu().numpy()
     indices = rng.choice(shares.shape[0], number, p=shares / shares.sum())
     return torch.from_numpy(indices).to(weights.device)
 
 
 def _edit_of(pool: Pool, log_scales: Tensor, counts: dict[str, int]) -> Edit:
-    """The pool as an edit; everything that shares a source starts with zero moments."""
+    """Return the pool as an edit; primitives that share a source start with zero moments."""
     if not bool(pool.touched.any()):
         return Edit(counts=counts) if any(counts.values()) else NO_EDIT
     rows = pool.touched.nonzero().squeeze(1)

@@ -26,20 +26,21 @@ from crossgrad_plugins.densifiers.absgrad import gradient_sums
 from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth, Plan, edited_parameters
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Shortest interval of edits, in views (the published one of the larger variant).
+#: Shortest interval between edits, in views (the published interval of the larger variant).
 SHORTEST_INTERVAL = 100
-#: How many of the late prunings are done.
+#: Key of the number of late prunings that are done.
 LATE = "late"
 
 
 class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
-    """Clones and splits only what several views ask for; prunes by what they say, early and late.
+    """Clones and splits by the errors of several views; prunes by these errors, early and late.
 
-    A Gaussian grows where it is blended in more than `importance` erroneous pixels of a view on
-    average: cloned by the norm of its mean gradient, split by that of its absolute gradient. Of
-    the usual candidates for pruning a share goes, drawn with weights that grow with its share in
-    the error. Once density control is over, what is faint or has nearly the largest error is
-    removed at some points of the run. For anchors: densifier `multiview-gate`.
+    A Gaussian may grow if it is blended in more than `importance` erroneous pixels of a view on
+    average. It is cloned by the norm of its mean gradient, and split by the norm of its absolute
+    gradient. Only a share of the usual pruning candidates is removed; candidates are drawn with
+    weights that increase with their share in the error. After density control has ended, Gaussians
+    that are faint or have nearly the largest error are removed at some points of the run. For
+    anchors: densifier `multiview-gate`.
     """
 
     needs = frozenset({"abs_gradient", "count"})
@@ -110,7 +111,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
         return edit, state
 
     def _capped(self, context: DensifyContext, edit: Edit) -> Edit:
-        """The edit with no opacity above the cap; those below it keep their moments."""
+        """Return the edit with opacities limited to the cap; lower opacities keep their moments."""
         if self.cap_opacity == 1.0 or "opacities" in edit.values:
             return edit  # A reset has a lower cap.
         after = edited_parameters(context, edit)
@@ -122,7 +123,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
         return replace(edit, values=values, counts={**edit.counts, "capped": len(rows)})
 
     def _pruned_late(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
-        """Removes what is faint and what has nearly the largest error, where that is due."""
+        """Remove faint primitives and primitives with nearly the largest error, if it is due."""
         schedule = context.schedule
         reached = schedule.counted(context.step) / schedule.length
         due = sum(share <= reached for share in self.late_prunings) if schedule.grows else 0
@@ -140,10 +141,10 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
 
 
 def some_of(candidates: Tensor, score: Tensor, share: float, rng: np.random.Generator) -> Tensor:
-    """[M] bool, a share of the candidates [M], rounded up, drawn without replacement.
+    """Return [M] bool: a share of the candidates [M], rounded up, drawn without replacement.
 
-    One after the other is drawn with a probability in proportion to 1 / (1 - score), which is the
-    order of as many exponential numbers times 1 - score (Efraimidis and Spirakis 2006).
+    Candidates are drawn one by one with probability proportional to 1 / (1 - score). Sorting
+    exponential random numbers times 1 - score gives the same order (Efraimidis and Spirakis 2006).
     """
     rows = candidates.nonzero().squeeze(1)
     weight = 1.0 - score[rows].double().cpu().numpy()

@@ -1,4 +1,4 @@
-"""A gate in front of another densifier: only what several views ask for may grow (FastGS)."""
+"""A gate around another densifier: primitives grow only by the errors of several views (FastGS)."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,14 +24,14 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Names of what the gate remembers begin with this, those of the other densifier do not.
+#: Prefix of the names in the gate's state; names of the other densifier do not have it.
 OWN = "gate/"
-#: Hooks of a densifier that the gate answers for it.
+#: Hooks of the other densifier that the gate implements for it.
 _ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})
 
 
 def densifier_of(value: object) -> Densifier:
-    """A densifier from itself, from its name, or from `{name: ..., option: ...}`."""
+    """Return a densifier from itself, from its name, or from `{name: ..., option: ...}`."""
     if not isinstance(value, Densifier):
         choice = {"name": value} if isinstance(value, str) else value
         if not isinstance(choice, Mapping) or "name" not in choice:
@@ -48,11 +48,11 @@ def densifier_of(value: object) -> Densifier:
 
 
 class MultiViewGate(CountsMarkedPixels):
-    """Lets another densifier grow only where several views ask for it.
+    """Lets another densifier grow only primitives that several views show to be erroneous.
 
-    A primitive may grow where its Gaussians are blended in more than `importance` erroneous pixels
-    of a view on average. How it grows, and what is pruned, is left to the other densifier:
-    `anchor` or `octree` for anchors, any that clones and splits for Gaussians.
+    A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels of
+    a view on average. The other densifier decides how it grows and which primitives are pruned:
+    `anchor` or `octree` for anchors, any densifier that clones and splits for Gaussians.
     """
 
     of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (
@@ -62,25 +62,25 @@ class MultiViewGate(CountsMarkedPixels):
     @property
     @override
     def needs(self) -> frozenset[str]:  # type: ignore[override]
-        """What the other one needs, and the count."""
+        """The statistics that the other densifier needs, and the count."""
         return self.of.needs | {"count"}
 
     @property
     @override
     def tensors(self) -> frozenset[str]:  # type: ignore[override]
-        """Those that the other one edits."""
+        """The tensors that the other densifier edits."""
         return self.of.tensors
 
     @property
     @override
     def resets(self) -> bool:  # type: ignore[override]
-        """Whether the other one resets opacities."""
+        """Whether the other densifier resets opacities."""
         return self.of.resets
 
     @property
     @override
     def observes(self) -> bool:  # type: ignore[override]
-        """Whether any of both gathers statistics of views."""
+        """Whether the gate or the other densifier gathers statistics of views."""
         return self.count == "running" or self.of.observes
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
@@ -114,7 +114,7 @@ class MultiViewGate(CountsMarkedPixels):
         return edit, _joined(own, inner)
 
     def _check(self, edit: Edit, may_grow: Tensor) -> None:
-        """Refuses growth of what may not grow."""
+        """Raise an error if a primitive grew that may not grow."""
         if edit.source is None or edit.fresh is None:
             return
         if not bool(may_grow[edit.source[edit.fresh]].all()):
@@ -127,7 +127,7 @@ class MultiViewGate(CountsMarkedPixels):
 
 
 def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
-    """The part of the gate and that of the other densifier."""
+    """Return the gate's part of a state and the other densifier's part."""
     own, inner = (
         {
             part: {
@@ -143,6 +143,6 @@ def _parted(state: PluginState) -> tuple[PluginState, PluginState]:
 
 
 def _joined(own: PluginState, inner: PluginState) -> PluginState:
-    """One state of both parts."""
+    """Return one state that contains both parts."""
     per_primitive = {OWN + name: rows for name, rows in own.per_primitive.items()}
     return replace(inner, per_primitive={**inner.per_primitive, **per_primitive})

@@ -12,11 +12,11 @@ from crossgrad_plugins.densifiers.clone_split import AxisSplit, Growth
 class PixelDensityControl(AxisSplit):
     """Adaptive density control whose statistic is weighted by pixels and scaled by depth.
 
-    A render in which a Gaussian fills many pixels counts for more: the statistic is
-    sum(m f |g|) / sum(m) with m the pixels in which it was blended, g the NDC gradient of its
-    projected mean and f = min(1, (z / depth_threshold)^2), which holds back what floats in front of
-    a camera (z is the depth of its centre). Only this statistic is scaled, never the gradients that
-    train. Source: Pixel-GS.
+    A render in which a Gaussian fills many pixels has a larger weight. The statistic is sum(m f
+    |g|) / sum(m). m is the number of pixels in which the Gaussian was blended, and g the NDC
+    gradient of its projected mean. f = min(1, (z / depth_threshold)^2) with the depth z of the
+    centre reduces the growth of floaters in front of a camera. Only this statistic is scaled; the
+    training gradients are not. Source: Pixel-GS.
     """
 
     needs = frozenset({"pixels"})
@@ -39,7 +39,7 @@ class PixelDensityControl(AxisSplit):
         return PluginState(per_primitive=totals)
 
     def _nearness(self, record: ViewRecord) -> Tensor:
-        """[N] in [0, 1], the factor f of each Gaussian in this view."""
+        """Return [N] in [0, 1], the factor f of each Gaussian in this view."""
         means = record.gaussians.means
         pose = record.view.camera.world_to_camera.to(means, non_blocking=True)
         x, y, z = means.unbind(1)

@@ -1,4 +1,4 @@
-"""Revising Densification: growth where the picture errs (Rota Bulò et al. 2024, 2404.06109)."""
+"""Revising Densification: growth at large image errors (Rota Bulò et al. 2024, 2404.06109)."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -31,7 +31,7 @@ ErrorKind = Literal["ssim", "l1"]
 
 
 def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
-    """At most `most` of `number` views, one drawn uniformly from each of equal runs of them."""
+    """Return at most `most` of `number` views, a random one from each of `most` equal ranges."""
     if number <= most:
         return list(range(number))
     edges = np.linspace(0, number, most + 1).astype(np.int64)
@@ -39,15 +39,15 @@ def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
 
 
 def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKind) -> Tensor:
-    """[P] the largest share that each primitive has in the error of any of the views, pixels.
+    """Return [P] the largest share of each primitive in the error of any of the views, in pixels.
 
-    The views are drawn with the current parameters, through the exposure; the whole costs two
-    renders and one backward pass per view.
+    The views are rendered with the current parameters and the exposure. This costs two renders and
+    one backward pass per view.
 
     Args:
-        context: With the parameters and the rasterizer.
+        context: The step, with the parameters and the rasterizer.
         views: Positions in `scene.train_views`.
-        kind: What the error of a pixel is.
+        kind: The kind of pixel error.
     """
     blocks = context.backbone.blocks()
     name = next(block.tensors[0] for block in blocks if block.per_primitive)
@@ -67,7 +67,7 @@ def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKin
 
 
 def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: ErrorKind) -> Tensor:
-    """[H, W] error of each pixel, averaged over the channels; 0 where the photo is masked out.
+    """Return [H, W] error of each pixel, mean over channels; 0 where the photo is masked out.
 
     Args:
         image: [H, W, 3], the render of the view.
@@ -82,10 +82,10 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
 
 
 def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error: Tensor) -> Tensor:
-    """[N] sum over pixels of the Gaussian's blending weight times the pixel's error.
+    """Return [N] sums over pixels of the Gaussian's blending weight times the pixel's error.
 
-    A pixel is the sum of weight times colour, so this is the gradient by the colour (of one
-    channel) of the sum over pixels of image times error.
+    A pixel is the sum of weight times colour. So the result is the gradient of the sum over pixels
+    of image times error, by the colour of one channel.
     """
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     plain = replace(gaussians, colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)
@@ -98,18 +98,18 @@ def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error
 
 #: Density control ends after 27,000 of 30,000 steps (published).
 LAST_EDIT_SHARE = 27 / 30
-#: Opacities are not lowered below this.
+#: Opacities are not lowered below this value.
 LEAST_OPACITY = 1e-6
-#: Logits below this are those of opacities that halve to float32's rounding.
+#: Below this logit, the shared opacity equals half the opacity up to float32 rounding.
 _FAINT = -15.0
 
 
 class RevisingDensification(CloneSplit):
     """Clones and splits the Gaussians that have the largest share in the error of some view.
 
-    The share is measured when an edit is due, with the current parameters, over views that are
-    spread over the training views. Clones and children share their opacity, and instead of
-    opacity resets all opacities are lowered a little at every edit.
+    The share is measured when an edit is due. The measurement uses the current parameters and views
+    that are spread over the training views. Clones and children share their opacity. Instead of
+    opacity resets, every edit lowers all opacities a little.
     """
 
     observes: ClassVar[bool] = False
@@ -162,13 +162,13 @@ class RevisingDensification(CloneSplit):
 
 
 def halved_logits(logits: Tensor) -> Tensor:
-    """Logits [R] of o' = 1 - sqrt(1 - o): two such copies are together as opaque as one."""
+    """Return logits [R] of o' = 1 - sqrt(1 - o); two copies with o' are as opaque as one."""
     transparency = logsigmoid(-logits) / 2  # log of sqrt(1 - o)
     shared = torch.log(-torch.expm1(transparency)) - transparency
     return torch.where(logits < _FAINT, logits - log(2.0), shared)
 
 
 def lowered_logits(logits: Tensor, decrease: float) -> Tensor:
-    """Logits [P] of opacities less `decrease`; nothing is raised to the least opacity."""
+    """Return logits [P] of opacities minus `decrease`; no opacity is raised to the minimum."""
     lowered = (sigmoid(logits) - decrease).clamp(min=LEAST_OPACITY)
     return torch.minimum(logits, torch.logit(lowered))

@@ -1,4 +1,4 @@
-"""The PLY file of 3DGS, which every viewer of Gaussians opens."""
+"""The PLY file of 3DGS, which all viewers of Gaussians can open."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Plain spherical-harmonics Gaussians as arrays, in the units in which files store them."""
+"""Gaussians with spherical harmonics as arrays, in the units of the files."""
 
 from dataclasses import dataclass, replace
 from math import log
@@ -13,11 +13,12 @@ from crossgrad_core.numerics.elementwise import sigmoid
 from crossgrad_core.numerics.raster_constants import SH_C0
 from crossgrad_core.plugin import Gaussians, Similarity
 
-#: Coefficients of bands 1 to 3.
+#: Number of coefficients of bands 1 to 3.
 REST = 15
 
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
-#: Keeps the logit of an opacity of exactly 0 or 1 finite; float32 has no value nearer to 1.
+#: Keeps the logit of an opacity of exactly 0 or 1 finite; 1 minus this is the largest float32 below
+#: 1.
 _OPACITY_MARGIN = 2.0**-24
 
 #: How viewers should draw the Gaussians: the 3DGS way, or antialiased as Mip-Splatting.
@@ -51,7 +52,7 @@ class SplatCloud:
 
     @property
     def sh_degree(self) -> int:
-        """The highest degree with a coefficient that is not zero."""
+        """The highest degree with a non-zero coefficient."""
         for degree in (3, 2, 1):
             if np.any(self.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1]):
                 return degree
@@ -59,7 +60,7 @@ class SplatCloud:
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> "SplatCloud":
-        """The Gaussians of a backbone; bands above their active degree become zero."""
+        """Return the Gaussians of a backbone; bands above their active degree become zero."""
         opacities = _array(gaussians.opacities).reshape(-1)
         opacities = np.clip(opacities, _OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)
         scales = np.maximum(_array(gaussians.scales), _SMALLEST_SCALE)
@@ -74,9 +75,10 @@ class SplatCloud:
         )
 
     def to_gaussians(self) -> Gaussians:
-        """float32 Gaussians on the CPU with the bands that are in use.
+        """Return float32 Gaussians on the CPU with the bands that are in use.
 
-        Map a georeferenced cloud `to_local` first: float32 cannot hold its coordinates.
+        Map a georeferenced cloud with `to_local` first, because float32 cannot represent its
+        coordinates.
         """
         degree = self.sh_degree
         return Gaussians(
@@ -91,15 +93,15 @@ class SplatCloud:
         )
 
     def to_input(self, similarity: Similarity) -> "SplatCloud":
-        """The cloud of a local frame in the input frame."""
+        """Map a cloud of the local frame to the input frame."""
         return self._mapped(similarity.to_input(self.means), -log(similarity.scale))
 
     def to_local(self, similarity: Similarity) -> "SplatCloud":
-        """The cloud of an input frame in the local frame."""
+        """Map a cloud of the input frame to the local frame."""
         return self._mapped(similarity.to_local(self.means), log(similarity.scale))
 
     def selected(self, rows: NDArray[np.bool_]) -> "SplatCloud":
-        """The Gaussians that are marked in `rows` [N]."""
+        """Return the Gaussians that are marked in `rows` [N]."""
         return replace(
             self,
             means=self.means[rows],
@@ -111,7 +113,7 @@ class SplatCloud:
         )
 
     def _mapped(self, means: NDArray[np.float64], log_scale: float) -> "SplatCloud":
-        # The similarity has no rotation, so quaternions and spherical harmonics stay.
+        # The similarity has no rotation, so quaternions and spherical harmonics do not change.
         log_scales = (self.log_scales.astype(np.float64) + log_scale).astype(np.float32)
         return replace(self, means=means, log_scales=log_scales)
 
@@ -122,7 +124,7 @@ def _array(tensor: Tensor) -> NDArray[np.float64]:
 
 
 def _constant_band(gaussians: Gaussians) -> NDArray[np.float64]:
-    """[N, 3] band 0; RGB colours are the same from everywhere and need no other band."""
+    """Return [N, 3] band 0; RGB colours are equal in all directions and need no other band."""
     if gaussians.colors is not None:
         return (_array(gaussians.colors) - 0.5) / SH_C0
     if gaussians.sh_dc is None:

@@ -1,7 +1,7 @@
 """Standard 3DGS PLY files (Inria property order), as the usual viewers read them.
 
-Source: 3DGS; the order `x y z nx ny nz f_dc f_rest opacity scale rot`, float32 little-endian.
-`f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
+Source: 3DGS. The properties are `x y z nx ny nz f_dc f_rest opacity scale rot`, float32
+little-endian. `f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
 """
 
 import re
@@ -24,7 +24,7 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.exporters.ply_cloud import REST, RenderMode, SplatCloud
 
-#: Property names in the order in which they are written.
+#: Property names in the order of the file.
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz"),
     *(f"f_dc_{i}" for i in range(3)),
@@ -34,16 +34,16 @@ PROPERTIES = (
     *(f"rot_{i}" for i in range(4)),
 )
 _NEEDED = tuple(name for name in PROPERTIES if not name.startswith(("n", "f_rest_")))
-#: Rounding of positions to float32 may move a Gaussian by this much, in local units.
+#: Largest error of positions from rounding to float32, in local units.
 POSITION_TOLERANCE = 1e-6
 
 _OFFSET_TAG = "crossgrad_offset:"
 _MODE_TAG = "SplatRenderMode:"
 _CHUNK = 65_536
 _LARGEST = float(np.finfo(np.float32).max)
-#: Natural logarithm of the largest size; float32 ends at e^88.
+#: Natural logarithm of the largest size; the limit of float32 is about e^88.
 _LARGEST_LOG_SCALE = 80.0
-#: Lengths of a rotation whose square float32 can hold.
+#: Range of the length of a rotation, so that float32 can represent its square.
 _ROTATION_LENGTHS = (1e-18, 1e18)
 _OFFSET = re.compile(r"\s+".join([r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"] * 3))
 _IDENTITY = Similarity(np.zeros(3), 1.0)
@@ -55,11 +55,11 @@ def write_ply(
     similarity: Similarity = _IDENTITY,
     comments: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Writes a cloud of the local frame in input coordinates; the file appears complete.
+    """Write a cloud of the local frame in input coordinates; the file appears only when complete.
 
-    Where the input coordinates are so large (UTM, ECEF) that float32 would move Gaussians by more
-    than 1e-6 local units, positions are written relative to a rounded offset, which stands in a
-    comment `crossgrad_offset: x y z` and is applied by `read_ply`.
+    Large input coordinates (UTM, ECEF) can be too coarse in float32. If rounding would move
+    Gaussians by more than 1e-6 local units, positions are written relative to a rounded offset. The
+    offset is written to a comment `crossgrad_offset: x y z`, and `read_ply` adds it again.
 
     Args:
         path: The file.
@@ -68,10 +68,10 @@ def write_ply(
         comments: Further lines for the header, plain text.
 
     Returns:
-        What the user should know about the file, one sentence each; usually nothing.
+        Notes about the file for the user, one sentence each; usually empty.
 
     Raises:
-        UserError: The disk is full or the folder may not be written to.
+        UserError: The disk is full or the folder is not writable.
     """
     notes = []
     offset = position_offset(similarity)
@@ -94,7 +94,7 @@ def write_ply(
 
 
 def position_rounding(cloud: SplatCloud, similarity: Similarity) -> Rounding:
-    """How `write_ply` keeps the positions of a cloud."""
+    """Return the offset and the largest rounding error of positions in `write_ply`."""
     offset = position_offset(similarity)
     moved = cloud.to_input(Similarity(similarity.offset - offset, similarity.scale))
     means = moved.selected(_representable(moved)).means
@@ -103,10 +103,10 @@ def position_rounding(cloud: SplatCloud, similarity: Similarity) -> Rounding:
 
 
 def position_offset(similarity: Similarity) -> NDArray[np.float64]:
-    """[3] what to subtract from input coordinates before they are rounded to float32.
+    """Return [3] the offset to subtract from input coordinates before rounding to float32.
 
-    Zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`; else the centre
-    of the scene, rounded to a power of ten of at most one local unit.
+    The offset is zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`.
+    Otherwise it is the centre of the scene, rounded to a power of ten of at most one local unit.
     """
     largest = np.float32(np.abs(similarity.offset).max())
     error = 0.5 * float(np.spacing(largest)) * similarity.scale  # local units
@@ -118,14 +118,14 @@ def position_offset(similarity: Similarity) -> NDArray[np.float64]:
 
 
 def read_ply(path: Path) -> SplatCloud:
-    """Reads Gaussians by property name: any order and types, with or without normals, degree 0-3.
+    """Read Gaussians by property name: any order and types, with or without normals, degree 0-3.
 
     Returns:
-        The cloud in the frame of the file, its `crossgrad_offset` applied.
+        The cloud in the frame of the file, with `crossgrad_offset` added.
 
     Raises:
-        UserError: Not a PLY file, no Gaussians in it, ends too early, holds non-finite numbers, or
-            is in other coordinates than a scene's input.
+        UserError: The file is not a PLY file, has no Gaussians, is truncated, has non-finite
+            numbers, or has other coordinates than a scene's input.
     """
     vertices = read_vertices(path)
     _check_coordinates(vertices.comments, path)
@@ -158,10 +158,11 @@ def read_ply(path: Path) -> SplatCloud:
 
 
 def sh_degree_of(path: Path) -> int:
-    """The SH degree that a PLY of Gaussians holds, from its header alone.
+    """Return the SH degree of a PLY file of Gaussians, from its header alone.
 
     Raises:
-        UserError: Not a PLY file, no Gaussians in it, or an unusual number of coefficients.
+        UserError: The file is not a PLY file, has no Gaussians, or has an unusual number of
+            coefficients.
     """
     properties = vertex_properties(path)
     _require_properties(properties, path)
@@ -169,7 +170,7 @@ def sh_degree_of(path: Path) -> int:
 
 
 def _plain(value: float) -> str:
-    """A number without exponent or needless digits; float(text) gives the same bits."""
+    """Return a number without exponent or needless digits; float(text) gives the same bits."""
     return np.format_float_positional(value, trim="-")
 
 
@@ -181,7 +182,7 @@ def _header(count: int, comments: Sequence[str]) -> bytes:
 
 
 def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
-    """[N] Gaussians whose every number is finite in float32."""
+    """Return [N] bool: Gaussians whose values are all finite in float32."""
     valid = (np.abs(cloud.means) <= np.finfo(np.float32).max).all(axis=1)
     valid &= np.isfinite(cloud.logit_opacities)
     for array in (cloud.log_scales, cloud.quats, cloud.sh_dc, cloud.sh_rest):
@@ -190,7 +191,7 @@ def _representable(cloud: SplatCloud) -> NDArray[np.bool_]:
 
 
 def _rows(cloud: SplatCloud, part: slice) -> NDArray[np.float32]:
-    """[n, 62] little-endian rows of the table."""
+    """Return [n, 62] little-endian rows of the table."""
     means = cloud.means[part]
     count = len(means)
     columns = (
@@ -266,7 +267,7 @@ def _require_properties(names: Collection[str], path: Path) -> None:
 
 
 def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float) -> None:
-    # More than float32 can work with counts as infinite; NaN fails the comparison too.
+    # Values beyond the range of float32 count as infinite; NaN fails the comparison too.
     with np.errstate(invalid="ignore"):  # a signalling NaN
         numbers = column.astype(np.float64)
     valid = (numbers >= -_LARGEST) & (numbers <= top)

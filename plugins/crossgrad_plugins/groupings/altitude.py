@@ -29,9 +29,9 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Altitude(Grouping):
-    """near: cameras below a height; far: those above it.
+    """near: cameras up to a height; far: cameras above it.
 
-    Source: the paper, altitude thresholds; the choice of the axis and of the cut is ours.
+    Source: the paper, altitude thresholds; the choice of the axis and of the threshold is ours.
     """
 
     up: Literal["auto", "cameras", "pca"] | tuple[float, float, float] = Field(

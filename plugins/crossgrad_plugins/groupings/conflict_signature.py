@@ -29,19 +29,19 @@ from crossgrad_plugins.groupings.split import (
     smaller_mean_first,
 )
 
-#: Eigenvalues of a cosine matrix that are closer than this are one, split by rounding.
+#: Eigenvalues of a cosine matrix that are closer than this are equal up to rounding.
 _SMALLEST_GAP = 1e-9
 
 
 class ConflictSignature(Regrouping):
-    """The two sides of the spectral cut of the cosines between the cameras' gradients.
+    """Two groups of cameras from a spectral cut of the cosines between their gradients.
 
-    Gradients are normalised per block, their cosines averaged over blocks; (1 + cosine) / 2 is the
-    similarity. The side with the smaller mean radial distance is near. A view that was not probed
-    has the label of the nearest probed camera. Until there are gradients to look at, after step
-    `at`, the views are grouped as by `radial`.
+    Gradients are normalised per block, and their cosines are averaged over blocks. The similarity
+    is (1 + cosine) / 2. The group with the smaller mean radial distance is near. A view that was
+    not probed has the label of the nearest probed camera. Until step `at`, when gradients become
+    available, the views are grouped as by `radial`.
 
-    Source: the paper names it without a definition; this one is ours.
+    Source: the paper names this grouping without a definition; the definition is ours.
     """
 
     needs_probe: ClassVar[bool] = True
@@ -89,15 +89,16 @@ class ConflictSignature(Regrouping):
         try:
             return self.fit(model.scene, rng, ModelProbe(model, rng))
         except UserError as error:
-            # Gradients that all agree make one group; a run goes on with those it has.
+            # Gradients that all agree form one group; the run then keeps its present groups.
             early = Radial().fit(model.scene, rng)
             return GroupingRule(early.labels, (f"the groups stay as they are: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, V] cosines averaged over the blocks of the Gramians [B, V, V].
+    """Return [V, V] cosines averaged over the blocks of the Gramians [B, V, V].
 
-    A pair with a zero gradient has no cosine in that block; a pair without any has cosine 0.
+    A pair with a zero gradient has no cosine in that block. A pair without any cosine gets cosine
+    0.
     """
     norms = np.sqrt(np.einsum("bii->bi", gramians))
     products = norms[:, :, None] * norms[:, None, :]
@@ -107,20 +108,21 @@ def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[V] side 0 or 1 by the sign of the second eigenvector of the normalised Laplacian.
+    """Return [V] side 0 or 1, by the sign of the second eigenvector of the normalised Laplacian.
 
-    All on side 0 where no direction is second: one camera, or cameras that are all alike.
+    All cameras are on side 0 if there is no second direction: one camera, or identical cameras.
 
     Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
     """
     similarity = (1.0 + cosines) / 2.0
     root = np.sqrt(similarity.sum(axis=1))
-    # The second smallest eigenvalue of I - S is the second largest of S, whose largest, 1, is known
-    # with its vector. Two groups that share nothing have 1 twice: without it the other one is left.
+    # The second smallest eigenvalue of I - S is the second largest of S. The largest eigenvalue of
+    # S is 1, with a known eigenvector. Two groups without any similarity have the eigenvalue 1
+    # twice; removing the known eigenvector leaves the other one.
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
-    # The known one is -1 now: of the others none is less. Two cameras that are alike leave 0.
+    # The known eigenvalue is -1 now, and no other is smaller. For two identical cameras 0 remains.
     if len(values) == 1 or min(values[-1], values[-1] - values[-2]) <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
     return (vectors[:, -1] > 0.0).astype(np.int64)

@@ -33,9 +33,9 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Radial(Grouping):
-    """near where the distance from the mean training camera is at most its median, else far.
+    """near: distance from the mean training camera up to its median; far: larger distances.
 
-    Source: the paper, median radial split; Otsu's cut is ours.
+    Source: the paper, median radial split; Otsu's threshold is ours.
     """
 
     cut: Cut = Field("median", description=CUT)
@@ -52,10 +52,10 @@ class Radial(Grouping):
 
 
 class Percentile(Grouping):
-    """near where the distance from the mean training camera is at most its q-th percentile.
+    """near: cameras up to the q-th percentile of the distance from the mean camera; far: the rest.
 
-    Balanced pairs then estimate (near mean + far mean) / 2, not the mean over cameras: for q away
-    from 50 that is another objective, not only another variance.
+    Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
+    is not 50, this is a different objective, not only a different variance.
 
     Source: the paper, partition threshold study (30 and 70).
     """
@@ -76,7 +76,7 @@ class Percentile(Grouping):
 
 
 class Terciles(Grouping):
-    """near, middle and far: the thirds of the distance from the mean training camera.
+    """near, middle and far: thirds of the distance from the mean training camera.
 
     Source: the paper, 3-way groups.
     """
@@ -95,9 +95,9 @@ class Terciles(Grouping):
 
 
 class Anchors(Grouping):
-    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: the others.
+    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: the rest.
 
-    The middle may be empty in a scene of very few cameras; near and far may not.
+    The middle may be empty in a scene with very few cameras; near and far may not.
 
     Source: the paper, operator variants.
     """
@@ -120,7 +120,7 @@ class Anchors(Grouping):
 def rule_by_shares(
     scene: Scene, grouping: str, share: float, needed: Sequence[str]
 ) -> GroupingRule:
-    """Near up to quantile `share` of the radial distance, far beyond quantile 1 - share.
+    """Return the rule: near up to quantile `share` of the radial distance, far above 1 - share.
 
     Args:
         scene: The scene.

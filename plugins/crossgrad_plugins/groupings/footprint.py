@@ -1,4 +1,4 @@
-"""How large the scene appears: pixels per local unit."""
+"""Groups of cameras by how large the scene appears, in pixels per local unit."""
 
 from collections.abc import Sequence
 
@@ -31,14 +31,14 @@ from crossgrad_plugins.groupings.split import (
 
 
 class Footprint(Grouping):
-    """near: views that draw a local unit over at least the median number of pixels; far: the rest.
+    """near: views that show a local unit with at least the median number of pixels; far: the rest.
 
-    The measure of a view is the median of f/z over the SfM points that it observed, or over those
-    in its image where it observed fewer than three; where there are none either, that of the
-    nearest training camera that has one. It uses the focal length and needs no layout of cameras
-    around a centre.
+    The measure of a view is the median of f/z over the SfM points that the view observed. If it
+    observed fewer than three, all SfM points in its image are used. If there are none either, the
+    view gets the measure of the nearest training camera that has one. The measure includes the
+    focal length and does not assume cameras around a centre.
 
-    Source: the paper, projected footprint; Otsu's cut and what stands in are ours.
+    Source: the paper, projected footprint; Otsu's threshold and the fallbacks are ours.
     """
 
     cut: Cut = Field("median", description=CUT)
@@ -60,7 +60,7 @@ class Footprint(Grouping):
         known, places = own[~blind], scene.centers[~blind]
 
         def sizes(views: Sequence[View]) -> NDArray[np.float64]:
-            """[V] small where a view is near, as halves() calls it."""
+            """Return [V] negative footprints; small values are near, as `halves` requires."""
             return -_filled(_own(scene, views), views, known, places)
 
         train = sizes(scene.train_views)
@@ -77,7 +77,7 @@ class Footprint(Grouping):
 
 
 def _own(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] footprints; NaN where a view shows no SfM point."""
+    """Return [V] footprints; NaN if a view shows no SfM point."""
     return np.array([footprint_of(scene, view) for view in views])
 
 
@@ -87,7 +87,7 @@ def _filled(
     known: NDArray[np.float64],
     places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """[V] footprints [V], that of the nearest of the cameras at `places` [N, 3] for NaN."""
+    """Return [V] footprints; NaN becomes the value of the nearest camera at `places` [N, 3]."""
     for place, view in enumerate(views):
         if np.isnan(found[place]):
             ways = np.linalg.norm(places - centers_of((view,)), axis=1)

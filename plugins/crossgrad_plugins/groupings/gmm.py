@@ -1,4 +1,4 @@
-"""A two-component Gaussian mixture of log-distances."""
+"""Groups of cameras by a two-component Gaussian mixture of log-distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,18 +21,19 @@ from crossgrad_plugins.groupings.distance import Radial
 from crossgrad_plugins.groupings.split import FAR, NEAR, log_distances, require_training_views
 
 _VARIANCE_FLOOR = 1e-6
-#: A mixture begins with two cameras.
+#: A mixture needs at least two cameras.
 _FEWEST = 2
 _ITERATIONS = 500
 _TOLERANCE = 1e-10
 
 
 class GaussianMixture(Grouping):
-    """The two components of a mixture fitted to log r; near has the smaller mean.
+    """The two components of a mixture fitted to log r; near is the component with the smaller mean.
 
-    Falls back to the median (grouping `radial`), with a note, where the fit is degenerate: a
-    component weighs less than one camera, gets no camera, or a figure is not finite. A camera that
-    stands at the mean of all has no logarithm: it is near, and left out of the fit.
+    If the fit is degenerate, the median is used (grouping `radial`), with a note. A fit is
+    degenerate if a component weighs less than one camera, if it gets no camera, or if a number is
+    not finite. A camera at the mean of all cameras has no logarithm: it is near, and is left out of
+    the fit.
 
     Source: expectation maximisation (Dempster et al. 1977) in one dimension.
     """
@@ -70,14 +71,14 @@ class _Mixture:
     likelihood: float
 
     def labels(self, distances: NDArray[np.float64]) -> tuple[str, ...]:
-        """The more probable component of each distance [V]."""
+        """Return the label of the more probable component for each distance [V]."""
         nowhere = distances == 0.0
         near, far = _log_joint(np.log(np.where(nowhere, 1.0, distances)), self).T
         return tuple(NEAR if is_near else FAR for is_near in (near >= far) | nowhere)
 
 
 def _fit(logs: NDArray[np.float64], restarts: int, rng: np.random.Generator) -> _Mixture | None:
-    """The most likely of several fits; None where none is usable."""
+    """Return the most likely of several fits, or None if no fit is usable."""
     if len(logs) < _FEWEST or (spread := float(logs.var())) == 0.0:
         return None
     fits = [_expectation_maximisation(logs, spread, rng) for _ in range(restarts)]
@@ -93,7 +94,7 @@ def _usable(mixture: _Mixture, cameras: int) -> bool:
 def _expectation_maximisation(
     logs: NDArray[np.float64], spread: float, rng: np.random.Generator
 ) -> _Mixture:
-    """One fit from two random cameras as means."""
+    """Return one fit that starts with two random cameras as means."""
     starts = np.sort(rng.choice(logs, size=2, replace=False))
     mixture = _Mixture(np.full(2, 0.5), starts, np.full(2, spread), -np.inf)
     for _ in range(_ITERATIONS):
@@ -119,8 +120,8 @@ def _maximised(
     variance_floor: float,
     likelihood: float,
 ) -> _Mixture:
-    """The mixture with the moments of the cameras' shares [N, 2]."""
-    # A component that no camera belongs to keeps finite figures and is refused by its weight.
+    """Return the mixture with the weighted moments of the cameras; shares [N, 2] are weights."""
+    # A component without any camera keeps finite numbers; `_usable` rejects it by its weight.
     totals = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
     means = (shares * logs[:, None]).sum(axis=0) / totals
     squares = (shares * (logs[:, None] - means) ** 2).sum(axis=0) / totals
@@ -129,7 +130,7 @@ def _maximised(
 
 
 def _log_joint(logs: NDArray[np.float64], mixture: _Mixture) -> NDArray[np.float64]:
-    """[V, 2] log of weight times density."""
+    """Return [V, 2] log of weight times density."""
     squared = (logs[:, None] - mixture.means) ** 2 / mixture.variances
     constant = np.log(mixture.weights) - 0.5 * np.log(2.0 * np.pi * mixture.variances)
     return np.asarray(constant - 0.5 * squared)

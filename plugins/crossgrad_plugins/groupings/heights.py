@@ -8,29 +8,30 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Scene, UserError, View, centers_of, without_rounding
 
-#: An axis, or where to take it from.
+#: An axis, or the method to find it.
 Up: TypeAlias = Literal["auto", "cameras", "pca"] | tuple[float, float, float]
 
-#: Below this length the mean of the cameras' unit up axes says nothing (they point everywhere).
+#: If the mean of the cameras' unit up axes is shorter than this, the axes point in all directions
+#: and the mean is not usable.
 _SHORTEST_MEAN = 0.1
 
 
 def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V] height of each camera along the unit axis `up` [3] over the mean training camera.
+    """Return [V] height of each camera over the mean training camera, along the unit axis `up` [3].
 
-    Equal heights are equal, as `radial_distances` has distances.
+    Rounding differences between equal heights are removed, as in `radial_distances`.
     """
-    # Not a matrix product: its rounding depends on the number of rows, and a median cut falls
-    # exactly on one of them.
+    # Not a matrix product: its rounding depends on the number of rows, and a median threshold
+    # equals one of the heights exactly.
     return without_rounding(scene, ((centers_of(views) - scene.middle) * up).sum(axis=1))
 
 
 def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:
-    """The scene's unit upward axis [3] in the local frame, and where it comes from.
+    """Return the scene's unit upward axis [3] in the local frame, and a text about its origin.
 
-    `cameras` is the mean of the training cameras' up axes (-y of OpenCV cameras); `pca` the axis of
-    least variance of their centres; `auto` takes the cameras' unless they cancel (cameras that look
-    straight down in all headings).
+    `cameras` is the mean of the training cameras' up axes (-y of OpenCV cameras). `pca` is the axis
+    of least variance of their centres. `auto` uses `cameras`, unless the up axes cancel (cameras
+    that look straight down in all headings).
 
     Raises:
         UserError: The given axis has no direction, or the cameras' up axes cancel.
@@ -67,9 +68,10 @@ def _given(up: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def _flattest(scene: Scene) -> NDArray[np.float64]:
-    """The axis of least variance of the training cameras' centres, cameras above what they see.
+    """Return the axis of least variance of the training cameras' centres.
 
-    Its sign puts the cameras above the SfM points or, where there are none, lets them look down.
+    The axis points so that the cameras are above the SfM points. Without SfM points, it points so
+    that the cameras look down.
     """
     spread = scene.robust_centers - scene.middle
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]

@@ -1,4 +1,4 @@
-"""Two clusters of camera positions."""
+"""Groups of cameras by two clusters of their positions."""
 
 from collections.abc import Sequence
 
@@ -59,13 +59,16 @@ class KMeans(Grouping):
 
 
 def _nearest(points: NDArray[np.float64], centroids: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[V] index of the nearest of the centroids [2, 3]."""
+    """Return [V] index of the nearest of the centroids [2, 3]."""
     squared = ((points[:, None, :] - centroids[None, :, :]) ** 2).sum(axis=2)
     return np.asarray(squared.argmin(axis=1))
 
 
 def _seeds(points: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """[2, 3] two of the points: the second with probability by squared distance from the first."""
+    """Return [2, 3] two of the points.
+
+    The probability of the second point is proportional to its squared distance from the first.
+    """
     first = points[int(rng.integers(len(points)))]
     squared = ((points - first) ** 2).sum(axis=1)
     total = float(squared.sum())
@@ -76,7 +79,7 @@ def _seeds(points: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.
 def _lloyd(
     points: NDArray[np.float64], centroids: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Centroids after convergence and the sum of squared distances from them."""
+    """Return the centroids after convergence, and the sum of squared distances from them."""
     for _ in range(_ITERATIONS):
         clusters = _nearest(points, centroids)
         if len(np.unique(clusters)) < len(centroids):

@@ -1,4 +1,4 @@
-"""Groups that the user names: folders of images, or lists of views."""
+"""Groups that the user defines: folders of images, or lists of views."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,10 +21,11 @@ from crossgrad_plugins.groupings.split import require_training_views
 
 
 class Lists(Grouping):
-    """Labels by the images' top folder, or by a file of the user.
+    """Labels by the images' top folder, or from a file of the user.
 
-    Without a file the label of `aerial/0001.jpg` is `aerial`. A file is CSV with two columns, view
-    name and label; a name that ends with a slash covers the folder.
+    Without a file, the label of `aerial/0001.jpg` is `aerial`. A file is CSV with two columns, view
+    name and label. A name that ends with a slash is a folder, and its label holds for all views in
+    it.
     """
 
     labels: ClassVar[tuple[str, ...]] = ()
@@ -51,10 +52,10 @@ class Lists(Grouping):
 
 
 def read_labels(path: Path) -> dict[str, str]:
-    """View name or folder (ending with a slash) -> label.
+    """Return the mapping of view name or folder (ending with a slash) to label.
 
     Raises:
-        UserError: The file is missing, a row has not two columns, or a name has two labels.
+        UserError: The file is missing, a row does not have two columns, or a name has two labels.
     """
     todo = "check the path; the file is text in UTF-8 with rows `name,label`"
     rows = [row for row in read_rows(path, "the list of labels", todo) if row]
@@ -83,12 +84,12 @@ def read_labels(path: Path) -> dict[str, str]:
 
 
 def _folder(name: str) -> str:
-    """The top folder of a view's name, empty where there is none."""
+    """Return the top folder of a view's name, or an empty text if there is none."""
     return name.split("/", 1)[0] if "/" in name else ""
 
 
 def _listed(name: str, table: Mapping[str, str], path: Path) -> str:
-    """The label of the view, or of the innermost listed folder that holds it."""
+    """Return the label of the view, or of the innermost listed folder that contains it."""
     if name in table:
         return table[name]
     parts = name.split("/")

@@ -1,4 +1,4 @@
-"""Labels from a threshold, the threshold, and the check that every group has views."""
+"""Labels from a threshold, the threshold itself, and the check that every group has views."""
 
 from collections.abc import Callable, Sequence
 from typing import Final, Literal, TypeAlias
@@ -8,26 +8,27 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import GroupingRule, Quantity, Scene, UserError, View, radial_distances
 
-#: Where a distance is cut in near and far: at the median, or where Otsu cuts its logarithm.
+#: The threshold between near and far: the median distance, or Otsu's threshold of its logarithm.
 Cut: TypeAlias = Literal["median", "otsu"]
 CUT: Final = "where near ends: the median, or Otsu's cut of the logarithms"
 NEAR, MIDDLE, FAR = "near", "middle", "far"
 
 
 def halves(values: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
-    """`near` where a value [V] is at most the threshold, else `far`."""
+    """Return `near` for each value [V] up to the threshold, else `far`."""
     return tuple(NEAR if value <= threshold else FAR for value in values)
 
 
 def rule_of_distances(
     scene: Scene, grouping: str, threshold_of: Callable[[NDArray[np.float64]], float | np.floating]
 ) -> GroupingRule:
-    """Labels `near` where the distance from the mean training camera is at most a threshold.
+    """Return the rule: `near` up to a threshold of the distance from the mean training camera.
 
     Args:
         scene: The scene.
         grouping: Name of the grouping.
-        threshold_of: The threshold, from the distances [V] of the training views.
+        threshold_of: Function that returns the threshold for the distances [V] of the training
+            views.
 
     Raises:
         UserError: There are no training views, or all are on one side.
@@ -41,14 +42,14 @@ def rule_of_distances(
 
 
 def cut_of(distances: NDArray[np.float64], cut: Cut) -> float:
-    """Where distances [V >= 1] are cut in two; those of 0 do not move Otsu's cut."""
+    """Return the threshold of distances [V >= 1]; distances of 0 do not affect Otsu's threshold."""
     if cut == "median" or not (distances > 0.0).any():
         return float(np.median(distances))
     return float(np.exp(otsu_threshold(np.log(distances[distances > 0.0]))))
 
 
 def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
-    """Logarithms of the distances from the mean training camera; none for one that stands there."""
+    """Return the logarithms of the distances from the mean training camera; -inf for distance 0."""
     distances = radial_distances(scene, views)
     logs = np.full(len(distances), -np.inf)
     np.log(distances, out=logs, where=distances > 0.0)
@@ -56,10 +57,10 @@ def log_distances(scene: Scene, views: Sequence[View]) -> Quantity:
 
 
 def require_training_views(scene: Scene, grouping: str) -> None:
-    """Refuses a scene without training views.
+    """Raise an error if a scene has no training views.
 
     Raises:
-        UserError: Nothing to fit the rule on.
+        UserError: There are no views to fit the rule on.
     """
     if not scene.train:
         raise UserError(
@@ -72,13 +73,13 @@ def require_training_views(scene: Scene, grouping: str) -> None:
 def require_groups(
     grouping: str, train_labels: Sequence[str], labels: Sequence[str], quantity: str
 ) -> None:
-    """Refuses a rule that leaves a group without training views.
+    """Raise an error if a rule leaves a group without training views.
 
     Args:
         grouping: Name of the grouping.
         train_labels: Labels of the training views.
-        labels: Every label that the rule can give.
-        quantity: What the rule looked at, for the message.
+        labels: Every label that the rule can return.
+        quantity: The quantity that the rule uses, for the message.
 
     Raises:
         UserError: A group is empty.
@@ -97,16 +98,21 @@ def require_groups(
 
 
 def smaller_mean_first(sides: NDArray[np.int64], distances: NDArray[np.float64]) -> int:
-    """Which of the sides 0 and 1 [V] has the smaller mean distance; 0 where one is empty."""
+    """Return the side, 0 or 1, with the smaller mean distance; 0 if one side is empty.
+
+    Args:
+        sides: [V] side of each view.
+        distances: [V] distance of each view.
+    """
     means = [float(distances[sides == side].mean()) for side in (0, 1) if (sides == side).any()]
     return int(np.argmin(means)) if len(means) == 2 else 0  # noqa: PLR2004 - both sides
 
 
 def otsu_threshold(values: NDArray[np.float64]) -> float:
-    """The cut between neighbouring values [N >= 1] with the least variance within both sides.
+    """Return the threshold between values [N >= 1] with the least variance within both sides.
 
-    Exact: every cut between two different sorted values is tried, there is no histogram. All values
-    equal: that value.
+    The result is exact: every cut between two different sorted values is tried, without a
+    histogram. If all values are equal, the result is that value.
 
     Source: Otsu 1979 (largest variance between classes).
     """
@@ -115,9 +121,10 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 
 
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[...] share of the variance of values [..., N >= 2] that lies between both sides of the cut.
+    """Return [...] share of the variance of values [..., N >= 2] between the two sides.
 
-    1 for two values, 3/4 for very many that are evenly spread; 0 where all values are equal.
+    The sides are those of Otsu's threshold. The share is 1 for two values, and 3/4 for very many
+    evenly spread values. It is 0 if all values are equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """
@@ -130,9 +137,9 @@ def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _between(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., N-1] N^2 times the variance between both sides of each cut of sorted values [..., N].
+    """Return [..., N-1] N^2 times the variance between the sides of each cut.
 
-    -1 where neighbours are equal.
+    Values [..., N] are sorted. The result is -1 for a cut between equal values.
     """
     sums, total = np.cumsum(ordered, axis=-1)[..., :-1], ordered.sum(axis=-1, keepdims=True)
     left = np.arange(1, ordered.shape[-1])
@@ -142,13 +149,16 @@ def _between(ordered: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def gap_threshold(values: NDArray[np.float64]) -> float:
-    """The middle of the widest gap between neighbouring sorted values [N >= 1]."""
+    """Return the middle of the widest gap between sorted values [N >= 1]."""
     ordered = np.sort(values)
     return _cut(ordered, np.where(np.diff(ordered) > 0.0, np.diff(ordered), -1.0))
 
 
 def _cut(ordered: NDArray[np.float64], scores: NDArray[np.float64]) -> float:
-    """The middle of the neighbours [N] with the best score [N-1]; the maximum where none is > 0."""
+    """Return the middle of the gap with the best score [N-1] between sorted values [N].
+
+    If no score is above 0, the result is the maximum value.
+    """
     if len(scores) == 0 or scores.max() <= 0.0:
         return float(ordered[-1])
     place = int(scores.argmax())

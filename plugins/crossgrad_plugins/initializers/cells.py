@@ -1,4 +1,4 @@
-"""A photo in square cells, also beyond its edges: their colours, and whether points cover them."""
+"""Square cells over a photo and beyond its edges, with mean colours and coverage by points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import Camera, View
 
-#: A Gaussian is taken to hide what lies within so many standard deviations.
+#: A Gaussian is assumed to hide the area within this number of standard deviations.
 _WITHIN = 2.0
-#: Of the longer side: what is larger is a wrong point, or soon smaller.
+#: Largest radius of a disc, as a share of the photo's longer side. A larger Gaussian is a wrong
+#: point, or soon becomes smaller.
 _LARGEST = 1.0 / 8.0
-#: A cell is covered where small Gaussians make up that share of its area.
+#: A cell is covered if small Gaussians fill this share of its area.
 _COVERED = 0.5
 
 
@@ -32,37 +33,37 @@ class Cells:
 
     @property
     def inner(self) -> tuple[int, int]:
-        """Rows and columns that lie on the photo, in part at least."""
+        """Number of rows and columns of cells that are at least partly on the photo."""
         return int(np.ceil(self.camera.height / self.size)), int(
             np.ceil(self.camera.width / self.size)
         )
 
     @cached_property
     def places(self) -> NDArray[np.int64]:
-        """[C, 2] column and row of each cell, those of the photo from 0 on."""
+        """[C, 2] column and row of each cell; the photo's cells are counted from 0."""
         rows, columns = (np.arange(-self.margin, count + self.margin) for count in self.inner)
         down, across = np.meshgrid(rows, columns, indexing="ij")
         return np.column_stack([across.ravel(), down.ravel()])
 
     @cached_property
     def pixels(self) -> NDArray[np.float64]:
-        """[C, 2] the middles of the cells; of those that the photo's edge cuts, on the photo."""
+        """[C, 2] centres of the cells; cells at the photo's edge have centres on the photo."""
         middles = (self.places + 0.5) * self.size
         ends = np.array([self.camera.width, self.camera.height]) - 0.5
         return np.where(self.on_photo[:, None], np.minimum(middles, ends), middles)
 
     @cached_property
     def on_photo(self) -> NDArray[np.bool_]:
-        """[C] whether a cell lies on the photo."""
+        """[C] whether a cell is on the photo."""
         rows, columns = self.inner
         across, down = self.places.T
         on_photo = (across >= 0) & (across < columns) & (down >= 0) & (down < rows)
         return np.asarray(on_photo, dtype=np.bool_)
 
     def colors(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """[C, 3] mean colours of the nearest cell of the photo, and [C] whether it has pixels.
+        """Return [C, 3] mean colours of the nearest cells on the photo, and [C] validity flags.
 
-        Pixels that do not count are left out.
+        A flag is True if that cell has pixels. Pixels that do not count are left out.
         """
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()
@@ -77,7 +78,7 @@ class Cells:
         return means.round().astype(np.uint8)[down, across], pixels[down, across, 0] > 0
 
     def _sums(self, image: NDArray[np.uint8]) -> NDArray[np.uint64]:
-        """[rows, columns, channels] sums of [H, W, channels] over the cells of the photo."""
+        """Return [rows, columns, channels] sums of [H, W, channels] over the cells of the photo."""
         down, across = (
             np.floor(np.arange(count) * self.size).astype(np.int64) for count in self.inner
         )
@@ -85,7 +86,12 @@ class Cells:
         return np.asarray(np.add.reduceat(lines, across, axis=1))
 
     def covered(self, points: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[C] whether Gaussians [P, 3] of standard deviations [P] cover a cell's middle."""
+        """Return [C] whether Gaussians cover the centre of each cell.
+
+        Args:
+            points: [P, 3] centres of the Gaussians.
+            sizes: [P] standard deviations of the Gaussians.
+        """
         pixels, depth = self.camera.project(points)
         radii = _WITHIN * sizes * self.camera.fx / np.where(depth > 0.0, depth, np.inf)
         radii = np.minimum(radii, _LARGEST * max(self.camera.width, self.camera.height))
@@ -98,7 +104,7 @@ class Cells:
     def _under_small(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[C] whether the discs in a cell make up enough of its area."""
+        """Return [C] whether the discs in a cell fill enough of its area."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         across, down = np.floor(np.clip(pixels / self.size, -1e6, 1e6)).astype(np.int64).T
         across, down = across + self.margin, down + self.margin
@@ -110,14 +116,15 @@ class Cells:
     def _under_large(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[C] whether a cell's middle lies in a square of the area of one of the discs."""
+        """Return [C] whether a cell's centre is in the square of the area of one of the discs."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         half = (np.sqrt(np.pi) / 2.0 * radii / self.size)[:, None]
         middle = np.clip(pixels / self.size, -1e6, 1e6) + self.margin - 0.5
         ends = np.array([columns, rows])
         first = np.clip(np.ceil(middle - half), 0, ends).astype(np.int64)
         behind = np.maximum(np.clip(np.floor(middle + half) + 1, 0, ends).astype(np.int64), first)
-        # Each square is four corners of a table of differences, which is summed up once.
+        # Each square adds four corners to a table of differences. One cumulative sum then fills the
+        # squares.
         steps = np.zeros((rows + 1, columns + 1), dtype=np.int64)
         for across, down, sign in (
             (first[:, 0], first[:, 1], 1),

@@ -1,4 +1,4 @@
-"""How deep a photo is where none of its SfM points lies: a plane, and what is near it bends it."""
+"""The depth of a photo between its SfM points: a plane, adjusted to the nearest points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,16 +12,16 @@ from crossgrad_core.plugin import Camera
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-#: Neighbours whose distance from the plane counts.
+#: Number of neighbours whose distance from the plane is used.
 _NEIGHBOURS = 8
-#: In parts of the longer side: below the first all distances count alike; a point as far away as
-#: the second is worth as much as the plane.
+#: In units of the longer side. Below the first value, all distances have the same weight. A point
+#: at the second value has the same weight as the plane.
 _BLUR, _REACH = 0.02, 0.1
-#: Farther than so many times its farthest points a photo is not deep.
+#: The largest depth of a photo, as a multiple of the depth of its farthest points.
 _FARTHEST = 2.0
-#: Of the farthest camera or point: how far away the sky is.
+#: Distance of the sky, as a multiple of the distance of the farthest camera or point.
 _SKY = 2.0
-#: Share of the points that may lie nearer, or farther, than any added one.
+#: Share of the points that may be nearer, or farther, than all added points.
 _TAIL = 0.02
 #: Huber's constant, for 95 % of the efficiency of least squares.
 _HUBER, _PASSES = 1.345, 10
@@ -29,13 +29,13 @@ _HUBER, _PASSES = 1.345, 10
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """Where the sky of a scene is.
+    """The position of the sky of a scene.
 
     Attributes:
         up: [3] the scene's upward axis, unit, local frame.
-        centers: [V, 3] of the cameras.
-        points: [P, 3] SfM points, or some of them.
-        most: Share of the points that do not lie astray.
+        centers: [V, 3] centres of the cameras.
+        points: [P, 3] SfM points, or a sample of them.
+        most: Share of the points that are not stray.
     """
 
     up: NDArray[np.float64]
@@ -44,7 +44,7 @@ class Sky:
     most: float
 
     def depth(self, camera: Camera) -> float:
-        """How far away it is: behind everything that the camera could see of the scene."""
+        """Return the distance of the sky: behind all of the scene that the camera could see."""
         center = camera.center.numpy()
         far = float(np.linalg.norm(self.centers - center, axis=1).max())
         if len(self.points):
@@ -53,7 +53,10 @@ class Sky:
         return _SKY * far
 
     def rise(self, camera: Camera) -> NDArray[np.float64]:
-        """[3] over (x, y, 1) of `from_the_middle`: how steeply the rays through pixels go up."""
+        """Return [3] the slope of the rays through pixels, as a linear function of (x, y, 1).
+
+        x and y are as in `from_the_middle`. The function is positive for rays that go up.
+        """
         across, down, ahead = camera.world_to_camera[:3, :3].numpy() @ self.up
         side = max(camera.width, camera.height)
         x, y = camera.width / 2.0 - camera.cx, camera.height / 2.0 - camera.cy
@@ -63,18 +66,18 @@ class Sky:
 
 @dataclass(frozen=True, eq=False)
 class Depth:
-    """Depth of a photo, from the points that it observed.
+    """Depth of a photo, estimated from the points that it observed.
 
-    Of a plane in space the inverse depth is a plane over the pixels, so that ground goes on beyond
+    The inverse depth of a plane in space is a plane over the pixels. So the ground continues beyond
     its last point, up to the horizon. Rays that go up and do not meet the plane end in the sky.
 
     Attributes:
-        pixels: [S, 2] of the points, in units of the longer side from the middle.
-        inverse: [S] their inverse depths.
-        median: Median of their depths.
+        pixels: [S, 2] pixels of the points, in units of the longer side from the photo's centre.
+        inverse: [S] inverse depths of the points.
+        median: Median depth of the points.
         nearest: Largest inverse depth of an added point.
-        farthest: Smallest inverse depth of an added point that is not of the sky.
-        rise: [3] how steeply rays go up, over (x, y, 1).
+        farthest: Smallest inverse depth of an added point that is not sky.
+        rise: [3] slope of the rays, as a linear function of (x, y, 1).
         sky: Depth of the sky.
     """
 
@@ -90,7 +93,14 @@ class Depth:
     def of(
         cls, camera: Camera, points: NDArray[np.float64], fewest: int, sky: Sky
     ) -> "Depth | None":
-        """From the points [S, 3] that were observed; None with fewer than `fewest` in front."""
+        """Return the depth of a photo, or None if fewer than `fewest` points are in front of it.
+
+        Args:
+            camera: The photo's camera.
+            points: [S, 3] the observed points.
+            fewest: Minimum number of points in front of the camera.
+            sky: The scene's sky.
+        """
         pixels, depth = camera.project(points)
         ahead = depth > 0.0
         if np.count_nonzero(ahead) < fewest:
@@ -103,12 +113,12 @@ class Depth:
 
     @cached_property
     def plane(self) -> NDArray[np.float64]:
-        """[3] inverse depth over (x, y, 1)."""
+        """[3] inverse depth of the plane, as a linear function of (x, y, 1)."""
         return _plane(self.pixels, self.inverse)
 
     @cached_property
     def rest(self) -> NDArray[np.float64]:
-        """[S] the points' inverse depths less the plane's."""
+        """[S] inverse depths of the points minus the inverse depth of the plane."""
         return self.inverse - _on(self.plane, self.pixels)
 
     @cached_property
@@ -118,11 +128,11 @@ class Depth:
         return cKDTree(self.pixels)
 
     def rises(self, around: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether rays through pixels [N, 2], as of `from_the_middle`, go up."""
+        """Return [N] whether rays through pixels [N, 2], as in `from_the_middle`, go up."""
         return _on(self.rise, around) > 0.0
 
     def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N] depths at pixels [N, 2], in units of the longer side from the middle."""
+        """Return [N] depths at pixels [N, 2], in units of the longer side from the centre."""
         count = min(_NEIGHBOURS, len(self.rest))
         distances, rows = self._tree.query(around, k=[*range(1, count + 1)])
         weights = 1.0 / (distances**2 + _BLUR**2)
@@ -133,7 +143,7 @@ class Depth:
 
 
 def from_the_middle(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels [N, 2] in units of the photo's longer side, from its middle."""
+    """Return pixels [N, 2] in units of the photo's longer side, from its centre."""
     middle = np.array([camera.width, camera.height]) / 2.0
     return (pixels - middle) / max(camera.width, camera.height)
 
@@ -143,14 +153,14 @@ def _on(plane: NDArray[np.float64], around: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _plane(around: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3] by Huber's loss, iteratively reweighted."""
+    """Return [3] the plane fitted with Huber's loss, by iterative reweighting."""
     columns = np.column_stack([around, np.ones(len(around))])
     weights = np.ones(len(around))
     for _ in range(_PASSES):
         root = np.sqrt(weights)
         plane = np.linalg.lstsq(columns * root[:, None], inverse * root, rcond=None)[0]
         off = np.abs(inverse - columns @ plane)
-        # Of normal noise the median deviation is 0.6745 sigma.
+        # For normal noise, the median absolute deviation is 0.6745 sigma.
         limit = _HUBER * np.median(off) / 0.6745
         weights = np.minimum(1.0, np.divide(limit, off, out=np.ones_like(off), where=off > limit))
     return np.asarray(plane)

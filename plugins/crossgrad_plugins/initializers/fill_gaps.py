@@ -1,4 +1,4 @@
-"""Large Gaussians where photos show something that no SfM point stands for, and around them."""
+"""Large Gaussians in parts of photos without SfM points, and beyond the edges of photos."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,30 +14,30 @@ from crossgrad_plugins.groupings.heights import upward
 from crossgrad_plugins.initializers.cells import Cells
 from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
 
-#: A photo needs so many observed points to say how deep it is.
+#: Number of observed points that a photo needs for an estimate of its depth.
 FEWEST: Final = 8
-#: Standard deviation of an added Gaussian over the side of its cell.
+#: Standard deviation of an added Gaussian, as a share of its cell's side.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
-#: A picture shows nothing that is so many times as far away as it is deep there.
+#: A photo does not show points farther away than this multiple of its depth there.
 _BEHIND: Final = 1.5
-#: A camera at least so many times as far away as a photo is deep there stands on its ground, if the
-#: way down to it is as steep as this (sine).
+#: A camera stands on the ground of a photo if its distance is at least this share of the photo's
+#: depth there, and if the ray down to it is at least this steep (sine).
 _GROUND, _STEEP = 0.75, 0.3
-#: Points that are looked at to find how far the scene goes, and the share that is not stray.
+#: Number of points that are used to find the extent of the scene, and the share that is not stray.
 _POINTS, _NOT_STRAY = 1000, 0.98
 
 
 @dataclass(eq=False)
 class _Filling:
-    """Points so far.
+    """The points so far.
 
     Attributes:
-        points: [P, 3] those of the scene and the added ones.
-        sizes: [P] what each of them covers, standard deviations, local units.
-        colors: Of the added ones, view by view.
-        inside: How many were added on photos.
-        left_aside: Photos with too few points.
+        points: [P, 3] points of the scene and added points.
+        sizes: [P] standard deviation of the area that each point covers, local units.
+        colors: Colours of the added points, view by view.
+        inside: Number of points added on photos.
+        left_aside: Number of photos with too few points.
     """
 
     points: NDArray[np.float64]
@@ -57,16 +57,17 @@ class _Filling:
         self.colors.append(colors)
 
 
-#: What was worked out, as long as its scene is in use.
+#: Results per scene; they are dropped with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 
 class Filled(Initializer):
-    """Fills what is empty: cells of photos without points, and a margin beyond all photos.
+    """Fills cells of photos that have no points, and a margin beyond all photos.
 
-    Depth is that of a plane through the points that a photo observed, bent by those nearby. Cells
-    beyond a photo's edge have the colour at the edge, and are filled where no training photo looks:
-    held-out photos and viewers see the ground go on there instead of a black hole. Ours.
+    The depth is a plane through the points that a photo observed, adjusted to the nearest points.
+    Cells beyond a photo's edge have the colour at the edge, and are filled where no training photo
+    looks. So held-out photos and viewers show a continued ground there instead of a black hole.
+    Ours.
     """
 
     cells: int = Field(12, ge=2, le=200, description="along the longer side of a photo")
@@ -118,7 +119,8 @@ class Filled(Initializer):
         }
         known = [(view, depth) for view in views if (depth := deep[view]) is not None]
         filling.left_aside = len(views) - len(known)
-        # What is near is filled finely first, and needs nothing coarse behind it any more.
+        # Near photos are filled first, with small Gaussians, so that no large ones are needed
+        # behind.
         known.sort(key=lambda each: each[1].median)
         air = _Air.of(known)
         for view, depth in known:
@@ -126,7 +128,8 @@ class Filled(Initializer):
         filling.inside = len(filling.points) - len(scene.points)
         if margin and known:
             pictures = _Pictures.of(deep)
-            # What is around a camera that another photo looks down on, this one shows, or hides.
+            # A camera may be on ground that another photo shows from above. The other photo shows,
+            # or hides, the surroundings of this camera.
             centers = np.stack([view.camera.center.numpy() for view, _ in known])
             low = pictures.look_down_on(centers, sky.up)
             high = [each for each, inside in zip(known, low, strict=True) if not inside]
@@ -143,10 +146,10 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fills a photo, or with a margin what is beyond its edges and in no picture `seen`.
+        """Fill a photo, or, with a margin, the cells beyond its edges that `seen` does not show.
 
-        What rays that go up would place in the air is the photo's sky; beyond its edges nothing is
-        added there.
+        Rays that go up could place points in the air. On the photo such points become sky. Beyond
+        its edges they are left out.
         """
         camera = view.camera
         cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
@@ -171,14 +174,14 @@ class Filled(Initializer):
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
-    """At most so many of the views, evenly spread."""
+    """Return at most `most` of the views, evenly spread."""
     if len(views) <= most:
         return list(views)
     return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
 
 
 def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[P] distance of each point from its neighbours, as 3DGS makes the first Gaussians."""
+    """Return [P] distances of the points to their neighbours, as 3DGS sizes initial Gaussians."""
     from scipy.spatial import cKDTree
 
     count = min(_NEAREST, len(points) - 1)
@@ -191,7 +194,7 @@ def _spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _behind(
     view: View, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[N, 3] points of the local frame behind pixels [N, 2] at depths [N]."""
+    """Return [N, 3] points of the local frame at depths [N] along the rays of pixels [N, 2]."""
     camera, pose = view.camera, view.camera.world_to_camera.numpy()
     rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     local = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
@@ -200,11 +203,11 @@ def _behind(
 
 @dataclass(frozen=True, eq=False)
 class _Air:
-    """The space around cameras that is nearer than what they see.
+    """The space around cameras that is nearer than everything they see.
 
     Attributes:
-        centers: [K, 3] of the cameras.
-        reach: [K] distance of the nearest that each sees.
+        centers: [K, 3] centres of the cameras.
+        reach: [K] depth of the nearest point that each camera sees.
     """
 
     centers: NDArray[np.float64]
@@ -217,7 +220,10 @@ class _Air:
         return cls(np.array(centers).reshape(-1, 3), np.array(reach))
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether points [N, 3] lie in it; what rounds to the border does not."""
+        """Return [N] whether points [N, 3] are in this space.
+
+        Points within rounding of its border are not.
+        """
         held = np.zeros(len(points), dtype=np.bool_)
         for center, reach in zip(self.centers, self.reach, strict=True):
             held |= np.linalg.norm(points - center, axis=1) < 0.999 * reach
@@ -226,14 +232,15 @@ class _Air:
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The pictures of some views, as deep as they are.
+    """The volumes of space that some views show, up to their depth.
 
     Attributes:
-        cameras: Of the views.
-        depths: Of each view; None where nothing tells: its picture has no end then.
-        matrices: [V, 3, 4] homogeneous points of the local frame to pixels times depth.
+        cameras: Cameras of the views.
+        depths: Depth of each view; None if it is unknown; the view then has no far limit.
+        matrices: [V, 3, 4] map from homogeneous points of the local frame to pixels times depth.
         ends: [V, 1, 2] width and height.
-        limits: [V, 2] depths up to which a picture shows everything, and beyond which nothing.
+        limits: [V, 2] depth up to which a view shows everything, and depth beyond which it shows
+            nothing.
     """
 
     cameras: Sequence[Camera]
@@ -259,7 +266,10 @@ class _Pictures:
         )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[N] whether one of the pictures shows a point [N, 3]: in it, and not far behind."""
+        """Return [N] whether a view shows each point [N, 3].
+
+        A point is shown if it is inside the image and not far behind the depth of the view.
+        """
         pixels, depth, inside = self._seen(points)
         shown = np.asarray((inside & (depth <= self.limits[:, :1])).any(axis=0))
         open_yet = inside & (depth <= self.limits[:, 1:])
@@ -273,7 +283,7 @@ class _Pictures:
     def look_down_on(
         self, points: NDArray[np.float64], up: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[N] whether one of the pictures shows from above the ground on which a point stands.
+        """Return [N] whether a view shows, from above, the ground on which each point stands.
 
         Args:
             points: [N, 3].
@@ -294,16 +304,16 @@ class _Pictures:
     def _seen(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """[V, N, 2] pixels times depth, [V, N] depths, and whether points lie in pictures."""
+        """Return [V, N, 2] pixels times depth, [V, N] depths, and if points are in the images."""
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
-        # Both sides times the depth: nothing is divided by zero.
+        # Both sides are multiplied by the depth, so that no division by zero can occur.
         inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
         return pixels, depth, np.asarray(inside & (depth > 0.0))
 
     def _at(self, view: int, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N] depths of a picture that has some, at pixels [N, 2]."""
+        """Return [N] depths of a view with known depth, at pixels [N, 2]."""
         deep = self.depths[view]
         assert deep is not None
         return deep.at(from_the_middle(self.cameras[view], pixels))

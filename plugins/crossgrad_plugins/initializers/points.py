@@ -1,4 +1,4 @@
-"""The points of the scene and no others."""
+"""The points of the scene, without additions."""
 
 from typing_extensions import override
 
@@ -6,7 +6,7 @@ from crossgrad_core.plugin import Initializer, MorePoints, Scene
 
 
 class SfmPoints(Initializer):
-    """Adds nothing."""
+    """Adds no points."""
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:

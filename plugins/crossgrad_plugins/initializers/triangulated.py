@@ -1,4 +1,4 @@
-"""Points of scenes that come without any: features of photos, matched and triangulated."""
+"""Points for scenes without any: features of photos, matched and triangulated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,11 +26,13 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
 _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: What was worked out, as long as its scene is in use.
+#: Results per scene; they are dropped with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
-#: Lowe's ratio of the nearest descriptor to the second (SIFT, section 7.1), as distances.
+#: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
+#: (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Rays that differ by less meet nowhere in particular; features seen under more are not the same.
+#: Smallest and largest angle between two rays. At smaller angles the intersection is not well
+#: defined; at larger angles the features are not the same.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 
@@ -40,9 +42,9 @@ class Features:
 
     Attributes:
         camera: The photo's camera.
-        pixels: [F, 2] where they are, pixel centres at +0.5.
+        pixels: [F, 2] positions, pixel centres at +0.5.
         descriptors: [F, D] float32, of length 1.
-        colors: [F, 3] uint8 the photo's colours there.
+        colors: [F, 3] uint8 colours of the photo at the features.
     """
 
     camera: Camera
@@ -53,13 +55,13 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """Features of two photos whose rays meet.
+    """Matched features of two photos and their triangulated points.
 
     Attributes:
-        first: [M] rows of the features of one photo.
-        second: [M] of those of the other.
-        points: [M, 3] where they meet, local frame.
-        angles: [M] between the rays, radians.
+        first: [M] rows of the features of the first photo.
+        second: [M] rows of the features of the second photo.
+        points: [M, 3] triangulated points, local frame.
+        angles: [M] angles between the rays, radians.
     """
 
     first: NDArray[np.int64]
@@ -69,10 +71,9 @@ class Met:
 
 
 class Triangulated(Initializer):
-    """Triangulates SIFT features of neighbouring training photos, where a scene has no points.
+    """Triangulates SIFT features of neighbouring training photos, if a scene has no points.
 
-    Poses are taken as they are: nothing is optimised. A scene with points of its own starts from
-    those.
+    Poses are not changed. For a scene that has points, this initializer adds none.
     """
 
     alone: ClassVar[bool] = True
@@ -126,7 +127,7 @@ class Triangulated(Initializer):
         return meet(first, second, self.pixels)
 
     def _features(self, view: View) -> Features:
-        """SIFT features of a photo where its pixels count."""
+        """Return the SIFT features of a photo at pixels that count."""
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()
         grey = np.ascontiguousarray((image @ _GREY).round().astype(np.uint8))
@@ -140,7 +141,7 @@ class Triangulated(Initializer):
 
 
 def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """[F, 2] pixels and [F, 128] descriptors, of length 512, of a photo [H, W]."""
+    """Return [F, 2] pixels and [F, 128] descriptors, of length 512, of a photo [H, W]."""
     guard_pycolmap()
     import pycolmap
 
@@ -158,20 +159,20 @@ def _sift(grey: NDArray[np.uint8], most: int) -> tuple[NDArray[np.float64], NDAr
 
 
 def _spread(views: Sequence[View], most: int) -> list[View]:
-    """At most so many of the views, evenly spread."""
+    """Return at most `most` of the views, evenly spread."""
     if len(views) <= most:
         return list(views)
     return [views[row] for row in np.linspace(0, len(views) - 1, most).round().astype(int)]
 
 
 def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
-    """Pairs of photos to compare: each with the nearest that look about the same way."""
+    """Return pairs of photos to compare: each photo with its nearest of similar direction."""
     centers = centers_of(views)
     axes = np.stack([view.camera.world_to_camera[2, :3].numpy() for view in views])
     found: set[tuple[int, int]] = set()
     for i in range(len(views)):
         distances = np.linalg.norm(centers - centers[i], axis=1)
-        # What stands in the same place shows no depth.
+        # Cameras at the same position give no depth.
         distances[(axes @ axes[i] < _ASKEW) | (distances == 0.0)] = np.inf
         near = np.argsort(distances, kind="stable")[:neighbours]
         found |= {(min(i, j), max(i, j)) for j in near.tolist() if np.isfinite(distances[j])}
@@ -179,7 +180,10 @@ def _pairs(views: Sequence[View], neighbours: int) -> list[tuple[int, int]]:
 
 
 def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[int, int]]:
-    """Pair and row of the points that are kept: each feature counts once, at its widest angle."""
+    """Return the pair and row of the points to keep.
+
+    Each feature is used once, in the match with the widest angle.
+    """
     angles = np.concatenate([each.angles for each in met]) if met else np.zeros(0)
     places = [(p, m) for p, each in enumerate(met) for m in range(len(each.points))]
     used: set[tuple[int, int]] = set()
@@ -194,10 +198,10 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 
 
 def meet(first: Features, second: Features, pixels: float) -> Met:
-    """The features that two photos share, and the points that they show.
+    """Return the features that two photos share, and their triangulated points.
 
-    Each is the other's nearest by far, both rays have it in front of the camera, and in both photos
-    the point lies within so many pixels of its feature.
+    Both descriptors are each other's nearest by a clear margin. The point is in front of both
+    cameras. In both photos its projection is at most `pixels` from its feature.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]
@@ -214,7 +218,7 @@ def meet(first: Features, second: Features, pixels: float) -> Met:
 def _matched(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of descriptors that are each other's nearest, and much nearer than the second."""
+    """Return rows of descriptors that are mutually nearest and clearly nearer than the second."""
     nothing = np.zeros(0, dtype=np.int64)
     if min(len(first), len(second)) <= 1:
         return nothing, nothing
@@ -233,7 +237,7 @@ def _matched(
 
 
 def _projection(camera: Camera) -> NDArray[np.float64]:
-    """[3, 4] homogeneous points of the local frame to homogeneous pixels."""
+    """Return [3, 4] the map from homogeneous points of the local frame to homogeneous pixels."""
     return np.asarray((camera.matrix @ camera.world_to_camera[:3]).numpy())
 
 
@@ -243,7 +247,7 @@ def _triangulated(
     at: NDArray[np.float64],
     other: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """[M, 3] points whose projections [3, 4] are nearest to pixels [M, 2], linearly.
+    """Return [M, 3] points whose projections [3, 4] are nearest to pixels [M, 2], linearly.
 
     Source: Hartley and Zisserman, Multiple View Geometry, section 12.2 (homogeneous method).
     """
@@ -259,7 +263,7 @@ def _triangulated(
 
 
 def _angles(first: Camera, second: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[M] angles at points [M, 3] between the rays to two cameras."""
+    """Return [M] angles at points [M, 3] between the rays to two cameras."""
     rays = [each.center.numpy() - points for each in (first, second)]
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)

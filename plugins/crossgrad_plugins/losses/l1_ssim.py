@@ -1,4 +1,4 @@
-"""The loss of 3DGS: absolute differences and dissimilar structure."""
+"""The loss of 3DGS: absolute differences and structural dissimilarity."""
 
 from typing import Any
 
@@ -19,11 +19,11 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """(1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
+    """Return (1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
 
-    In float32 value and gradient come from one pass (the gradient is first order only): a fused
-    kernel on the CPU, torch's operators elsewhere. Other types, and weights, take the torch path
-    that can be differentiated again.
+    In float32, one pass computes value and gradient: a fused kernel on the CPU, torch's operators
+    on other devices. This gradient is first order only. Other types, and calls with weights, use
+    plain torch operators, which can be differentiated again.
 
     Args:
         image: [H, W, 3] floating point, the render.
@@ -51,7 +51,7 @@ def photometric_loss(
 
 
 class _FusedLoss(torch.autograd.Function):
-    """Stores the gradient by the image in the forward pass and scales it in the backward pass."""
+    """Computes the gradient by the image in the forward pass and scales it in the backward pass."""
 
     @staticmethod
     @override
@@ -86,7 +86,7 @@ class _FusedLoss(torch.autograd.Function):
 
 
 class _DeviceLoss(torch.autograd.Function):
-    """As `_FusedLoss`, by torch's operators: for a GPU, which is not waited for."""
+    """Like `_FusedLoss`, but with torch's operators, for a GPU, without synchronisation."""
 
     @staticmethod
     @override
@@ -126,8 +126,8 @@ def _check_weights(image: Tensor, weights: Tensor) -> None:
 class L1SSIM(Loss):
     """(1 - w) * L1 + w * (1 - SSIM), means over the pixels that count and their channels.
 
-    In float32 value and gradient come from one pass, on the CPU a fused one; pixel weights and
-    other types take torch's operators and autograd.
+    In float32, one pass computes value and gradient; on the CPU this is a fused kernel. Pixel
+    weights and other types use torch's operators and autograd.
 
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
     """

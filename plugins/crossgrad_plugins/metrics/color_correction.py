@@ -1,4 +1,4 @@
-"""PSNR and SSIM of the render after its colours were fitted to the photo."""
+"""PSNR and SSIM of the render after its colours are fitted to the photo."""
 
 from typing import ClassVar
 
@@ -11,25 +11,26 @@ from typing_extensions import override
 from crossgrad_core.plugin import Compared, Figure, Metric, psnr
 from crossgrad_plugins.metrics.ssim import ssim
 
-#: What stands in summary.json with every colour-corrected figure.
+#: The definition that summary.json contains for every colour-corrected metric.
 DEFINITION = (
     "of the render after the affine map of RGB (3 x 4, 8-bit sRGB values) that brings it closest "
     "to the photo of the view by least squares over the pixels that count; "
     "clamped and rounded to 8 bits again"
 )
-#: Directions of colour in which a render varies less than this, relative to the widest, are fitted
-#: as if it did not vary in them: a grey render has two such directions, but for rounding.
+#: A colour direction in which a render varies less than this, relative to the widest direction, is
+#: treated as constant. A grey render has two such directions, apart from rounding.
 _FLAT = 1e-10
-#: Pixels that are worked on at once: what is made of them stays in the cache.
+#: Number of pixels that are processed at once, so that intermediate results stay in the cache.
 _AT_ONCE = 2**15
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
 class ColorCorrectedPSNR(Metric):
-    """PSNR of the render whose colours are fitted to the photo, which it therefore looks at.
+    """PSNR of the render after its colours are fitted to the photo (the metric uses the photo).
 
-    Beside `psnr` it tells errors of brightness and white balance from errors of the scene.
+    Compared with `psnr`, it separates errors of brightness and white balance from errors of the
+    scene.
     """
 
     figure: ClassVar[Figure] = Figure(
@@ -43,7 +44,7 @@ class ColorCorrectedPSNR(Metric):
 
 
 class ColorCorrectedSSIM(Metric):
-    """SSIM (3DGS form) of the render whose colours are fitted to the photo."""
+    """SSIM (3DGS form) of the render after its colours are fitted to the photo."""
 
     figure: ClassVar[Figure] = Figure(
         name="ssim_cc", label="SSIM (cc)", definition=f"SSIM (3DGS form) {DEFINITION}"
@@ -56,9 +57,9 @@ class ColorCorrectedSSIM(Metric):
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
-    """[H, W, 3] uint8, the render after the affine map that fits it best to its photo.
+    """Return [H, W, 3] uint8, the render after the affine colour map that fits it to its photo.
 
-    The map is fitted where the mask is True and applied everywhere. None where no pixel counts.
+    The map is fitted where the mask is True and applied everywhere. None if no pixel counts.
     """
     render, photo = (_kept(image, compared.mask) for image in (compared.render, compared.photo))
     if not len(render):
@@ -73,15 +74,15 @@ def color_corrected(compared: Compared) -> Tensor | None:
 
 
 def _kept(image: Tensor, mask: Tensor | None) -> Bytes:
-    """[N, 3] the pixels that count."""
+    """Return [N, 3] the pixels that count."""
     kept = image.reshape(-1, 3) if mask is None else image[mask]
     return kept.numpy()
 
 
 def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
-    """Matrix [3, 3] and offset [3]: `render @ matrix + offset` is closest to `photo`, both [N, 3].
+    """Return matrix [3, 3] and offset [3] with `render @ matrix + offset` closest to `photo`.
 
-    Of several such maps the one with the smallest matrix.
+    Both images are [N, 3]. Of several equally close maps, the map with the smallest matrix is used.
     """
     sums = _sums(render, photo)
     within, across = _spread(sums, slice(0, 3)), _spread(sums, slice(3, 6))
@@ -91,9 +92,10 @@ def _fit(render: Bytes, photo: Bytes) -> tuple[Floats, Floats]:
 
 
 def _sums(render: Bytes, photo: Bytes) -> Floats:
-    """[7, 7] sums of the products of the render's channels, the photo's, and 1.
+    """Return [7, 7] sums of the products of the render's channels, the photo's channels and 1.
 
-    Whole numbers that float64 holds, in whatever order they are added up.
+    The sums are whole numbers that float64 represents exactly, so the order of addition does not
+    matter.
     """
     total = np.zeros((7, 7))
     for at in range(0, len(render), _AT_ONCE):
@@ -105,9 +107,10 @@ def _sums(render: Bytes, photo: Bytes) -> Floats:
 
 
 def _spread(sums: Floats, others: slice) -> Floats:
-    """[3, 3] covariances of the render's channels with others.
+    """Return [3, 3] covariances of the render's channels with other channels.
 
-    The differences are taken in integers, so that neither rounding nor the number of threads shows.
+    Differences are computed with integers, so the result does not depend on rounding or on the
+    number of threads.
     """
     exact = [[int(value) for value in row] for row in sums]
     count = exact[6][6]

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from crossgrad_plugins.metrics.lpips_distance import Weights
 
 
-#: How images enter the network, for summary.json.
+#: The range of the images at the input of the network, for summary.json.
 IN_FULL_RANGE: Final = "images in [-1, 1], as the method means it"
 IN_UNIT_RANGE: Final = "images in [0, 1], as 3DGS feeds them"
 
 
 def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Figure:
-    """The figure of a metric without weights; `described` adds which weights it has."""
+    """Return the figure of a metric without weights; `described` adds the source of the weights."""
     return Figure(
         name=name,
         label=label,
@@ -36,9 +36,10 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
 
 
 class Perceptual(Metric):
-    """Learned perceptual similarity (LPIPS 0.1) with the weights that the user names.
+    """Learned perceptual similarity (LPIPS 0.1) with weights that the user provides.
 
-    Null without a trunk, which no package ships; nothing is ever downloaded.
+    The result is null without a trunk, because no Python package contains one. Nothing is ever
+    downloaded.
 
     Attributes:
         net: The network.
@@ -62,12 +63,12 @@ class Perceptual(Metric):
     @field_validator("trunk", "heads")
     @classmethod
     def _from_anywhere(cls, path: Path | None) -> Path | None:
-        """config.yaml repeats the run from any folder."""
+        """Make a path absolute, so that config.yaml works from any folder."""
         return None if path is None else path.expanduser().absolute()
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Reads the weights before anything is trained."""
+        """Read the weights, so that errors appear before training starts."""
         if self.trunk is not None:
             self._weights(self.trunk)
         elif self.heads is not None:
@@ -99,7 +100,7 @@ class Perceptual(Metric):
 
     @abstractmethod
     def entering(self, image: Tensor) -> Tensor:
-        """An image [H, W, 3] in [0, 1] as it enters the network."""
+        """Return an image [H, W, 3] in [0, 1], scaled to the input range of the network."""
 
     def _weights(self, trunk: Path) -> "Weights":
         return _kept(self.net, trunk, self.heads, f"metrics.{self.entry}")
@@ -130,10 +131,10 @@ class LPIPSOfVGG(Perceptual):
 
 
 class LPIPSOfVGGAs3DGS(Perceptual):
-    """Learned perceptual similarity with VGG-16, images in [0, 1] as 3DGS feeds them.
+    """Learned perceptual similarity with VGG-16, images in [0, 1] as in the 3DGS code.
 
-    Made for images in [-1, 1], the network sees low contrast; the figure compares with those that
-    papers of the 3DGS family give, and with no other LPIPS.
+    The network expects images in [-1, 1], so it sees low contrast. The result can be compared only
+    with LPIPS values of papers of the 3DGS family, and with no other LPIPS.
     """
 
     net: ClassVar[Trunk] = VGG16

@@ -1,4 +1,4 @@
-"""The distance of two images by the features of a network, and its files of weights."""
+"""The distance of two images by the features of a network, and the files of its weights."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from torch.nn import functional
 from crossgrad_core.plugin import UserError
 from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
 
-#: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as LPIPS has them.
+#: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as in LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Keeps the length of a vector of features away from 0.
+#: Keeps the length of a feature vector above 0.
 _LEAST = 1e-8
-#: Packages that bring the published heads, and where in them.
+#: Packages that contain the published heads, and the folders of the heads in them.
 _PACKAGES = (
     ("torchmetrics", ("functional", "image", "lpips_models")),
     ("lpips", ("weights", "v0.1")),
@@ -28,12 +28,12 @@ _SAFETENSORS = ".safetensors"
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """All that LPIPS with one trunk needs.
+    """All weights that LPIPS with one trunk needs.
 
     Attributes:
-        trunk: (weights [O, I, H, W], biases [O]) of its convolutions in order.
-        heads: [1, C, 1, 1] of those that are compared.
-        source: Which files they are, for summary.json.
+        trunk: (weights [O, I, H, W], biases [O]) of the trunk's convolutions in order.
+        heads: [1, C, 1, 1] linear heads of the convolutions that are compared.
+        source: A text that names the files, for summary.json.
     """
 
     trunk: tuple[tuple[Tensor, Tensor], ...]
@@ -42,7 +42,7 @@ class Weights:
 
 
 def distance(net: Trunk, weights: Weights, first: Tensor, second: Tensor) -> float:
-    """LPIPS of two images [H, W, 3]; those in [-1, 1] are scaled as the method wants it.
+    """Return the LPIPS of two images [H, W, 3]; the method expects values in [-1, 1].
 
     Source: Zhang et al. 2018, The Unreasonable Effectiveness of Deep Features as a Perceptual
     Metric, version 0.1: features of unit length, squared differences, weighted by channel, mean
@@ -58,7 +58,7 @@ def distance(net: Trunk, weights: Weights, first: Tensor, second: Tensor) -> flo
 
 
 def _features(net: Trunk, weights: Weights, image: Tensor) -> Iterator[Tensor]:
-    """[1, C, h, w] what each compared convolution gives, after its ReLU."""
+    """Yield the output [1, C, h, w] of each compared convolution, after its ReLU."""
     shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
     x = ((image - shift) / scale).permute(2, 0, 1)[None]
     for layer, (weight, bias) in zip(net.layers, weights.trunk, strict=True):
@@ -70,21 +70,21 @@ def _features(net: Trunk, weights: Weights, image: Tensor) -> Iterator[Tensor]:
 
 
 def _unit(features: Tensor) -> Tensor:
-    """The features of each pixel at length 1."""
+    """Return the features of each pixel, scaled to length 1."""
     return features / (_LEAST + features.square().sum(dim=1, keepdim=True)).sqrt()
 
 
 def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> Weights:
-    """Reads and checks the weights.
+    """Read and check the weights.
 
     Args:
         net: The network.
         trunk: File with its pretrained weights.
-        heads: File with the linear heads; by default those of an installed package.
-        setting: How the user sets them, such as `metrics.lpips`.
+        heads: File with the linear heads; None for the heads of an installed package.
+        setting: The user's setting for them, such as `metrics.lpips`.
 
     Raises:
-        UserError: A file is missing, is none of weights, or holds those of another network.
+        UserError: A file is missing, has no weights, or has the weights of another network.
     """
     of_trunk = _read_trunk(net, trunk, f"{setting}.trunk")
     file, whose = (heads, heads.name) if heads is not None else _installed(net, setting)
@@ -119,7 +119,7 @@ def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
 
 
 def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
-    """The heads that an installed package brings, and its name; it is not imported."""
+    """Return the heads in an installed package, and its name, without importing it."""
     for package, folders in _PACKAGES:
         spec = find_spec(package)
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():
@@ -135,7 +135,7 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
 
 
 def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
-    """The tensors of a file by name; nothing in it is executed."""
+    """Return the tensors of a file by name; nothing in the file is executed."""
     if not path.is_file():
         raise UserError("there is no file of weights", where=path, todo=todo)
     try:
@@ -143,10 +143,11 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
             from safetensors.torch import load_file
 
             return load_file(path)
-        # Files that were written on a GPU are read without one.
+        # Map to the CPU, so that files written on a GPU can be read without a GPU.
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # What a damaged file raises is documented nowhere.
-        # Not in torch's words, which end in the advice to execute what is in the file.
+    except Exception as error:  # Exceptions for damaged files are not documented.
+        # Torch's own message ends with the advice to execute code from the file, so it is not
+        # shown.
         raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error
     if not isinstance(found, Mapping):
         raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
@@ -166,7 +167,7 @@ def _unreadable(path: Path, found: str, todo: str) -> UserError:
 def _check(
     path: Path, found: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
 ) -> None:
-    """Refuses weights of another network, or that are not finite."""
+    """Raise an error for weights of another network, or for values that are not finite."""
     for name, shape in shapes.items():
         tensor = found.get(name)
         if tensor is None or tuple(tensor.shape) != shape:
@@ -185,7 +186,7 @@ def _check(
 
 
 def _described(net: Trunk, path: Path) -> str:
-    """Which file of weights it is: figures of different ones do not compare."""
+    """Return a text that identifies the file, because results of different files do not compare."""
     digest = sha256(path.read_bytes()).hexdigest()
     published = "" if digest.startswith(net.digest) else "not "
     return f"{path.name} (SHA-256 {digest[:16]}, {published}the file that torchvision publishes)"

@@ -1,7 +1,8 @@
-"""The networks whose features LPIPS compares, as far as it needs them.
+"""The networks whose features LPIPS compares, without the parts that it does not need.
 
-Layers and numbering are those of torchvision's `alexnet` and `vgg16` (`features`), so that its
-files of weights fit; Krizhevsky 2014 (arXiv 1404.5997) and Simonyan and Zisserman 2015 (1409.1556).
+Layers and their numbers are as in torchvision's `alexnet` and `vgg16` (`features`), so that its
+weight files can be loaded. Sources: Krizhevsky 2014 (arXiv 1404.5997); Simonyan and Zisserman 2015
+(1409.1556).
 """
 
 from dataclasses import dataclass
@@ -11,15 +12,15 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Convolution:
-    """A convolution that a ReLU follows.
+    """A convolution followed by a ReLU.
 
     Attributes:
-        layer: Its number in `features`.
+        layer: Number of the convolution in `features`.
         shape: (channels out, channels in, height, width) of its weights.
         stride: Pixels.
         padding: Pixels.
-        pools: Whether a maximum over windows comes before it.
-        compared: Whether LPIPS compares what it gives.
+        pools: Whether max pooling precedes the convolution.
+        compared: Whether LPIPS compares its output.
     """
 
     layer: int
@@ -35,13 +36,13 @@ class Trunk:
     """A network without its classifier.
 
     Attributes:
-        name: What users know it as.
+        name: The usual name of the network.
         model: Its name in torchvision.
-        heads: What the file of its linear heads is called.
-        published: Name of the file of weights that LPIPS was fitted on; its last part is the
-            beginning of the file's SHA-256.
-        window: Side of the windows that maxima are taken over, pixels; they are 2 apart.
-        smallest: Images need at least so many pixels on either side.
+        heads: Name of the file of its linear heads.
+        published: Name of the weight file that LPIPS was fitted on; the last part of the name is
+            the beginning of the file's SHA-256.
+        window: Side of the max-pooling windows, pixels; their stride is 2.
+        smallest: Smallest side of an image, pixels.
         layers: Its convolutions in order.
     """
 
@@ -60,12 +61,15 @@ class Trunk:
 
     @property
     def digest(self) -> str:
-        """How the SHA-256 of the published file begins."""
+        """The beginning of the SHA-256 of the published file."""
         return self.published.rpartition("-")[2].partition(".")[0]
 
 
 def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
-    """Stages of (convolutions, channels); a maximum between stages, the last of each compared."""
+    """Return the convolutions of stages of (convolutions, channels).
+
+    Max pooling separates stages, and the last convolution of each stage is compared.
+    """
     layers: list[Convolution] = []
     number, channels_in = 0, 3
     widths = [(stage, width) for stage, (count, width) in enumerate(stages) for _ in range(count)]
@@ -81,7 +85,7 @@ def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
                 )
             )
             number, channels_in = number + 2, width
-        number += 1  # The maximum has a number of its own.
+        number += 1  # Max pooling has a number of its own.
     return tuple(layers)
 
 

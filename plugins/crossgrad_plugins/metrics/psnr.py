@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Compared, Figure, Metric, psnr
 class PSNR(Metric):
     """Peak signal-to-noise ratio over the pixels that count and their channels, in dB.
 
-    At most 100 dB, which identical images have. Source: 3DGS evaluation script.
+    The maximum is 100 dB, for identical images. Source: 3DGS evaluation script.
     """
 
     figure: ClassVar[Figure] = Figure(

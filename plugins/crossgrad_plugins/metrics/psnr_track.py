@@ -1,4 +1,4 @@
-"""Peak signal-to-noise ratio with the exposure of the view taken from its SfM observations."""
+"""Peak signal-to-noise ratio with the view's exposure taken from its SfM observations."""
 
 from typing import ClassVar
 
@@ -13,16 +13,16 @@ from crossgrad_plugins.exposures.srgb import encoded, with_gain
 from crossgrad_plugins.exposures.tracks.gains import LEAST
 from crossgrad_plugins.exposures.tracks.observations import light_at
 
-#: Gains that are tried around the first guess, in stops, from coarse to fine.
+#: Step sizes of the search for a gain around the first estimate, in stops, from coarse to fine.
 _STEPS = (0.1, 0.01)
 _TRIED = 15
 
 
 class TrackExposedPSNR(Metric):
-    """PSNR once the render's light is multiplied by one number, taken from SfM observations.
+    """PSNR of the render multiplied, in linear light, by one gain from SfM observations.
 
-    The number brings render and photo closest together where the photo shows the SfM points that it
-    observed: it looks at the photo where its pose came from, and nowhere else.
+    The gain brings render and photo closest together at the SfM points that the photo observed. The
+    metric uses the photo only at these points, which also determined its pose.
     """
 
     figure: ClassVar[Figure] = Figure(
@@ -50,7 +50,7 @@ class TrackExposedPSNR(Metric):
 
 
 def _closest(drawn: Tensor, compared: Compared) -> float | None:
-    """The gain in stops; None where too few observations are usable."""
+    """Return the gain in stops; None if too few observations are usable."""
     camera = compared.view.camera
     of_photo = light_at(compared.photo, compared.mask, camera, compared.points)
     if np.count_nonzero(of_photo.usable) < LEAST:
@@ -61,7 +61,7 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     lit = light > 0.0
     if not lit.any():
         return 0.0
-    # Of sums a single light far beyond white would be most.
+    # The median is used, because a sum would be dominated by a single light far beyond white.
     stops = float(np.log2(np.median(wanted[lit] / light[lit])))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)
@@ -71,9 +71,9 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
 
 
 def _distances(lights: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean squares of what brightnesses [L, N] in linear light differ by from [N], as sRGB.
+    """Return the mean squared differences of brightnesses [L, N] in linear light from [N], as sRGB.
 
-    Beyond white they are white, as where the render is compared with the photo.
+    Values beyond white are clipped to white, as in the comparison of the render with the photo.
     """
     some, others = (encoded(torch.from_numpy(each)).clamp(max=1.0) for each in (lights, wanted))
     return (some - others).square().mean(dim=1).numpy()

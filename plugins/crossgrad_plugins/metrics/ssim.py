@@ -1,7 +1,8 @@
-"""Structural similarity, as the 3DGS family and as scikit-image compute it.
+"""Structural similarity, computed as in the 3DGS family and as in scikit-image.
 
-Both clamp the images to [0, 1] and round them to 8 bits first, as if the render had been written to
-a file and read back. With a mask only kept pixels count; a masked-out pixel is 0 in both images.
+Both metrics first clamp the images to [0, 1] and round them to 8 bits, like a render that is
+written to a file and read back. With a mask, only kept pixels count; a masked-out pixel is 0 in
+both images.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ SSIM_SKIMAGE_TOO_SMALL = (
     f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
     f"in an image of {WINDOW} x {WINDOW} or more"
 )
-#: Rows that a thread works on at once, so that what it makes of them stays in its cache.
+#: Number of rows that a thread processes at once, so that intermediate results stay in its cache.
 _ROWS = 128
 
 
@@ -55,9 +56,9 @@ class SSIMOfSkimage(Metric):
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """SSIM as the loss has it: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
+    """Return the SSIM as in the loss: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
 
-    Arguments as for `psnr`. The mean over kept pixels; None if no pixel is kept.
+    Arguments as for `psnr`. The result is the mean over kept pixels; None if no pixel is kept.
     """
     from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 
@@ -70,11 +71,12 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
 
 
 def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """SSIM of scikit-image with Gaussian weights, sigma 1.5, and without sample covariance.
+    """Return the SSIM of scikit-image with Gaussian weights, sigma 1.5, without sample covariance.
 
-    As in scikit-image, the mean leaves out a border of 5 pixels, where windows leave the image.
+    As in scikit-image, the mean excludes a border of 5 pixels, where windows extend beyond the
+    image.
 
-    Arguments as for `psnr`. None, with `SSIM_SKIMAGE_TOO_SMALL` as the reason, if nothing is left.
+    Arguments as for `psnr`. None if no pixel is left; `SSIM_SKIMAGE_TOO_SMALL` is the reason.
     """
     height, width = image.shape[:2]
     inside = torch.zeros(height, width, dtype=torch.bool)
@@ -87,9 +89,9 @@ def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> f
 
 
 def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[np.float64]:
-    """SSIM per pixel and channel, [H, W, 3], but for a border of RADIUS pixels, which is anything.
+    """Return the SSIM per pixel and channel, [H, W, 3]; a border of RADIUS pixels is undefined.
 
-    A value depends on the pixels within RADIUS alone, so that strips have the bits of the whole.
+    A value depends only on pixels within RADIUS, so strips have the same bits as the whole image.
     """
     from skimage.metrics import structural_similarity
 
@@ -100,7 +102,7 @@ def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[
 
     def work(start: int) -> None:
         stop = min(start + _ROWS, height)
-        # Of the last rows a few may be too few for a window.
+        # The last rows alone may be too few for a window.
         first = max(min(start - RADIUS, height - WINDOW), 0)
         last = min(stop + RADIUS, height)
         _, full = structural_similarity(

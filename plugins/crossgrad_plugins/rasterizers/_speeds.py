@@ -1,22 +1,22 @@
-"""How fast each rasterizer is on a device, answered without importing the rasterizers.
+"""The speed of each rasterizer on a device, available without an import of the rasterizers.
 
-The entry points of the group `crossgrad.rasterizers.speed` name these functions; the scale is that
-of `Rasterizer.speed`.
+The entry points of the group `crossgrad.rasterizers.speed` name these functions. The scale is
+defined by `Rasterizer.speed`.
 """
 
 from typing import Final
 
-#: gswarp, and the package that it is built on.
+#: gswarp, and the package that it requires.
 GSWARP_PACKAGES: Final = ("gswarp", "warp")
 
 
 def gsplat(device: str) -> float:
-    """Return the speed of gsplat, 0 where its package or a compiler is missing."""
+    """Return the speed of gsplat; 0 if its package or a compiler is missing."""
     return 100.0 if device == "cuda" and not gsplat_missing() else 0.0
 
 
 def gswarp(device: str) -> float:
-    """Return the speed of gswarp, 0 where a package is missing."""
+    """Return the speed of gswarp; 0 if a package is missing."""
     return 80.0 if device == "cuda" and not gswarp_missing() else 0.0
 
 
@@ -26,19 +26,19 @@ def numba(device: str) -> float:
 
 
 def torch(device: str) -> float:
-    """Return the speed of the reference."""
+    """Return the speed of the reference rasterizer."""
     return 1.0 if device in {"cpu", "cuda"} else 0.0
 
 
 def gsplat_missing() -> str:
-    """Return what gsplat lacks on this machine and how to install it; empty if nothing."""
+    """Return the requirement of gsplat that is missing and how to install it; empty if none is."""
     from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 
     return package_missing("gsplat") or compiler_missing("gsplat") or ""
 
 
 def gswarp_missing() -> str:
-    """Return what gswarp lacks on this machine and how to install it; empty if nothing."""
+    """Return the requirement of gswarp that is missing and how to install it; empty if none is."""
     from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 
     return package_missing(*GSWARP_PACKAGES) or ""

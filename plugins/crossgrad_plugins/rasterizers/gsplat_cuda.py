@@ -1,4 +1,4 @@
-"""gsplat's rasterizer: CUDA, several views of one size in one call."""
+"""gsplat's rasterizer: CUDA; several views of the same size are rendered in one call."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ _GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
 class GsplatRasterizer(Rasterizer):
-    """Draws with the package gsplat (Apache-2); docs/rasterizers.md has how its rules differ.
+    """Renders with the package gsplat (Apache-2); docs/rasterizers.md lists its different rules.
 
     Source: Ye et al. 2024 (gsplat, arXiv 2409.06765).
     """
@@ -58,7 +58,7 @@ class GsplatRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Objects where the package, or what it compiles its kernels with, is not there."""
+        """Return an objection if the package or its compiler is missing."""
         missing = self.missing(selection.device)
         return [f"{missing}, or leave --rasterizer out"] if missing else []
 
@@ -99,7 +99,7 @@ class GsplatRasterizer(Rasterizer):
         backgrounds: Sequence[Tensor],
         outputs: frozenset[str],
     ) -> list[Render]:
-        """K views of one size, with N Gaussians each, in one call of gsplat."""
+        """Return the renders of K views of one size, with N Gaussians each, in one call."""
         gaussians, camera = views[0]
         if not len(gaussians):
             return [
@@ -111,7 +111,7 @@ class GsplatRasterizer(Rasterizer):
             Screen(torch.zeros(len(each), dtype=torch.int32, device=each.means.device))
             for each, _ in views
         ]
-        # The Gaussians of each view are a batch of their own, so that gradients stay apart.
+        # The Gaussians of each view are a separate batch, so that gradients stay separate.
         tensors = [_batch([getattr(each, name) for each, _ in views]) for name in _GEOMETRY]
         tensors.append(_batch([_colors(each, c) for each, c in views]))
         settings = {
@@ -140,12 +140,12 @@ class GsplatRasterizer(Rasterizer):
 
 
 def _batch(tensors: Sequence[Tensor]) -> Tensor:
-    """[K, ...] of K tensors; no copy of a single one."""
+    """Return [K, ...] of K tensors; a single tensor is not copied."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
 def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """[N, 3] RGB as `view_colors` has it; harmonics above degree 0 in one kernel."""
+    """Return [N, 3] RGB like `view_colors`; harmonics above degree 0 use one kernel."""
     center = camera.center.to(gaussians.means, non_blocking=True)
     coefficients = coefficients_of(gaussians) if gaussians.colors is None else None
     if coefficients is None or not gaussians.sh_degree:
@@ -157,7 +157,7 @@ def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _cameras(cameras: Sequence[Camera], like: Tensor) -> dict[str, Tensor]:
-    """Poses [K, 1, 4, 4] and calibrations [K, 1, 3, 3], copied to the device in one piece."""
+    """Return poses [K, 1, 4, 4] and intrinsics [K, 1, 3, 3], copied in one transfer."""
     poses = torch.stack([camera.world_to_camera.reshape(-1) for camera in cameras])
     matrices = torch.stack([camera.matrix.reshape(-1) for camera in cameras])
     both = torch.cat([poses, matrices], 1).to(like, non_blocking=True)
@@ -186,7 +186,7 @@ def _draw(
 
 
 def _observe(screens: Sequence[Screen], centers: Tensor, gradient: Tensor) -> None:
-    """Notes the gradients [K, 1, N, 2] by the projected means."""
+    """Store the gradients [K, 1, N, 2] by the projected means."""
     absolute = getattr(centers, "absgrad", None)
     for view, screen in enumerate(screens):
         screen.mean_gradient = gradient[view, 0]

@@ -1,4 +1,4 @@
-"""gswarp's rasterizer: NVIDIA Warp, which brings its own compiler, so that a driver is enough."""
+"""gswarp's rasterizer: NVIDIA Warp, which contains a compiler, so only a driver is required."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -24,14 +24,14 @@ from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn, empty
 from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-#: Depth up to which gswarp draws nothing, in the units that it is given.
+#: gswarp does not render Gaussians up to this depth, in the units of its input.
 _NEAR = 0.2
 
 
 class GswarpRasterizer(Rasterizer):
-    """Draws with the package gswarp (Apache-2); docs/rasterizers.md has how its rules differ.
+    """Renders with the package gswarp (Apache-2); docs/rasterizers.md lists its different rules.
 
-    gswarp's near plane is fixed. What it is given is scaled so that the plane is where `near` says.
+    gswarp's near plane is fixed. The scene is scaled so that this plane is at the depth `near`.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"depth"})
@@ -60,7 +60,7 @@ class GswarpRasterizer(Rasterizer):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Objects where the package is not there, and to dilations that are not its own."""
+        """Return objections to a missing package and to other dilations."""
         if selection.device not in self.devices:
             return []
         reasons = []
@@ -114,7 +114,7 @@ class GswarpRasterizer(Rasterizer):
 
 
 def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """[N, 3] RGB, or [N, (degree + 1)^2, 3] for gswarp's own harmonics: one kernel."""
+    """Return [N, 3] RGB, or [N, (degree + 1)^2, 3] coefficients for gswarp's own kernel."""
     coefficients = coefficients_of(gaussians) if degree else None
     if coefficients is not None:
         return coefficients
@@ -122,10 +122,10 @@ def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
 
 
 def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int) -> dict[str, Any]:
-    """The fields of gswarp's settings for a camera of a scene that is `enlarged` times as large.
+    """Return the fields of gswarp's settings for a camera of a scene enlarged by a factor.
 
-    Above degree 0 gswarp evaluates harmonics itself. Its matrices are transposed; the projection
-    maps the image to [-1, 1], with the principal point.
+    Above degree 0, gswarp evaluates harmonics itself. Its matrices are transposed. The projection
+    maps the image to [-1, 1] and includes the principal point.
     """
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= enlarged
@@ -168,6 +168,6 @@ def _draw(screen: Screen, settings: dict[str, Any], tensors: Sequence[Tensor]) -
 
 
 def _observe(screen: Screen, half: tuple[float, float], _centers: Tensor, gradient: Tensor) -> None:
-    """Notes the gradient [N, 3] by the projected means, which gswarp gives in NDC units."""
+    """Store the gradient [N, 3] by the projected means, converted from NDC units to pixels."""
     along = zip(gradient[:, :2].unbind(1), half, strict=True)
     screen.mean_gradient = torch.stack([each / side for each, side in along], dim=1)

@@ -1,4 +1,7 @@
-"""The CPU rasterizer: tiles, hand-written backward pass, all cores, the same bits on any number."""
+"""The CPU rasterizer: tiles and a hand-written backward pass.
+
+The results have the same bits for any number of cores.
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -29,12 +32,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.frame import backward, forward, marked_pixels
 
-#: The differentiable inputs in the order in which autograd sees them.
+#: The differentiable inputs, in the order of autograd's arguments.
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 
 
 class NumbaRasterizer(Rasterizer):
-    """Draws float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
+    """Renders float32 Gaussians on the CPU; kernels are compiled once and cached on disk."""
 
     provides: ClassVar[frozenset[str]] = frozenset(
         {"depth", "pixels", "abs_gradient", "directions", "count"}
@@ -75,7 +78,7 @@ class NumbaRasterizer(Rasterizer):
 
 
 class _Call:
-    """Values that autograd must carry besides tensors."""
+    """The values that autograd must pass in addition to tensors."""
 
     def __init__(
         self,
@@ -98,7 +101,7 @@ class _Call:
 
 
 def _require_fitting(gaussians: Gaussians) -> None:
-    """Raises for tensors that do not fit each other: kernels read them without looking."""
+    """Raise an error for tensors of inconsistent shapes, because kernels do not check bounds."""
     if misfit := gaussians.misfit():
         raise UserError(
             "these Gaussians cannot be drawn",
@@ -137,7 +140,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
 
 
 def _counter(frame: Frame) -> Callable[[Tensor], Tensor]:
-    """What `Screen.count` is; does not keep the images of the frame alive."""
+    """Return the function for `Screen.count`; it does not keep the images of the frame alive."""
     drawn = frame.projected, frame.lists, frame.masks, frame.options
 
     def count(marked: Tensor) -> Tensor:
@@ -209,7 +212,7 @@ class _Draw(torch.autograd.Function):
 def _gradient(
     gaussians: GaussianArrays, rows: Tensor | None, name: str, array: NDArray[np.float32] | None
 ) -> Tensor | None:
-    """The gradient of one input; by rows, sparse, where it was asked for."""
+    """Return the gradient of one input, as sparse rows if this was requested."""
     if array is None:
         return None
     values = torch.from_numpy(array)

@@ -25,12 +25,12 @@ from crossgrad_plugins.rasterizers.reference.harmonics import view_colors
 from crossgrad_plugins.rasterizers.reference.projection import Projection, Shape, project, shape
 from crossgrad_plugins.rasterizers.reference.statistics import Recorder, longest_axes, recorded
 
-#: Standard deviations, and the least square of half the difference of the variances, px^4.
+#: Number of standard deviations, and lower bound of the squared half difference of variances, px^4.
 SIGMAS, LEAST_SPREAD = 3.0, 0.1
 
 
 def published_radii(projection: Projection, dilation: float) -> Tensor:
-    """[N] half-sides of the squares, whole pixels; 0 where there is no inverse covariance.
+    """Return [N] half-sides of the squares, whole pixels; 0 if there is no inverse covariance.
 
     Source: diff-gaussian-rasterization, radius = ceil(3 sqrt(lambda_max)) with lambda_max = mid +
     sqrt(max(0.1, mid^2 - det)).
@@ -45,10 +45,10 @@ def published_radii(projection: Projection, dilation: float) -> Tensor:
 
 
 def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
-    """[N, 4] int64 tile boxes (x0, y0, x1, y1) that squares around `means` overlap, ends excluded.
+    """Return [N, 4] int64 tile boxes (x0, y0, x1, y1) that squares around `means` overlap.
 
-    Pixels are numbered from the centre of the first one here. Empty where the radius is 0 or the
-    square is off the image.
+    Ends are excluded. Pixels are numbered from the centre of the first pixel. A box is empty if the
+    radius is 0 or if the square is outside the image.
     """
     tiles = torch.tensor([-(-pixels // TILE) for pixels in size]).to(means, non_blocking=True)
     middle = torch.where(radii[:, None] > 0, means, 0.0) - 0.5
@@ -59,7 +59,7 @@ def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def common_tiles(boxes: Tensor, others: Tensor) -> Tensor:
-    """[N, 4] tile boxes that both have; an end not beyond its start where there are none."""
+    """Return [N, 4] the intersections of tile boxes; if empty, the end equals the start."""
     first = torch.maximum(boxes[:, :2], others[:, :2])
     last = torch.minimum(boxes[:, 2:], others[:, 2:])
     return torch.cat([first, torch.maximum(first, last)], -1)
@@ -69,9 +69,9 @@ _LARGEST_RADIUS = 2.0**30
 
 
 class TorchRasterizer(Rasterizer):
-    """Draws Gaussians by the common rule set in the type of their means.
+    """Renders Gaussians by the common rule set, in the data type of their means.
 
-    It is the oracle that the fast rasterizers are tested against: short rather than quick.
+    Fast rasterizers are tested against it, so it is written to be short rather than fast.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset(
@@ -98,7 +98,7 @@ class TorchRasterizer(Rasterizer):
         size = (camera.width, camera.height)
         with torch.no_grad():
             index, boxes, published = self._drawn(gaussians, camera)
-        # Whatever is not drawn never enters the graph, so that it cannot pass on a NaN.
+        # Gaussians that are not drawn never enter the graph, so that they cannot pass on a NaN.
         drawn = _rows(gaussians, index)
         projection, shapes, colors = self._splats(drawn, camera)
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))
@@ -136,9 +136,9 @@ class TorchRasterizer(Rasterizer):
         return projection, shapes, view_colors(gaussians, eye)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The Gaussians to draw, front to back, their tile boxes [V, 4], and all published radii.
+        """Return the Gaussians to draw, front to back, their tile boxes [V, 4], and their radii.
 
-        The radii [N] int32 are None unless the footprint is the published one.
+        The radii [N] int32 are the published radii; None unless the footprint is `3-sigma`.
         """
         projection, shapes, colors = self._splats(gaussians, camera)
         table = splat_table(projection.means, projection.depths, colors, shapes)
@@ -168,7 +168,7 @@ class TorchRasterizer(Rasterizer):
 
 
 def _rows(gaussians: Gaussians, index: Tensor) -> Gaussians:
-    """The Gaussians at `index` [V]."""
+    """Return the Gaussians at `index` [V]."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
     tensors = {name: getattr(gaussians, name) for name in names}
     rows = {name: tensor[index] for name, tensor in tensors.items() if tensor is not None}

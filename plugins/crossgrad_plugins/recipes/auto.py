@@ -1,4 +1,4 @@
-"""Recipe `auto`: the values that were measured to be best for the length and the device."""
+"""Recipe `auto`: the best measured settings for the length and the device of a run."""
 
 from functools import cached_property
 from typing import Final, Literal
@@ -10,53 +10,55 @@ from crossgrad_plugins.recipes import budget
 
 #: Adam's decay rates as published.
 BETA1, BETA2 = 0.9, 0.999
-#: Components of long runs, and the ones that replace them in short runs.
+#: Components of long runs, and the components that replace them in short runs.
 DENSIFIER, SHORT_DENSIFIER = "adc", "absgrad"
 RESOLUTION, SHORT_RESOLUTION = "full", "strided"
 INITIALIZER, POINTS_ONLY, EXPOSURE = "fill-gaps", "points", "auto"
-#: Training photos from which on a short run grows by absolute gradients; with fewer photos it
-#: overfits.
+#: A short run with at least this many training photos densifies by absolute gradients. With fewer
+#: photos it overfits.
 MANY_PHOTOS: Final = 100
 
-#: The published rates are for `REFERENCE` steps. A shorter run has them times the ratio of the two
-#: to this power, because the sum of the rates falls with the length, but not as fast.
+#: The published rates are for `REFERENCE` steps. A shorter run multiplies them by the ratio
+#: `REFERENCE` / steps to this power. The power is below 1: the sum of the rates falls with the
+#: length, but not as fast.
 SHORTNESS: Final = 0.45
-#: The largest factor, which runs of some 1,000 steps have.
+#: The largest factor, which runs of about 1,000 steps use.
 MOST: Final = 4.5
-#: A run that renders each training photo fewer times than this, on average, has few passes: it
-#: ends long before it overfits.
+#: A run that renders each training photo fewer times than this, on average, has few passes. It ends
+#: long before it overfits.
 FEW_PASSES: Final = 40
-#: Power and largest factor of the rates of runs with few passes.
+#: Power and largest factor of the learning rates in runs with few passes.
 FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
-#: In a run with few passes, Adam's second moment averages over this share of the steps, and over
-#: this many steps at least. The first gradients are much larger than later ones, and with the
-#: published average they would slow down the next 1,000 steps.
+#: In a run with few passes, Adam's second moment averages over this share of the steps, but over at
+#: least `LEAST_MEMORY` steps. The first gradients are much larger than later gradients. The
+#: published average would remember them and slow down the next 1,000 steps.
 MEMORY, LEAST_MEMORY = 1 / 50, 50
-#: Decay of the first moment in short runs, which averages over 3 steps instead of 10.
+#: Decay of the first moment in short runs: it averages over 3 steps instead of 10.
 SHORT_BETA1: Final = 0.7
-#: Largest standard deviation, as a share of the distance to the nearest camera at whose side a
-#: Gaussian is.
+#: Largest standard deviation of a Gaussian, as a share of the distance to the nearest camera that
+#: has the Gaussian outside its photo.
 SCALE_RATIO: Final = 0.5
-#: Share of a short run with few passes before SH bands above the first are rendered: until then
-#: they cost time and gain little.
+#: Share of a short run with few passes before SH bands above the first are rendered. Earlier, these
+#: bands cost time and improve little.
 SH_START: Final = 0.5
 #: The highest SH degree.
 MOST_DEGREES: Final = 3
-#: Share of the run over which constant learning rates fade.
+#: Share of the run, at its end, over which constant learning rates decay.
 LR_TAIL: Final = 0.25
-#: Share of the Gaussians that a view is drawn without if at most so many photos show a point.
+#: Share of the Gaussians that a view omits, if the median point is seen by at most `FEW_PHOTOS`
+#: photos.
 DROPOUT, FEW_PHOTOS = 0.3, 5
-#: Edits that growth along the curve has in runs of so many views or more. In shorter runs, new
-#: primitives have no time to settle and can cost 1 dB.
+#: Smallest number of edits of budgeted growth, in runs of at least this many views. In shorter
+#: runs, new primitives have no time to converge and can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
-#: The reason while only the seconds of a run are known.
+#: The reason that the table shows while only the duration of a run in seconds is known.
 UNKNOWN: Final = "decided when the length is planned"
 #: The page that shows how these values were measured.
 SCHEDULES: Final = "docs/schedules.md"
 
 
 class Auto(Recipe):
-    """Decides what was measured to be best for the length and the device."""
+    """Uses the best measured settings for the length and the device of the run."""
 
     @override
     def decide(self, facts: Facts) -> list[Decision]:
@@ -72,7 +74,7 @@ class Auto(Recipe):
 
 
 class Choice:
-    """The values that several rows share, each worked out once.
+    """The values that several decisions share. Each value is computed once.
 
     Args:
         facts: The facts about the run.
@@ -84,13 +86,13 @@ class Choice:
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether the backbone has Gaussians with axes of their own, drawn as published."""
+        """Whether the backbone's Gaussians have their own axes and are rendered as published."""
         backbone = self.facts.backbone
         return bool(backbone.axes) and backbone.response == "plain"
 
     @cached_property
     def few_passes(self) -> bool:
-        """Whether the run shows each training photo only a few times."""
+        """Whether the run renders each training photo only a few times."""
         views = self.facts.views
         if views is None or "beta2" in self.given:
             return False
@@ -119,34 +121,34 @@ class Choice:
         return self.facts.densifier(self.densifier_name)
 
     def default_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
-        """How primitives grow in a run of any length, as was set or as suits the densifier."""
+        """Return the growth mode for any length: set by the user or by the densifier."""
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # A bound that the user names is a limit and not a target.
+        # A bound that the user sets is a limit, not a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"
 
     @cached_property
     def length(self) -> int:
-        """Length of the schedule, in what it counts."""
+        """Length of the schedule, in steps or views (the schedule's unit)."""
         return self.facts.schedule(self.facts.unit).length
 
     @cached_property
     def growth(self) -> Literal["unbounded", "budget"]:
-        """How primitives grow in this run: there is no budget at the published length."""
+        """The growth mode of this run; there is no budget at the published length."""
         usual = self.default_growth(budgeted=self.densifier.budgeted)
         return usual if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
     def led(self) -> bool:
-        """Whether growth follows the curve to a budget that suits the length."""
+        """Whether growth follows the schedule of a budget that suits the length."""
         return self.growth == "budget" and self.length < REFERENCE
 
 
 def components(choice: Choice) -> list[Decision]:
-    """Return the rows of components."""
+    """Return the decisions about components."""
     facts, name = choice.facts, choice.densifier_name
     usual = facts.backbone.default_densifier
     swapped = name != usual
@@ -199,7 +201,7 @@ def _dropout(facts: Facts) -> Decision:
 
 
 def growth(choice: Choice) -> list[Decision]:
-    """Return the rows of density control."""
+    """Return the decisions about density control."""
     facts, led = choice.facts, choice.led
     schedule = facts.schedule(facts.unit)
     usual = choice.default_growth(budgeted=choice.densifier.budgeted)
@@ -257,7 +259,7 @@ def _budget(choice: Choice) -> Decision:
 
 
 def rates(choice: Choice) -> list[Decision]:
-    """Return the rows of learning rates and of Adam."""
+    """Return the decisions about learning rates and Adam."""
     if choice.facts.steps is None:
         values = {"rate_factor": 1.0, "few_pass_rates": False, "beta1": BETA1, "beta2": BETA2}
         return [Decision(name, value, UNKNOWN, SCHEDULES) for name, value in values.items()]
@@ -310,7 +312,7 @@ def _rate_factor(choice: Choice) -> float:
 
 
 def _beta1(choice: Choice) -> float:
-    """Return the decay of the first moment: published with a batch rule, and with anchors."""
+    """Return the decay of the first moment: published for batch rules and for anchors."""
     facts = choice.facts
     if facts.views is None or facts.batched or not facts.backbone.axes:
         return BETA1
@@ -329,7 +331,7 @@ def _beta2(choice: Choice) -> float:
 
 
 def steps(choice: Choice) -> list[Decision]:
-    """Return the rows of how a step moves Gaussians."""
+    """Return the decisions about how a step updates Gaussians."""
     facts, short = choice.facts, choice.facts.short
     along = short and facts.backbone.gaussian_tensors is not None
     bounded = short and facts.backbone.learns_scales
@@ -363,18 +365,18 @@ def steps(choice: Choice) -> list[Decision]:
 
 
 def _sh_start(choice: Choice) -> float:
-    """Return the share of the run before the SH degree grows, as a whole number of views."""
+    """Return the share of the run before the SH degree grows, rounded to a whole view."""
     facts = choice.facts
     if not choice.few_passes or facts.unit != "views" or facts.published:
         return 0.0
     schedule = facts.schedule(facts.unit)
-    # Another schedule than the run's own may be longer than the run.
+    # The length of a custom schedule may exceed the length of the run.
     length = min(schedule.length, schedule.counted(schedule.total))
     return int(SH_START * shortness(schedule.length) * length) / length
 
 
 def ends(choice: Choice) -> list[Decision]:
-    """Return the rows of the end of a run."""
+    """Return the decisions about the end of a run."""
     edits = choice.densifier.edits
     fades = any(not block.lr.decays for block in choice.facts.backbone.trained_blocks())
     return [

@@ -1,6 +1,7 @@
-"""Recipes of the arms of the paper's experiments, as the grids in benchmarks/grids/paper run them.
+"""Recipes for the paper's experiments, one per arm, as in the grids of benchmarks/grids/paper.
 
-600 views are the 30,000 steps of the paper. What an arm does not fix, recipe `auto` decides.
+600 views are the 30,000 steps of the paper. Recipe `auto` decides all settings that an arm does not
+set.
 """
 
 from collections.abc import Mapping
@@ -8,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from crossgrad_plugins.recipes.auto import Auto
 
-#: Settings of all arms.
+#: Settings that all arms share.
 BASE: Final[Mapping[str, Any]] = {
     "max_views": 1200,
     "data.max_size": 400,
@@ -19,12 +20,12 @@ BASE: Final[Mapping[str, Any]] = {
     "metrics": ["psnr", "ssim", "psnr-cc"],
     "eval_from": 100_000,
 }
-#: Settings of the arms that draw a near and a far view in each step.
+#: Settings of the arms that render a near and a far view in each step.
 PAIRS: Final[Mapping[str, Any]] = {**BASE, "sampler": "near-far", "views_per_step": 2}
 
 
 class Vanilla30k(Auto):
-    """One view per step, for as many views as the paper's run of 30,000 steps."""
+    """One view per step, with as many views as the paper's run of 30,000 steps."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -35,7 +36,7 @@ class Vanilla30k(Auto):
 
 
 class Vanilla60k(Auto):
-    """One view per step, for as many views as two views per step draw."""
+    """One view per step, with as many views as an arm with two views per step renders."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -52,7 +53,7 @@ class TwoRandomViews(Auto):
 
 
 class Balanced(Auto):
-    """One view per step, near and far by turns."""
+    """One view per step, alternately near and far."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -91,7 +92,7 @@ class GradNorm(Auto):
 
 
 class ConfGate(Auto):
-    """A near and a far view per step, and the gate by confidence of conflict."""
+    """A near and a far view per step, and the gate by the confidence of a conflict."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "confgate"}
 

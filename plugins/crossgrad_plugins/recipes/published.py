@@ -1,4 +1,4 @@
-"""Recipe `published`: the rules of the original code of 3DGS, whatever the length of the run."""
+"""Recipe `published`: the rules of the original 3DGS code, for any length of the run."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
@@ -7,7 +7,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Decision, Facts, Recipe, Unit
 
-#: Near plane of the original code, in units of the scene's own frame.
+#: Near plane of the original code, in units of the scene's original frame.
 NEAR: Final = 0.2
 BECAUSE: Final = "as published"
 #: Settings that do not depend on any fact.

@@ -1,4 +1,4 @@
-"""Base of the resolutions that begin with small photos and end with the full size."""
+"""Base class of the resolutions that begin with small photos and end with the full size."""
 
 from abc import abstractmethod
 from bisect import bisect_left, bisect_right
@@ -21,23 +21,22 @@ from crossgrad_core.plugin import (
     Schedule,
 )
 
-#: A photo that would be reduced by less has its full size: there is hardly a pixel to save.
+#: A scale of at least this value is replaced by full size, because it would save hardly any pixels.
 FULL_FROM = 0.95
 _REACHED = "reached"
-#: Where density control goes on for longer, the window ends at this share of the run.
+#: If density control lasts longer, the window ends at this share of the run.
 LATEST = 0.9
-#: Without density control it ends here.
+#: Without density control, the window ends at this share of the run.
 USUAL = 0.5
 
 
 @dataclass(frozen=True)
 class Course:
-    """Scales one after the other, then full size.
+    """A sequence of increasing scales, followed by full size.
 
     Attributes:
-        ends: Shares of the window, at most 1, up to which each scale lasts; none is below another
-            one before it.
-        scales: As many scales in (0, 1); likewise.
+        ends: Shares of the window, at most 1, at which each scale ends; never decreasing.
+        scales: The scales, in (0, 1), as many as `ends`; never decreasing.
     """
 
     ends: tuple[float, ...] = ()
@@ -45,24 +44,24 @@ class Course:
 
     @classmethod
     def of_parts(cls, scales: Sequence[float]) -> "Course":
-        """Scales that last equally long and fill the window together."""
+        """Return a course whose scales last equally long and together fill the window."""
         count = len(scales)
         return cls(tuple((part + 1) / count for part in range(count)), tuple(scales))
 
     @classmethod
     def of_stages(cls, stages: Iterable[tuple[float, float]]) -> "Course":
-        """Scales with the share of the window at which each ends."""
+        """Return a course of stages (share of the window at which a scale ends, scale)."""
         return cls(*map(tuple, zip(*stages, strict=True)))
 
     def at(self, progress: float) -> float:
-        """The scale after that share of the window."""
+        """Return the scale after a share of the window."""
         part = bisect_right(self.ends, progress)
         return self.scales[part] if part < len(self.scales) else 1.0
 
     def pixels(self, progress: float) -> float:
-        """The sum of the pixels up to that share of the window, which may be over; 1 at full size.
+        """Return the sum of rendered pixels up to a share of the window, in photos at full size.
 
-        That is the integral of the squared scale.
+        The sum is the integral of the squared scale. The share may be above 1.
         """
         borders = [min(end, progress) for end in (0.0, *self.ends)]
         parts = zip(pairwise(borders), self.scales, strict=True)
@@ -70,7 +69,7 @@ class Course:
         return reduced + progress - borders[-1]
 
     def text(self, schedule: Schedule, window: float) -> str:
-        """The scales by step, of a run whose window is over at that count."""
+        """Return a text with the scales by step, for a window that ends at a given count."""
         if not self.scales:
             return "full size"
         scales = (*self.scales, 1.0)
@@ -85,17 +84,17 @@ class Course:
 
 @dataclass(frozen=True)
 class Part:
-    """The course of some photos, and how many there are."""
+    """The course of some photos, and the number of these photos."""
 
     course: Course
     photos: int = 1
 
 
 class CoarseToFine(Resolution):
-    """Renders and compares small photos first, then larger ones.
+    """Renders and compares small photos first, then larger photos.
 
-    No scale falls again, also where the length of the run follows the clock and its end moves away:
-    the largest scale that each course has reached is remembered.
+    A scale never decreases. This also holds if the length of the run follows the clock and its end
+    moves: the state contains the largest scale that each course has reached.
     """
 
     smallest: int = Field(
@@ -104,11 +103,15 @@ class CoarseToFine(Resolution):
 
     @abstractmethod
     def window(self, schedule: Schedule) -> float:
-        """The count, of views or of steps, from which on every view has its full size; 0: all."""
+        """Return the count of views or steps from which views have full size; 0: from the start."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, Part]:
-        """The courses by regime; one that is not there has the first one, none the full size."""
+        """Return the courses by regime.
+
+        A regime that is missing uses the first course. If there is no course, all views have full
+        size.
+        """
 
     @override
     def scales(
@@ -127,7 +130,7 @@ class CoarseToFine(Resolution):
         return tuple(found), PluginState({_REACHED: cast("Json", reached)})
 
     def measured(self, scene: Scene) -> "CoarseToFine":
-        """Fitted to the scene, which a run has done before its first step."""
+        """Return the resolution fitted to the scene; a run fits it before its first step."""
         return cast("CoarseToFine", self.fitted_to(scene))
 
     @override
@@ -149,18 +152,18 @@ class CoarseToFine(Resolution):
         return schedule.pace.views(step) * (rendered / every if every else 1.0)
 
     def of_photo(self, camera: Camera, scale: float) -> float:
-        """A scale that leaves a photo enough pixels."""
+        """Return the scale, raised so that the photo keeps enough pixels."""
         least = self.smallest / min(camera.width, camera.height)
         return 1.0 if max(scale, least) >= FULL_FROM else max(scale, least)
 
 
 def window_of(schedule: Schedule, until: float | None) -> float:
-    """The count, of views or of steps, from which on every view has its full size.
+    """Return the count of views or steps after which every view has full size.
 
     Args:
         schedule: The schedule of the run.
-        until: A share of the run; None for the end of density control, half of the run where there
-            is none.
+        until: A share of the run. None means the end of density control, or half of the run without
+            density control.
     """
     whole = schedule.counted(schedule.total)
     if until is not None:

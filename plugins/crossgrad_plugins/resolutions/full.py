@@ -1,4 +1,4 @@
-"""Every view in its full size."""
+"""Every view at full size."""
 
 from typing_extensions import override
 
@@ -6,7 +6,7 @@ from crossgrad_core.plugin import PluginState, Resolution, ScaleContext
 
 
 class FullSize(Resolution):
-    """Renders and compares every view in the size of its photo as trained."""
+    """Renders and compares every view at the size of its training photo."""
 
     @override
     def scales(

@@ -15,26 +15,27 @@ from typing_extensions import override
 from crossgrad_core.plugin import Field, Scene, Schedule, View
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part, window_of
 
-#: Spectra are those of so many photos, at most, of all regimes together.
+#: Maximum number of photos whose spectrum is measured, over all regimes together.
 MOST_PHOTOS = 32
-#: Regimes have courses of their own where what a scale keeps of their spectra differs by more.
+#: Regimes get separate courses if the shares of the spectrum that a scale keeps differ by more than
+#: this.
 ALIKE = 0.05
 #: Name of the course of all photos.
 ALL = "all"
-#: Shares are known at so many scales, 1 / GRID to 1.
+#: Number of scales, 1 / GRID to 1, at which the shares are measured.
 GRID = 256
-#: Photos are looked at in a window of so many pixels a side at most, in their middle: the share of
-#: the spectrum that a scale keeps is the same in a part, but not in a smaller copy.
+#: Largest side of the window in the middle of a photo that is analysed, in pixels. A scale keeps
+#: the same share of the spectrum in a crop as in the photo, but not in a smaller copy.
 _WINDOW = 1024
-#: Photos that are decoded at once; more of them would take memory.
+#: Number of photos that are decoded at once; more would need too much memory.
 _AT_ONCE = 2
-#: A frequency that a scale just keeps may have been rounded up.
+#: Tolerance, because a frequency that a scale just keeps may have been rounded up.
 _ROUNDING = 1e-9
 Floats = NDArray[np.float64]
 
 
 class Scales(BaseModel):
-    """The scales of some photos, as config.yaml has them."""
+    """The scales of some photos, as written to config.yaml."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -45,11 +46,11 @@ class Scales(BaseModel):
 
 
 class Spectral(CoarseToFine):
-    """Photos that stay small for as long as a small size keeps much of their spectrum.
+    """Keeps photos small as long as the small size contains much of their spectrum.
 
-    X(F_r) is the sum of the amplitudes of the frequencies that photos of 1 / r of the size have.
-    A run begins with the r at which X(F_r) = X(F) / ratio, and leaves an r for a finer one after
-    X(F_r) / X(F) of the window; between the levels of r the number of pixels grows linearly.
+    X(F_r) is the sum of the amplitudes of the frequencies that photos at 1 / r of the size contain.
+    A run begins with the r at which X(F_r) = X(F) / ratio. It leaves an r for a finer r after the
+    share X(F_r) / X(F) of the window. Between the levels of r, the number of pixels grows linearly.
 
     Source: DashGaussian (arXiv 2503.18402).
     """
@@ -96,7 +97,7 @@ class Spectral(CoarseToFine):
         return {name: Part(_course(each.scales), each.photos) for name, each in known.items()}
 
     def _groups(self, scene: Scene) -> Mapping[str, "_Group"]:
-        """The photos that have a course in common."""
+        """Return the groups of photos that share a course, by name."""
         views = scene.train_views
         regimes = sorted({view.regime for view in views}) if self.per_regime != "never" else []
         if len(regimes) > 1:
@@ -111,7 +112,7 @@ class Spectral(CoarseToFine):
         return {ALL: _Group.of(views, MOST_PHOTOS)}
 
     def _scales(self, group: "_Group") -> tuple[float, ...]:
-        """The scales of some photos in equal parts of the window; none where all is needed."""
+        """Return the scales in equal parts of the window; empty if full size is needed at once."""
         scales = np.arange(GRID + 1) / GRID
         least = min(1.0, max(1.0 / self.coarsest, self.smallest / group.shorter))
         first = int(np.argmax((scales >= least) & (group.kept >= 1.0 / self.ratio)))
@@ -120,9 +121,9 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        ahead = np.searchsorted(ends, parts, side="right")  # The level that is left next.
+        ahead = np.searchsorted(ends, parts, side="right")  # The level that the run leaves next.
         behind = np.maximum(ahead - 1, 0)
-        # Before the first level is left there is nothing to go on from.
+        # Before the first level is left, there is no level to interpolate from.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
         found = pixels[behind] + share * (pixels[ahead] - pixels[behind])
         return tuple(np.sqrt(found).round(4).tolist())
@@ -130,12 +131,12 @@ class Spectral(CoarseToFine):
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Photos that have a course in common.
+    """A group of photos that share a course.
 
     Attributes:
-        views: Theirs.
-        kept: [GRID + 1] share of their spectrum that the scales 0, 1 / GRID .. 1 keep.
-        shorter: Pixels of the shorter side; the median.
+        views: The views of the photos.
+        kept: [GRID + 1] share of the spectrum that the scales 0, 1 / GRID .. 1 keep.
+        shorter: Median of the shorter side, in pixels.
     """
 
     views: Sequence[View]
@@ -144,7 +145,7 @@ class _Group:
 
     @classmethod
     def of(cls, views: Sequence[View], most: int) -> "_Group":
-        """The group of some views, by the spectra of at most so many, spread over them."""
+        """Return the group of `views`; at most `most` spectra, evenly spread, are measured."""
         chosen = np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int)
         shorter = [min(view.camera.width, view.camera.height) for view in views]
         kept = kept_shares([views[each] for each in chosen])
@@ -157,12 +158,13 @@ def _course(scales: tuple[float, ...]) -> Course:
 
 
 def kept_shares(views: Sequence[View]) -> Floats:
-    """[GRID + 1] X(F_r) / X(F) at the scales 0, 1 / GRID .. 1: what is left of the spectrum.
+    """Return [GRID + 1] X(F_r) / X(F) at scales 0, 1 / GRID .. 1: the share of the spectrum kept.
 
-    X(F) is the sum of the amplitudes |DFT| of the grey photos, X(F_r) that of the frequencies that
-    a photo of 1 / r of the size has: those of at most 1 / r of the highest one, in x and in y. One
-    thread works on each photo and sums are in the order of the photos, so that no bit depends on
-    threads. Photos without an amplitude keep all at every scale.
+    X(F) is the sum of the amplitudes |DFT| of the grey photos. X(F_r) is the sum over the
+    frequencies that a photo at 1 / r of the size contains: at most 1 / r of the highest frequency,
+    in x and in y. Each photo is processed by one thread, and sums are in the order of the photos,
+    so the result does not depend on the number of threads. Photos whose amplitudes are all zero
+    keep everything at every scale.
 
     Args:
         views: The views, at least one.
@@ -183,11 +185,11 @@ def _of_view(view: View) -> Floats:
 
 
 def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
-    """[h, w] the middle of a photo in grey, 0 to 255; the mean where pixels do not count.
+    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean of others.
 
     Args:
         image: [H, W, 3] uint8.
-        mask: [H, W] bool; None where every pixel counts.
+        mask: [H, W] bool; None if every pixel counts.
     """
     top, left = (max(0, (size - _WINDOW) // 2) for size in image.shape[:2])
     part = slice(top, top + _WINDOW), slice(left, left + _WINDOW)
@@ -199,20 +201,20 @@ def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
 
 
 def amplitudes_within(grey: Floats) -> Floats:
-    """[GRID + 1] the sum of the amplitudes |DFT| of the frequencies that each scale keeps.
+    """Return [GRID + 1] the sum of the amplitudes |DFT| of the frequencies that each scale keeps.
 
     Args:
-        grey: [H, W].
+        grey: [H, W] photo.
     """
     height, width = grey.shape
     amplitudes = np.abs(np.fft.rfft2(grey))
-    # Of a real image the other half of the columns is the same, but for the first and, of an even
-    # number, the last one.
+    # For a real image, the other half of the columns is the same. Exceptions are the first column
+    # and, if their number is even, the last column.
     amplitudes[:, 1 : (width + 1) // 2] *= 2.0
     cells = np.maximum.outer(_cells(np.fft.fftfreq(height)), _cells(np.fft.rfftfreq(width)))
     return np.cumsum(np.bincount(cells.ravel(), amplitudes.ravel(), GRID + 1))
 
 
 def _cells(frequencies: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Number of the first scale that keeps each frequency, cycles per pixel in [-1/2, 1/2]."""
+    """Return the first scale index that keeps each frequency, cycles per pixel in [-1/2, 1/2]."""
     return np.asarray(np.ceil(2.0 * GRID * np.abs(frequencies) - _ROUNDING), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Some of the pixels of a photo for most of the run, all of them at its end."""
+"""Some pixels of each photo for most of the run, all pixels at its end."""
 
 from collections.abc import Mapping
 from math import ceil, isqrt
@@ -10,17 +10,17 @@ from typing_extensions import override
 from crossgrad_core.plugin import Camera, Field, Scene, Schedule, listed, shortness
 from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, Part
 
-#: Share of a short run up to which one pixel of each 2 x 2 is drawn; of longer ones less.
+#: Share of a short run in which one pixel of each 2 x 2 is rendered; smaller for longer runs.
 _SHARE = 0.8
-#: Shares of that up to which it is one of each 8 x 8, and of each 4 x 4.
+#: Shares of this window in which one pixel of each 8 x 8, and of each 4 x 4, is rendered.
 _EIGHTH, _QUARTER = 0.3, 0.6
 
 
 class Strided(CoarseToFine):
-    """Draws one pixel of each n x n up to a share of the run, another one in each step.
+    """Renders one pixel of each n x n up to a share of the run, a different pixel in each step.
 
-    Photos are not reduced: what is drawn is what the full render has at these pixels, so that the
-    gradients of an error by pixels are right in the mean. Ours.
+    Photos are not reduced. The rendered pixels have the same values as in the full render. So the
+    gradients of a per-pixel error are unbiased. Ours.
     """
 
     strided: ClassVar[bool] = True
@@ -41,13 +41,13 @@ class Strided(CoarseToFine):
     @override
     def fitted_to(self, scene: Scene) -> "Strided":
         most = [self._most(view.camera) for view in scene.train_views]
-        # An n that somebody names is that of the photos that are large enough for it.
+        # An n that the user sets is used for the photos that are large enough for it.
         n = median(most) if self.coarsest is None else min(self.coarsest, max(most))
         return self.model_copy(update={"coarsest": max(each for each in (1, 2, 4, 8) if each <= n)})
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
-        # In each step: not all photos are looked at again.
+        # This is called in each step, so do not examine all photos again.
         return self if self.coarsest is not None else self.fitted_to(scene)
 
     @override
@@ -88,6 +88,6 @@ class Strided(CoarseToFine):
         return 1.0 / min(round(1.0 / scale), self._most(camera))
 
     def _most(self, camera: Camera) -> int:
-        """The n that a photo has at most."""
+        """Return the largest n that a photo allows."""
         by_side = min(camera.width, camera.height) // self.smallest
         return max(1, min(by_side, isqrt(camera.width * camera.height // self.least)))

@@ -1,7 +1,7 @@
-"""Gaussians left out of training views at random, so that a run does not overfit few photos.
+"""Dropout of random Gaussians in training views, so that a run does not overfit few photos.
 
-Source: DropGaussian (Park et al. 2025), whose share grows with the steps. A constant share, and the
-scenes that it is used on, are ours (docs/few-photos.md).
+Source: DropGaussian (Park et al. 2025), whose share grows with the steps. The constant share and
+the choice of scenes are ours (docs/few-photos.md).
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Field, GaussiansContext, GaussiansResult, Rule, hookimpl
 
-#: The name of the rule, and of its generator.
+#: The name of the rule and of its random generator.
 NAME: Final = "dropout"
 
 
@@ -26,17 +26,18 @@ class Dropout(Rule):
 
     @hookimpl
     def crossgrad_view_gaussians(self, context: GaussiansContext) -> GaussiansResult:
-        """Make the Gaussians that are left as much more opaque as others are missing."""
+        """Raise the opacity of the remaining Gaussians to replace the omitted ones."""
         gaussians = context.gaussians
         draws = _draws(context.rngs[NAME], len(gaussians), gaussians.opacities.device)
         raised = gaussians.opacities * ((draws >= self.share) / (1.0 - self.share))
-        # Cut off at 1, but not its gradient: a nearly opaque Gaussian could never fade.
+        # Clamp the value to 1 but keep its gradient; otherwise a nearly opaque Gaussian could never
+        # fade.
         opacities = raised - (raised.detach() - 1.0).clamp(min=0.0)
         return GaussiansResult(replace(gaussians, opacities=opacities))
 
 
 def _draws(rng: np.random.Generator, count: int, device: torch.device) -> Tensor:
-    """[N] uniform in [0, 1), drawn on the device: the CPU takes milliseconds for a million."""
+    """Return [N] uniform numbers in [0, 1), drawn on the device, because the CPU is slow."""
     if device.type == "cpu":
         return torch.from_numpy(rng.random(count, dtype=np.float32))
     generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 63)))

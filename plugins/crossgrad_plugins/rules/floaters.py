@@ -1,8 +1,8 @@
-"""Floaters: primitives around a camera that no training photo shows, removed at the end of a run.
+"""Removal of floaters at the end of a run: primitives near a camera that no training photo shows.
 
-A step may carry a Gaussian past the camera that it is seen from, or out at the side of its photo.
-No photo pulls at it any more, so that it stays as it is, and if it is opaque it hides all that a
-photo from nearby would show (docs/floaters.md). The rule is ours.
+A step may move a Gaussian behind its camera or out of the photo at the side. Then no photo has a
+gradient for it, so it does not change any more. If it is opaque, it hides the scene in photos from
+nearby (docs/floaters.md). The rule is ours.
 """
 
 from typing import Final
@@ -26,9 +26,10 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The percentile of the depths of its SfM points that counts as nearest: single points lie wrong.
+#: The percentile of the depths of a camera's SfM points that counts as nearest. Single points are
+#: often wrong.
 NEAREST: Final = 1.0
-#: Cameras that observe fewer points say nothing about what is empty.
+#: A camera that observes fewer points than this does not show which space is empty.
 FEWEST_SEEN: Final = 8
 
 
@@ -39,14 +40,15 @@ class Floaters(Rule):
         0.3,
         gt=0,
         le=1,
-        # The ground below a level camera, which sees it from some way off on, is farther away.
+        # The ground below a level camera is farther away, because the camera sees it only from a
+        # distance.
         description="share of the distance from a camera to the nearest point it sees that counts "
         "as empty",
     )
 
     @hookimpl
     def crossgrad_final_edit(self, model: Model) -> FinalEdit | None:
-        """Remove the floaters, unless nothing else would be left."""
+        """Remove the floaters, unless this would remove all primitives."""
         count, rows = _primitives(model), floaters(model, self.empty)
         if not 0 < len(rows) < count:
             return None
@@ -64,7 +66,7 @@ class Floaters(Rule):
 
 
 def removed(count: int) -> str:
-    """Return the line of the log about the removal of so many primitives."""
+    """Return the log line about the removal of `count` primitives."""
     were = "primitive was" if count == 1 else "primitives were"
     return (
         f"floaters: {count:,} {were} removed that no training photo shows, in the empty space "
@@ -77,10 +79,10 @@ def _primitives(model: Model) -> int:
 
 
 def floaters(model: Model, empty: float) -> Tensor:
-    """[F] int64: the primitives in the empty space around a camera that touch no training photo.
+    """Return [F] int64 rows of primitives in empty space that touch no training photo.
 
-    A hidden primitive counts as touched: only one that the rasterizer leaves out of every photo
-    floats.
+    A hidden primitive counts as touched. A primitive is a floater only if the rasterizer omits it
+    from every training photo.
 
     Args:
         model: The model at the end of the run.
@@ -95,7 +97,8 @@ def floaters(model: Model, empty: float) -> Tensor:
     for view in model.scene.train_views:
         if len(rows) == 0:
             break
-        # Alone they are drawn in no time, and what would hide them does not matter.
+        # Rendered alone, the candidates take little time, and it does not matter what would hide
+        # them.
         alone = apply_to_parameters(Edit(rows), backbone.blocks(), parameters)
         with torch.no_grad():
             gaussians = backbone.decode(alone, view.camera, model.phase)
@@ -108,17 +111,17 @@ def floaters(model: Model, empty: float) -> Tensor:
 
 
 def cameras_that_tell(scene: Scene) -> list[View]:
-    """The training views that observe enough points to say how far the empty space goes."""
+    """Return the training views that observe enough points to bound the empty space."""
     return [view for view in scene.train_views if len(view.seen) >= FEWEST_SEEN]
 
 
 def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -> NDArray[np.bool_]:
-    """[N]: whether each position lies in the space that the nearest camera shows to be empty.
+    """Return [N] bool: whether each position is in the empty space around the nearest camera.
 
     Args:
         positions: [N, 3], local frame.
-        scene: Its training cameras and their SfM points count.
-        empty: Share of the way from a camera to the nearest point that it sees.
+        scene: The scene; its training cameras and their SfM points are used.
+        empty: Share of the distance from a camera to the nearest point that it sees.
     """
     from scipy.spatial import cKDTree  # Slow to import.
 

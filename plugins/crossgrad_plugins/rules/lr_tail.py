@@ -1,7 +1,7 @@
-"""Learning rates that fade at the end of a run.
+"""A decay of learning rates at the end of a run.
 
-The rates of opacity, scale and colour are constant as published, so that renders still fluctuate at
-the end of a run. Fading rates end that (docs/steady-ends.md).
+The published rates of opacity, scale and colour are constant, so renders still fluctuate at the end
+of a run. Decaying rates remove these fluctuations (docs/steady-ends.md).
 """
 
 from typing_extensions import override
@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Backbone, Field, LearningRate, Rule, Scene, Sc
 
 
 class LrTail(Rule):
-    """Lets constant learning rates fade over the last share of the steps."""
+    """Decays constant learning rates over the last share of the steps."""
 
     share: float = Field(
         0.25, gt=0, le=1, description="share of the steps, the last ones, in which rates fade"
@@ -21,7 +21,7 @@ class LrTail(Rule):
     def crossgrad_rate_factor(
         self, rate: LearningRate, step: int, schedule: Schedule
     ) -> float | None:
-        """Fade log-linearly from 1 to `factor`; rates that decay do so as published."""
+        """Decay log-linearly from 1 to `factor`; return None for rates that decay already."""
         total = schedule.total
         step, start = min(step, total), (1.0 - self.share) * total
         if rate.decays or step <= start:

@@ -1,9 +1,9 @@
 """A bound on the sizes of Gaussians near cameras.
 
-A splat is drawn as if its Gaussian were small for its distance. A large Gaussian at the side of a
-camera, or behind it, spreads over the camera's view, whether or not a training photo shows it
-(docs/floaters.md). Cameras that have it in their photo correct its size themselves. The rule is
-ours.
+A rasterizer projects a Gaussian as if it were small compared with its distance. A large Gaussian
+beside or behind a camera therefore spreads over the camera's view, and a training photo may not
+show it (docs/floaters.md). Cameras that have the Gaussian in their photo correct its size
+themselves. The rule is ours.
 """
 
 from math import log
@@ -28,17 +28,17 @@ from crossgrad_core.plugin import (
     is_in_image,
 )
 
-#: Steps between two looks at the sizes.
+#: Steps between two checks of the sizes.
 EVERY: Final = 50
-#: Smaller Gaussians are left alone, in scene extents. Most are smaller, and hardly one of them is
-#: above the bound.
+#: Smaller Gaussians are not checked, in scene extents. Most are smaller, and hardly any of them
+#: exceeds the bound.
 LEAST: Final = 0.01
-#: Distances that are computed at once.
+#: Maximum number of distances that are computed at once.
 _AT_ONCE: Final = 2**20
 
 
 class ScaleClamp(Rule):
-    """Bounds the standard deviations of Gaussians by their distance to a camera at their side."""
+    """Bounds standard deviations of Gaussians by the distance to cameras that do not show them."""
 
     ratio: float = Field(
         0.5,
@@ -49,7 +49,7 @@ class ScaleClamp(Rule):
 
     @hookimpl
     def crossgrad_after_optimizer(self, context: AfterStepContext) -> DensifyResult | None:
-        """Shorten axes that are too long, in the steps in which sizes are looked at."""
+        """Shorten axes that are too long, in every step that checks the sizes."""
         names, scene, ratio = context.backbone.gaussian_tensors, context.scene, self.ratio
         if context.step % EVERY or names is None:
             return None
@@ -74,10 +74,10 @@ class ScaleClamp(Rule):
 
 
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
-    """[N] bool: all positions [N, 3] that are nearer to any training camera, and few others.
+    """Return [N] bool: True for all positions [N, 3] nearer than `distances` [N] to any camera.
 
-    Products tell that fastest. They lose what is small of two large positions, so that as much is
-    taken off.
+    A few positions that are farther away may be True as well. The product form of the squared
+    distance is fastest. It loses precision for large coordinates, so an error bound is subtracted.
     """
     centers = torch.from_numpy(scene.centers).to(positions)
     squares, of_centers = (each.square().sum(dim=1) for each in (positions, centers))
@@ -90,9 +90,9 @@ def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
 
 
 def _nearest_beside(scene: Scene, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N] distance to the nearest training camera that has a position [N, 3] not in its photo.
+    """Return [N] distance to the nearest training camera with a position [N, 3] outside its photo.
 
-    Infinite for what all photos show.
+    The distance is infinite for positions that all photos show.
     """
     nearest = np.full(len(positions), np.inf)
     for view in scene.train_views:

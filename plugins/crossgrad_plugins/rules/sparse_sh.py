@@ -1,4 +1,4 @@
-"""SH bands that learn in some steps only, which saves time (docs/schedules.md)."""
+"""SH bands that are updated only in some steps, which saves time (docs/schedules.md)."""
 
 from collections.abc import Mapping
 
@@ -8,13 +8,13 @@ from crossgrad_core.plugin import Backbone, Block, Field, Rule, Scene, hookimpl
 
 
 class SparseSh(Rule):
-    """Lets SH bands above the first learn in one of several steps."""
+    """Updates SH bands above the first only in every n-th step."""
 
     every: int = Field(2, ge=2, le=100, description="SH bands learn in one of so many steps")
 
     @hookimpl
     def crossgrad_update_intervals(self, blocks: tuple[Block, ...]) -> Mapping[str, int]:
-        """Name the tensors of all blocks that need not learn in every step."""
+        """Return the interval for all tensors that need not be updated in every step."""
         return {name: self.every for block in blocks if block.rests for name in block.tensors}
 
     @override

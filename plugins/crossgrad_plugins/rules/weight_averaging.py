@@ -1,4 +1,4 @@
-"""The average of the last parameters, which evaluations and exports show (docs/steady-ends.md)."""
+"""The average of the last parameters, used for evaluation and export (docs/steady-ends.md)."""
 
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Final
@@ -16,18 +16,18 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The name of the rule, and of its state.
+#: The name of the rule and of its state.
 NAME: Final = "weight-averaging"
 _COUNT: Final = "count"
-#: Most states that an average is taken over. Neighbouring states hardly differ, and sums of so few
-#: float32 numbers round by a millionth.
+#: Maximum number of states in an average. Neighbouring states hardly differ, and a sum of 100
+#: float32 numbers has a rounding error of about one millionth.
 SAMPLES: Final = 100
-#: Decimals of a number of steps that are no rounding.
+#: Decimals of a number of steps that are kept; the rest is a rounding error.
 _DIGITS: Final = 6
 
 
 class WeightAveraging(Rule):
-    """Shows the average of the parameters of the last share of the steps."""
+    """Averages the parameters over the last share of the steps."""
 
     copies: ClassVar[int] = 3
     share: float = Field(
@@ -38,12 +38,12 @@ class WeightAveraging(Rule):
     def crossgrad_step_done(self, context: AfterStepContext) -> Answer | None:
         """Add the parameters to the sums in the steps that are averaged.
 
-        The sums start again if the primitives are others now, or if their values were overwritten.
+        The sums start again if the set of primitives changed or if values were overwritten.
         """
         held, total = context.state(NAME), context.schedule.total
-        # A tenth of ten steps is one, though not in binary numbers.
+        # A tenth of ten steps is one step, but not in binary floating point.
         before = int(round((1.0 - self.share) * total, _DIGITS))
-        left_out = context.step <= before  # The run may have become longer.
+        left_out = context.step <= before  # The run may have been extended.
         state = EMPTY_STATE if context.edited or left_out else held
         if not left_out and (total - context.step) % -(-(total - before) // SAMPLES) == 0:
             state = _added(state, context.backbone.trained_blocks(), context.parameters)
@@ -53,7 +53,7 @@ class WeightAveraging(Rule):
     def crossgrad_eval_parameters(
         self, states: Mapping[str, PluginState]
     ) -> Mapping[str, Tensor] | None:
-        """Return the means, if there are any yet."""
+        """Return the mean parameters, or None if no step was averaged yet."""
         held = states.get(NAME, EMPTY_STATE)
         count = held.values.get(_COUNT)
         if not isinstance(count, int):
@@ -67,7 +67,7 @@ def _added(
 ) -> PluginState:
     """Return the state with the parameters added to its sums.
 
-    Sums alone have the same bits on any number of threads; means are taken when they are shown.
+    Sums have the same bits for any number of threads. The division follows when the means are used.
     """
     known = {**state.tensors, **state.per_primitive}
     sums: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})

@@ -1,4 +1,4 @@
-"""Active pairs: a view and a partner of another group whose loss differs most."""
+"""Active pairs: a view, and a partner from the other group with a very different loss."""
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -24,16 +24,16 @@ _SMALLEST_TEMPERATURE = 1e-8
 
 
 class Active(Sampler):
-    """A uniform view, and a view of the other group by disparity of their running losses.
+    """A uniform view, and a view of the other group chosen by the difference in running loss.
 
-    The partner is drawn among the `top` views of the other group with the largest
-    |loss - loss of the first view|, by a softmax whose temperature is the standard deviation of
-    these differences. Losses are running means per view, which begin anew where the
-    octave of its scale changes. Views that were never rendered have none:
-    they are drawn first, in either place.
+    The partner is drawn from the `top` views of the other group with the largest |loss - loss of
+    the first view|. The draw is a softmax whose temperature is the standard deviation of these
+    differences. Losses are running means per view. A running mean starts again when the octave of
+    the view's scale changes. Views that were never rendered have no running loss; they are drawn
+    first, as first view or as partner.
 
-    Source: the paper, active loss-disparity pairing; top, temperature and decay are ours, for the
-    paper names no figures.
+    Source: the paper, active loss-disparity pairing. The values of top, temperature and decay are
+    ours, because the paper does not give them.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -62,10 +62,10 @@ class Active(Sampler):
     def _running_losses(
         self, last: StepRecord | None, state: PluginState
     ) -> tuple[dict[str, float], dict[str, int]]:
-        """View (as text, for JSON) -> running loss, the last step included, and -> its octave.
+        """Return the running loss and the octave of each view (its index as text, for JSON).
 
-        A view's running loss begins anew where it is rendered at another octave of scale; views
-        at full size have no entry among the octaves.
+        The losses include the last step. A view's running loss starts again when the view is
+        rendered at another octave of scale. Views at full size have no entry in the octaves.
         """
         losses = dict(cast("Mapping[str, float]", state.values.get("losses", {})))
         octaves = dict(cast("Mapping[str, int]", state.values.get("octaves", {})))
@@ -89,12 +89,12 @@ class Active(Sampler):
         losses: Mapping[str, float],
         rng: np.random.Generator,
     ) -> int:
-        """The second view: never rendered ones first, then by disparity."""
+        """Return the second view: a never rendered one if there is any, else by loss difference."""
         fresh = _never_rendered(others, losses)
         if fresh or str(first) not in losses:
             return _uniform(fresh or others, rng)
         scores = np.abs(np.array([losses[str(view)] for view in others]) - losses[str(first)])
-        # A stable sort, so that equal scores keep the order of the views.
+        # A stable sort keeps the order of the views for equal scores.
         best = np.argsort(-scores, kind="stable")[: self.top]
         temperature = max(float(scores[best].std()), _SMALLEST_TEMPERATURE)
         logits = (scores[best] - scores[best].max()) / temperature
@@ -103,7 +103,7 @@ class Active(Sampler):
 
 
 def _never_rendered(pool: Sequence[int], losses: Mapping[str, float]) -> list[int]:
-    """The views of the pool without a running loss."""
+    """Return the views of the pool without a running loss."""
     return [view for view in pool if str(view) not in losses]
 
 

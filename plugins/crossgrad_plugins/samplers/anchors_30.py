@@ -1,4 +1,4 @@
-"""Anchor pairs: the nearest and the farthest cameras meet each other, the middle meets itself."""
+"""Anchor pairs: near cameras are paired with far cameras, middle cameras with middle cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -21,12 +21,12 @@ _OPPOSITE = {"near": "far", "far": "near"}
 
 
 class Anchors30(Sampler):
-    """A uniform view, and a partner: of the opposite anchor group, or of the middle for the middle.
+    """A uniform view, and a partner from the opposite anchor group (middle views: from the middle).
 
-    Meant with operator `anchors`, which projects only between an anchor pair.
+    Intended for operator `anchors`, which projects only between the views of an anchor pair.
 
-    Source: the paper, operator variants (nearest and farthest 30 % are anchors; the rule of the
-    draw is ours).
+    Source: the paper, operator variants (the nearest and farthest 30 % are anchors; the sampling
+    rule is ours).
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -35,7 +35,7 @@ class Anchors30(Sampler):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Refuses groups without near and far ones."""
+        """Return an objection if the grouping has no near or no far group."""
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
             return [
                 "sampler anchors-30 needs groups labelled near and far; grouping "
@@ -54,7 +54,7 @@ class Anchors30(Sampler):
 
 
 def _anchor_groups(context: SampleContext) -> Mapping[str, Sequence[int]]:
-    """Label -> training views.
+    """Return label -> training views.
 
     Raises:
         UserError: There is no grouping with labels near and far.

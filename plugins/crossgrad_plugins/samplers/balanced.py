@@ -1,4 +1,4 @@
-"""Samplers of equal numbers of views from every group."""
+"""Samplers that draw equal numbers of views from every group."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, cast
@@ -22,10 +22,10 @@ HALVES = ("first", "second")
 
 
 class NearFar(Sampler):
-    """K/2 near and K/2 far views per step, near and far taking turns within the step.
+    """K/2 near and K/2 far views per step, alternating within the step.
 
-    With `alternating` a step has one view: near in odd steps, far in even ones. Under a grouping
-    whose two labels are not near and far, the labels take turns in alphabetical order.
+    With `alternating`, a step has one view: near in odd steps, far in even steps. If the grouping
+    has two other labels, they alternate in alphabetical order.
 
     Source: the paper, altitude-balanced view pairing (one uniform near view and one uniform far
     view, independent).
@@ -69,7 +69,8 @@ class NearFar(Sampler):
 class ThreeWay(Sampler):
     """One near, one middle and one far view per step.
 
-    Three renders per step: compare with the others at equal rendered views, not at equal steps.
+    A step has three renders, so compare this sampler with others at equal rendered views, not at
+    equal steps.
 
     Source: the paper, partition threshold study; groups are thirds of the radial distance.
     """
@@ -96,11 +97,11 @@ class ThreeWay(Sampler):
 
 
 class RandomSplit(Sampler):
-    """K/2 views of each of two random halves of the training views, drawn once at the first step.
+    """K/2 views from each of two random halves of the training views, drawn once at the first step.
 
-    Any grouping of the run is ignored; the labels of the draw are `first` and `second`.
+    The sampler ignores the grouping of the run; its labels are `first` and `second`.
 
-    Source: the paper announces this control and shows no figures.
+    Source: the paper announces this control but gives no results.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(minimum=2, multiple_of=2)
@@ -140,12 +141,13 @@ class RandomSplit(Sampler):
 def balanced_draw(
     groups: Mapping[str, Sequence[int]], context: SampleContext, state: PluginState, order: Order
 ) -> tuple[ViewSample, PluginState]:
-    """K / len(groups) views of every group, the groups taking turns within the step.
+    """Return K / len(groups) views of every group; the groups alternate within the step.
 
     Args:
-        groups: Label -> positions of its training views, in the order of the turns.
+        groups: Label -> positions of its training views, in the order of the draws.
         context: The step.
-        state: What this function returned last; holds one deck per label under order `epoch`.
+        state: The state that this function returned last. With order `epoch` it contains one
+            `EpochOrder` per label.
         order: How views are drawn within a group.
     """
     share = context.views_per_step // len(groups)
@@ -163,7 +165,7 @@ def balanced_draw(
 
 
 def idle_order(order: Order, views: int, groups: int) -> Mapping[str, str]:
-    """The option `order` where it changes nothing: one view of a group is never drawn twice."""
+    """Return the option `order` with a reason if it has no effect, else an empty mapping."""
     if order != "distinct" or views > groups:
         return {}
     why = "a step has one view of each group, which distinct leaves as iid draws it"

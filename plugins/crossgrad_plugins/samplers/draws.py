@@ -1,4 +1,4 @@
-"""How samplers draw from the views of a pool or of a group: iid, distinct or epoch by epoch."""
+"""Draws of views from a pool or from a group: independent, distinct or epoch by epoch."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ Order = Literal["iid", "distinct", "epoch"]
 
 @dataclass(frozen=True)
 class EpochOrder:
-    """An epoch under way: a pool in the order of this epoch and how far it has been dealt.
+    """The state of an epoch: a shuffled pool and the number of views already drawn.
 
     Attributes:
         order: The pool in the order of this epoch.
-        drawn_views: How many of `order` have been drawn.
+        drawn_views: Number of views of `order` that have been drawn.
     """
 
     order: Sequence[int] = ()
@@ -27,14 +27,14 @@ class EpochOrder:
     def next(
         self, count: int, renew: Callable[[], Sequence[int]]
     ) -> tuple[list[int], "EpochOrder"]:
-        """Draws the next `count` views; every view comes once per epoch.
+        """Return the next `count` views and the new state; every view occurs once per epoch.
 
-        Where the epoch ends within a draw the next one begins with views that this draw does not
-        hold yet, so that no draw holds a view twice.
+        If the epoch ends within a draw, the next epoch begins with views that this draw does not
+        contain yet. So a draw never contains a view twice.
 
         Args:
             count: At most the size of the pool.
-            renew: Gives the order of a new epoch.
+            renew: Function that returns the order of a new epoch.
         """
         drawn = list(self.order[self.drawn_views : self.drawn_views + count])
         missing = count - len(drawn)
@@ -47,12 +47,15 @@ class EpochOrder:
         return drawn + fresh, EpochOrder(fresh + rest, missing)
 
     def to_json(self) -> dict[str, Json]:
-        """The deck as plain data; the order is shared, not copied: it never changes."""
+        """Return the state as plain data.
+
+        The order is shared and not copied, because it never changes.
+        """
         return {"order": cast("list[Json]", self.order), "dealt": self.drawn_views}
 
     @staticmethod
     def from_json(data: Json) -> "EpochOrder":
-        """The deck that `to_json` wrote; a new one for None."""
+        """Return the state that `to_json` wrote, or a new state for None."""
         if data is None:
             return EpochOrder()
         values = cast("dict[str, Json]", data)
@@ -62,10 +65,10 @@ class EpochOrder:
 def draw(
     pool: Sequence[int], count: int, order: Order, epoch_order: EpochOrder, rng: np.random.Generator
 ) -> tuple[list[int], EpochOrder]:
-    """`count` members of `pool`, and the deck of epochs afterwards.
+    """Return `count` members of `pool`, and the state of the epoch after the draw.
 
     Raises:
-        UserError: The pool holds fewer members than a draw without repetition needs.
+        UserError: The pool has fewer members than a draw without repetition needs.
     """
     if order == "iid":
         return [int(pool[i]) for i in rng.integers(len(pool), size=count)], epoch_order
@@ -77,7 +80,7 @@ def draw(
 
 
 def require_enough(available: int, count: int) -> None:
-    """Refuses a draw of more different views than there are.
+    """Raise an error if a draw needs more different views than are available.
 
     Raises:
         UserError: `count` is larger than `available`.
@@ -92,10 +95,10 @@ def require_enough(available: int, count: int) -> None:
 
 
 def training_views(context: SampleContext) -> range:
-    """Positions of all training views.
+    """Return the positions of all training views.
 
     Raises:
-        UserError: There are none.
+        UserError: There are no training views.
     """
     if len(context.centers) == 0:
         raise UserError(
@@ -107,20 +110,20 @@ def training_views(context: SampleContext) -> range:
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
-    """Label -> positions of its training views; `near` comes first and `far` last."""
+    """Return label -> positions of its training views; `near` is first and `far` is last."""
     return _members(context.groups or ())
 
 
 def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[str, tuple[int, ...]]:
-    """The same, where a sampler needs a certain number of groups.
+    """Return the groups as `members_of` does, after a check of their number.
 
     Args:
         context: The step.
-        sampler: Name of the asking sampler, for the message.
-        expected: How many groups it needs.
+        sampler: Name of the calling sampler, for the message.
+        expected: Number of groups that the sampler needs.
 
     Raises:
-        UserError: There is no grouping, or it makes another number of groups.
+        UserError: There is no grouping, or it has another number of groups.
     """
     groups = members_of(context)
     if len(groups) != expected:
@@ -135,7 +138,7 @@ def groups_of(context: SampleContext, sampler: str, expected: int) -> Mapping[st
 
 
 def drawn(views: Sequence[int], context: SampleContext) -> ViewSample:
-    """The draw of these views with their labels, where there is a grouping."""
+    """Return the draw of `views`, with their labels if there is a grouping."""
     groups = context.groups
     labels = None if groups is None else tuple(groups[view] for view in views)
     return ViewSample(tuple(views), labels)
@@ -148,5 +151,5 @@ def _members(labels: tuple[str, ...]) -> Mapping[str, tuple[int, ...]]:
 
 
 def _rank(label: str) -> int:
-    """0 for near, 2 for far, 1 for anything else."""
+    """Return 0 for near, 2 for far, 1 for any other label."""
     return {"near": 0, "far": 2}.get(label, 1)

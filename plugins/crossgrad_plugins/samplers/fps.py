@@ -12,13 +12,13 @@ from crossgrad_plugins.samplers.draws import EpochOrder, drawn, require_enough, 
 
 
 class FarthestPoint(Sampler):
-    """Every training view once per epoch, each as far in pose space as possible from those before.
+    """Every training view once per epoch, each as far as possible in pose space from earlier views.
 
-    An epoch starts at a uniform view; a step takes the next K views of the order. Pose space joins
-    the camera centre and the unit viewing direction times `direction_weight`; distances in it are
-    Euclidean. The unit of the centre is the root mean square distance from the mean centre, both
-    without stray cameras. (Steps that each began anew would render the outermost cameras far more
-    often than the others.)
+    An epoch starts at a random view. A step takes the next K views of the order. A point of pose
+    space is the camera centre and the unit viewing direction times `direction_weight`; distances
+    are Euclidean. The unit of the centre is the root mean square distance from the mean centre,
+    both computed without stray cameras. (If each step started a new order, the outermost cameras
+    would be rendered far more often than others.)
 
     Source: farthest-point sampling, Eldar et al. 1997; the pose space is ours.
     """
@@ -45,20 +45,23 @@ class FarthestPoint(Sampler):
         return drawn(chosen, context), PluginState({"deck": epoch_order.to_json()})
 
     def _poses(self, context: SampleContext) -> NDArray[np.float64]:
-        """[N, 6] the training cameras in pose space."""
+        """Return [N, 6] the training cameras in pose space."""
         scene = context.scene
         centers = context.centers - scene.middle
         usual = scene.robust_centers - scene.middle
         radius = float(np.sqrt((usual**2).sum(axis=1).mean()))
         rows = [view.camera.world_to_camera[2, :3].numpy() for view in scene.train_views]
         directions = np.stack(rows).astype(np.float64)
-        # Cameras at one place differ in direction only.
+        # Cameras at the same position differ only in direction.
         scaled = centers / radius if radius > 0.0 else np.zeros_like(centers)
         return np.concatenate([scaled, self.direction_weight * directions], axis=1)
 
 
 def farthest_point_order(points: NDArray[np.float64], start: int) -> list[int]:
-    """All points [N, D] from `start` on, each the farthest from those before it; ties by index."""
+    """Return the order of points [N, D] from `start` on, each the farthest from all earlier points.
+
+    Of equally far points, the point with the lowest index is first.
+    """
     order = [start]
     nearest = np.full(len(points), np.inf)
     for _ in range(len(points) - 1):

@@ -1,4 +1,4 @@
-"""Far and near views in a ratio that changes once: 2:1, then 1:1."""
+"""Far and near views with a ratio that changes once: 2:1, then 1:1."""
 
 from collections.abc import Mapping
 from typing import ClassVar, cast
@@ -17,14 +17,14 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.samplers.draws import EpochOrder, draw, drawn, groups_of
 
-#: Decimals of a number of steps that are no rounding.
+#: Decimals of a number of steps that are kept; the rest is a rounding error.
 _DIGITS = 6
 
 
 class Horizon(Sampler):
-    """Views by turns: a far ones, then b near ones, and so on; each group in epochs of its own.
+    """Alternates a far views and b near views; each group has its own epochs.
 
-    The turns go on across steps, so that the ratio is exact for every K.
+    The cycle continues across steps, so the ratio is exact for every K.
 
     Source: Horizon-GS draws aerial : street = 2 : 1 in its coarse stage (60,000 of 100,000 steps)
     and 1 : 1 in its fine stage.
@@ -55,7 +55,7 @@ class Horizon(Sampler):
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
         near, far = groups_of(context, "horizon", 2).items()
-        # 0.29 of 100 steps are 29, though not in binary numbers.
+        # 0.29 of 100 steps are 29 steps, but not in binary floating point.
         coarse = context.step <= round(self.coarse_share * context.schedule.total, _DIGITS)
         far_turns, near_turns = self.coarse if coarse else self.fine
         turns = [far] * far_turns + [near] * near_turns
@@ -75,7 +75,7 @@ class Horizon(Sampler):
 
 
 def _turn(state: PluginState, coarse: bool) -> int:
-    """Whose turn it is: the place within the cycle of the stage, 0 where the stage begins."""
+    """Return the position within the cycle of the stage; 0 at the start of a stage."""
     if state.values.get("coarse") != coarse:
         return 0
     return cast("int", state.values["turn"])

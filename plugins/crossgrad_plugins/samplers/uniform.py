@@ -1,4 +1,4 @@
-"""Samplers that treat all training views alike: random views, and epochs."""
+"""Samplers that treat all training views equally: random views, and epochs."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -18,9 +18,10 @@ from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, drawn, tra
 
 
 class Random(Sampler):
-    """K uniform training views, independent of each other and of the steps before.
+    """K uniform training views, independent of each other and of earlier steps.
 
-    Source: the paper, `r2view`; its Proposition 2 assumes independent draws, hence the default.
+    Source: the paper, `r2view`. Its Proposition 2 assumes independent draws, so they are the
+    default.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts()
@@ -44,9 +45,9 @@ class Random(Sampler):
 
 
 class Epoch(Sampler):
-    """Every training view once per epoch, in an order that is shuffled anew each time.
+    """Every training view once per epoch, in a newly shuffled order each time.
 
-    The K views of a step are different; K at most the number of training views.
+    The K views of a step are different, so K is at most the number of training views.
 
     Source: 3DGS pops a random element of the remaining views and refills the list when it is empty;
     a shuffled epoch has the same distribution.

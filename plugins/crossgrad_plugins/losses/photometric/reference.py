@@ -1,10 +1,10 @@
-"""The photometric loss in plain torch: by autograd, or with its gradient for a GPU.
+"""The photometric loss in plain torch: by autograd, or with an explicit gradient for a GPU.
 
-It is the readable definition and the oracle of the fused kernel.
+This is the readable definition, and the reference for tests of the fused kernel.
 
-Autograd launches more kernels, most of them shorter than launching them takes. With
-sums and differences, as in the fused kernel of the CPU (`numba_kernels.fused`), twelve planes are
-filtered, and nine in the backward pass, instead of fifteen each time.
+Autograd launches more kernels, and most of them run for less time than the launch takes. The
+explicit gradient uses sums and differences, as the fused CPU kernel does (`numba_kernels.fused`).
+It filters twelve planes forward and nine backward, instead of fifteen each.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ C2 = 0.03**2
 
 
 def gaussian_window() -> Tensor:
-    """The normalised one-dimensional window of SSIM, [11] float64."""
+    """Return the normalised one-dimensional window of SSIM, [11] float64."""
     offset = torch.arange(WINDOW, dtype=torch.float64) - RADIUS
     weight = torch.exp(-(offset**2) / (2 * SIGMA**2))
     return weight / weight.sum()
@@ -36,18 +36,18 @@ def l1_ssim_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """(1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
+    """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
 
-    A masked-out pixel is 0 in both images before SSIM's windows are summed, has no term of its own
-    in either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
+    A masked-out pixel is 0 in both images before SSIM's windows are summed. It has no term of its
+    own in either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
 
     Args:
-        image: [H, W, C] floating point; values may lie outside [0, 1].
+        image: [H, W, C] floating point; values may be outside [0, 1].
         target: [H, W, C] floating point, or uint8 (then 255 means 1).
         mask: [H, W] bool, True where the pixel counts; None keeps all.
         ssim_weight: w in [0, 1].
-        weights: [H, W] floating point, not negative: a pixel's share in both means. Windows of SSIM
-            are summed as ever. None weighs all pixels alike.
+        weights: [H, W] floating point, not negative: a pixel's weight in both means. The weights do
+            not affect the window sums of SSIM. None weights all pixels equally.
 
     Returns:
         Scalar of the image's type.
@@ -69,15 +69,15 @@ def l1_ssim_loss(
 
 
 def _weighted(values: Tensor, mask: Tensor | None, weights: Tensor) -> Tensor:
-    """The mean of [H, W, C] over the kept pixels by weight; 0 where no weight is kept."""
+    """Return the weighted mean of [H, W, C] over the kept pixels; 0 if the total weight is 0."""
     share = masked(weights.to(values.dtype).unsqueeze(-1), mask)  # [H, W, 1]
     total = share.sum() * values.shape[-1]
-    # Where nothing counts the sum is 0 already; what it is divided by must not be.
+    # If nothing counts, the sum is 0 already, but the divisor must not be 0.
     return (masked(values, mask) * share).sum() / torch.where(total > 0, total, 1.0)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, C], windows zero-padded at the border.
+    """Return the SSIM of every pixel and channel, [H, W, C]; windows are zero-padded.
 
     Args:
         image: [H, W, C] floating point.
@@ -99,19 +99,20 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 @cache
 def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The window where it is needed: copied there once, since a GPU is waited for meanwhile.
+    """Return the window on a device, copied only once, because a copy synchronises with the GPU.
 
-    Others may ask first who need no gradients: made without inference mode it serves all.
+    The first call may be in inference mode. The window is created outside inference mode, so that
+    calls with gradients can use it too.
     """
     with torch.inference_mode(mode=False):
         return gaussian_window().to(device, dtype)
 
 
 def blurred(fields: Tensor) -> Tensor:
-    """Gaussian-weighted sums of [M, C, H, W] over the window around each pixel, same shape."""
+    """Return Gaussian-weighted sums of [M, C, H, W] over each pixel's window, same shape."""
     if fields.numel() == 0:
         return fields
-    # One group per plane: torch's depthwise convolution is the fastest of its ways on the CPU.
+    # One group per plane: torch's depthwise convolution is the fastest variant on the CPU.
     planes = fields.reshape(1, -1, *fields.shape[2:])  # [1, M * C, H, W]
     groups = planes.shape[1]
     weight = _window_for(fields.dtype, fields.device).expand(groups, 1, WINDOW)
@@ -124,7 +125,7 @@ def blurred(fields: Tensor) -> Tensor:
 def loss_and_gradient(
     image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float
 ) -> tuple[Tensor, Tensor]:
-    """The value of `reference.l1_ssim_loss`, a scalar, and its gradient by the image [H, W, C].
+    """Return the value of `l1_ssim_loss`, a scalar, and its gradient by the image [H, W, C].
 
     Args:
         image: [H, W, C] floating point.
@@ -150,7 +151,7 @@ def loss_and_gradient(
 def _dissimilarity_and_slope(
     sums: Tensor, differences: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """1 - SSIM of every pixel [C, H, W], and the gradient of the sum of SSIM over the kept pixels.
+    """Return 1 - SSIM of every pixel [C, H, W], and the gradient of the SSIM sum over kept pixels.
 
     Args:
         sums: [C, H, W] image plus target.
@@ -160,7 +161,7 @@ def _dissimilarity_and_slope(
     fields = torch.stack((sums, differences, sums * sums, differences * differences))
     mean_s, mean_d, square_s, square_d = blurred(fields)
     dark, bright = mean_d * mean_d, mean_s * mean_s
-    # Rounding may take a variance of nothing slightly below zero.
+    # Rounding may make a variance of zero slightly negative.
     variance_s = (square_s - bright).clamp_(min=0.0).add_(2 * C2)
     variance_d = (square_d - dark).clamp_(min=0.0)
     bright.add_(2 * C1)
@@ -175,5 +176,6 @@ def _dissimilarity_and_slope(
     slopes = torch.stack((by_mean, by_s, by_d))
     if mask is not None:
         slopes *= mask
-    of_mean, of_s, of_d = blurred(slopes)  # The window is symmetric: its adjoint is itself.
+    # The window is symmetric, so the adjoint operation is the same filter.
+    of_mean, of_s, of_d = blurred(slopes)
     return dissimilarity, of_mean.addcmul_(sums, of_s).addcmul_(differences, of_d)

@@ -1,4 +1,4 @@
-"""Counts of pixels in which Gaussians were blended, from gsplat's lists of intersections."""
+"""The number of pixels in which each Gaussian was blended, from gsplat's intersection lists."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -7,18 +7,20 @@ import torch
 from torch import Tensor
 
 _NAMES: Final = ("means2d", "conics", "opacities", "isect_offsets", "flatten_ids")
-#: Pixels that are looked at in one call: gsplat lists each Gaussian of each, 24 bytes.
+#: Number of pixels per call. gsplat lists every Gaussian of every pixel, with 24 bytes each.
 PIXELS: Final = 1 << 19
-#: More batches of Gaussians than a tile has.
+#: Larger than the number of batches of Gaussians of any tile.
 _ALL: Final = 1 << 30
 
 
 def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
-    """The function `Screen.count` of a view; keeps what was projected and the tile lists alive.
+    """Return the function `Screen.count` of a view.
+
+    It keeps the projected data and the tile lists alive.
 
     Args:
-        meta: What gsplat's `rasterization` says besides the image.
-        view: Which of the K views.
+        meta: The metadata that gsplat's `rasterization` returns.
+        view: Index of the view among the K views.
     """
     known: dict[str, Tensor] = {name: meta[name].detach() for name in _NAMES}
     width, height, tile_size = meta["width"], meta["height"], meta["tile_size"]
@@ -30,7 +32,8 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
         total: Tensor = opacities.new_zeros(opacities.shape[-1], dtype=torch.int64)
         rows = max(1, PIXELS // width)
         for first in range(0, height, rows):
-            # A pixel through which no light comes is left out, as one that is opaque would be.
+            # Pixels without remaining light are skipped like opaque pixels, so unmarked pixels get
+            # no light.
             light = opacities.new_zeros((*opacities.shape[:-1], height, width))
             band = slice(first, first + rows)
             light[view, 0, band] = marked[band].to(light)

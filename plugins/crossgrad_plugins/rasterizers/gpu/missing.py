@@ -1,4 +1,4 @@
-"""Packages and compilers that a rasterizer lacks on this machine, and the way out."""
+"""Packages and compilers that a rasterizer needs but this machine lacks, and the remedies."""
 
 import os
 import re
@@ -13,7 +13,7 @@ import torch
 
 
 def package_missing(package: str, *others: str) -> str | None:
-    """Why a rasterizer cannot run without its package and others; None where all are installed."""
+    """Return why a rasterizer cannot run: a missing package; None if all are installed."""
     lacks = next((name for name in (package, *others) if find_spec(name) is None), None)
     if lacks is None:
         return None
@@ -24,7 +24,10 @@ def package_missing(package: str, *others: str) -> str | None:
 
 
 def compiler_missing(package: str) -> str | None:
-    """Why a package cannot compile its kernels at first use; None where it can, or has them."""
+    """Return why a package cannot compile its kernels at first use.
+
+    The result is None if it can compile them or if they are compiled already.
+    """
     if is_compiled(package):
         return None
     nvcc, wanted = find_nvcc(), torch.version.cuda
@@ -51,7 +54,7 @@ def compiler_missing(package: str) -> str | None:
 
 
 def is_compiled(package: str) -> bool:
-    """Whether a package was installed with its kernels compiled; does not import it."""
+    """Return whether a package is installed with compiled kernels, without importing it."""
     spec = find_spec(package)
     places = [] if spec is None else spec.submodule_search_locations or []
     return any(path for place in places for path in Path(place).glob("csrc.*"))
@@ -59,19 +62,19 @@ def is_compiled(package: str) -> bool:
 
 @cache
 def bring_ninja() -> None:
-    """Lets torch find the ninja that lies beside this Python, whose folder may not be on PATH."""
+    """Put ninja from this Python's environment on PATH, so that torch can find it."""
     if shutil.which("ninja") is None:
         folders = [os.environ.get("PATH", ""), str(_own_ninja().parent)]
         os.environ["PATH"] = os.pathsep.join(filter(None, folders))
 
 
 def _own_ninja() -> Path:
-    """Where pip puts it in the environment of this Python."""
+    """Return the path of ninja in the environment of this Python."""
     return Path(sys.executable).parent / "ninja"
 
 
 def find_nvcc() -> Path | None:
-    """The CUDA compiler that torch would take."""
+    """Return the CUDA compiler that torch would use."""
     if home := _cuda_home():
         nvcc = Path(home) / "bin" / "nvcc"
     else:
@@ -80,13 +83,13 @@ def find_nvcc() -> Path | None:
 
 
 def _cuda_home() -> str:
-    """Where torch looks for the compiler and nowhere else; empty where that is not said."""
+    """Return the only folder in which torch looks for the compiler; empty if it is not set."""
     return os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH") or ""
 
 
 @cache
 def nvcc_version(nvcc: Path) -> str | None:
-    """The CUDA version of a compiler, such as 12.4; None where it does not say."""
+    """Return the CUDA version of a compiler, such as 12.4; None if it cannot be determined."""
     try:
         told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""A drawing of another package in an autograd function, and the render of no Gaussians."""
+"""Renders of other packages inside one autograd function, and the render without Gaussians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Drawing:
 
     Attributes:
         outputs: Differentiable results.
-        centers: The tensor whose gradient tells how the loss moves with the projected means.
+        centers: The tensor whose gradient is the gradient of the loss by the projected means.
     """
 
     outputs: tuple[Tensor, ...]
@@ -26,11 +26,11 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """A drawing that is wanted.
+    """A request for a drawing.
 
     Attributes:
-        draw: Draws, given the tensors.
-        observe: Is given `Drawing.centers` and their gradient by every backward pass.
+        draw: Function that draws, given the tensors.
+        observe: Function that every backward pass calls with `Drawing.centers` and their gradient.
     """
 
     draw: Callable[[Sequence[Tensor]], Drawing]
@@ -38,10 +38,10 @@ class Call:
 
 
 def drawn(call: Call, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """The outputs of a drawing, differentiable in `tensors`.
+    """Return the outputs of a drawing, differentiable in `tensors`.
 
-    The package's own graph is kept inside one node of ours. A hook on `centers` would refer to
-    the tensor that it hangs on, and neither would ever be freed.
+    The package's graph is kept inside one autograd node. A hook on `centers` would create a
+    reference cycle with its tensor, and the memory would never be freed.
     """
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         outputs: tuple[Tensor, ...] = _Nested.apply(call, *tensors)  # type: ignore[no-untyped-call]
@@ -72,7 +72,7 @@ class _Nested(torch.autograd.Function):
             [output for output, _ in known],
             wanted,
             [gradient for _, gradient in known],
-            retain_graph=True,  # Another backward pass may come.
+            retain_graph=True,  # There may be another backward pass.
             allow_unused=True,
         )
         by_tensor = {id(each): gradient for each, gradient in zip(wanted, found, strict=True)}
@@ -84,8 +84,8 @@ class _Nested(torch.autograd.Function):
 def empty_render(
     gaussians: Gaussians, camera: Camera, background: Tensor, outputs: frozenset[str]
 ) -> Render:
-    """The background, of which a gradient of zero comes back, and statistics of no rows."""
-    # The sum of nothing is 0: through it every tensor is in the graph, as where one is drawn.
+    """Return the background with gradients of zero, and screen statistics with zero rows."""
+    # The sum of an empty tensor is 0. It connects every tensor to the graph, as in a normal render.
     zero = torch.stack([tensor.sum() for tensor in gaussians.floats()]).sum()
     image = background.expand(camera.height, camera.width, 3) + zero
     alpha = torch.zeros_like(image[..., 0])

@@ -1,7 +1,7 @@
-"""A known scene, drawn before a run trains on a GPU: image, loss and gradients as they must be.
+"""A test before a run trains on a GPU: image, loss and gradients of a known scene must be correct.
 
-Others have trained a first process on a fresh machine to 14 dB without any error (gsplat issue
-872), and drawn memory that nobody had written (gsplat issue 1031).
+Two failures without any error message are known: a first process on a fresh machine that trained to
+only 14 dB (gsplat issue 872), and renders of uninitialised memory (gsplat issue 1031).
 """
 
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ _TENSORS: Final = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "
 
 @dataclass(frozen=True)
 class Look:
-    """The known scene as a rasterizer drew it, on the CPU.
+    """A render of the known scene, on the CPU.
 
     Attributes:
         image: [H, W, 3].
-        loss: Mean squared difference from a ramp of greys.
+        loss: Mean squared difference from a grey ramp.
         gradients: Tensor name -> its gradient.
     """
 
@@ -41,12 +41,12 @@ class Look:
 
 
 def self_test(rasterizer: Rasterizer, device: str) -> None:
-    """Draws the known scene in colours and in harmonics.
+    """Render the known scene with RGB colours and with harmonics, and compare with the reference.
 
-    It is the first process and the first call that fail, so that it is drawn twice in any case.
+    Known failures affect the first process and the first call, so the scene is rendered twice.
 
     Raises:
-        UserError: The rasterizer raises something, or draws something else than `torch` does.
+        UserError: The rasterizer raises an exception, or its render differs from that of `torch`.
     """
     for harmonics in (False, True):
         expected = look_at(_reference(rasterizer), "cpu", harmonics=harmonics)
@@ -61,7 +61,7 @@ def self_test(rasterizer: Rasterizer, device: str) -> None:
 
 
 def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
-    """Gaussians of a few pixels, some outside the image, and a camera off their axis."""
+    """Return Gaussians of a few pixels, some outside the image, and an off-axis camera."""
     random = torch.Generator().manual_seed(872)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -85,7 +85,7 @@ def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
 
 
 def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
-    """What a rasterizer makes of the known scene."""
+    """Return the image, loss and gradients of the known scene from a rasterizer."""
     gaussians, camera = known_scene(device, harmonics=harmonics)
     background = torch.tensor([0.2, 0.4, 0.6], device=device)
     image = rasterizer.render(gaussians, camera, background).image
@@ -99,7 +99,7 @@ def look_at(rasterizer: Rasterizer, device: str, *, harmonics: bool) -> Look:
 
 
 def difference(found: Look, expected: Look) -> str:
-    """What is wrong with a look; empty where nothing is."""
+    """Return a text about the first difference found; empty if there is none."""
     error = (found.image - expected.image).abs()
     if not (error.max() < PIXEL and error.mean() < MEAN):
         return (

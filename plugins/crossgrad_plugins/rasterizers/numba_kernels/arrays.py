@@ -1,4 +1,4 @@
-"""Inputs and outputs of a render, as plain arrays."""
+"""Inputs and outputs of a render as plain arrays."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ Int64 = NDArray[np.int64]
 
 
 def in_lines(count: int) -> Float32:
-    """Returns room for so many numbers that begins a cache line, which holds `WIDE` of them.
+    """Return an array of `count` numbers that starts at a cache line of `WIDE` numbers.
 
-    NumPy's own large arrays begin 16 bytes behind one.
+    NumPy's own large arrays start 16 bytes after the start of a cache line.
     """
     room = np.empty(count + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
@@ -34,13 +34,13 @@ class GaussianArrays:
         quats: [N, 4] wxyz, any norm; a zero quaternion is not drawn.
         scales: [N, 3] linear.
         opacities: [N].
-        colors: [N, 3] RGB as drawn.
+        colors: [N, 3] RGB as rendered.
         dc: [N, 1, 3] harmonics of degree 0.
         rest: [N, B - 1, 3] harmonics of higher degrees (B - 1 may be 0).
         degree: Active degree, 0 to 3.
-        sparse_rows: Fields whose rows `bring` must bring up to date before they are read, and whose
-            gradients are of these rows only.
-        bring: [R] int32 rows -> None.
+        sparse_rows: Fields whose rows `bring` must update before they are read, and whose gradients
+            contain only these rows.
+        bring: Function of [R] int32 rows that updates them.
     """
 
     means: Float32
@@ -74,14 +74,15 @@ class CameraArrays:
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """The rule set's free numbers, and which optional outputs to compute.
+    """The adjustable numbers of the rule set, and the optional outputs to compute.
 
     Attributes:
         max_alpha: Cap of a Gaussian's alpha, below 1.
-        near: Gaussians are drawn if their centre's depth is larger.
+        near: Gaussians are drawn if the depth of their centre is larger.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        response: How a Gaussian fills a pixel; `antialiased` lowers opacities by what the dilation
-            adds in area (Mip-Splatting's 2-D filter), `analytic` is not dilated.
+        response: The response of a Gaussian in a pixel. `antialiased` lowers opacities to
+            compensate the area that the dilation adds (Mip-Splatting's 2-D filter); `analytic` has
+            no dilation.
         squares: Whether a Gaussian touches only the tiles of the published 3-sigma square.
         depth: Whether to composite the depth.
         pixels: Whether to count the pixels of each Gaussian.
@@ -102,12 +103,12 @@ class Projected:
 
     Attributes:
         camera: The view.
-        radii: [N] int32, pixels; 0 where no pixel is touched.
+        radii: [N] int32, pixels; 0 if no pixel is touched.
         records: [N * RECORD] float32.
         owners: [N] int32, the Gaussian of each record.
         drawn: [chunks] int64, records per chunk.
         limits: [N, 2] int32, columns of 16 pixels that each record may touch; None for no limits.
-        rows: [R] int32, the Gaussians that have a record, sorted; None where nobody asks for them.
+        rows: [R] int32, the Gaussians that have a record, sorted; None if they are not needed.
     """
 
     camera: KernelCamera
@@ -138,15 +139,16 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered view and what its backward pass needs.
+    """A rendered view and the data for its backward pass.
 
     Attributes:
         image: [H, W, 3] over the background, not clamped.
         alpha: [H, W].
-        depth: [H, W] sum of weight times depth, None unless asked for.
-        pixels: [N] int32, pixels blended, None unless asked for.
-        gaussians: The input.
-        options: The input.
+        depth: [H, W] sum of weight times depth, None unless requested.
+        pixels: [N] int32, number of pixels in which each Gaussian was blended, None unless
+            requested.
+        gaussians: The input Gaussians.
+        options: The input options.
         projected: Drawn Gaussians.
         lists: Tile lists.
         masks: [E] uint64, patches that each entry was blended into.
@@ -172,13 +174,14 @@ class GaussianGradients:
         quats: [N, 4].
         scales: [N, 3].
         opacities: [N].
-        colors: [N, 3] by the RGB drawn (after the clamp of harmonics).
-        dc: [N, 1, 3] or [R, 1, 3], those of the rows drawn; None without harmonics.
-        rest: [N, B - 1, 3] or [R, B - 1, 3], None without harmonics or where nobody
-            asked for it.
+        colors: [N, 3] by the rendered RGB (after the clamp of harmonics).
+        dc: [N, 1, 3], or [R, 1, 3] for the drawn rows; None without harmonics.
+        rest: [N, B - 1, 3], or [R, B - 1, 3] for the drawn rows; None without harmonics or if not
+            requested.
         centres: [N, 2] by the projected mean, per pixel.
-        absolute: [N, 2] the same with absolute values summed over pixels, None unless asked for.
-        directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`, None unless asked for.
+        absolute: [N, 2] by the projected mean, summed as absolute values over pixels; None unless
+            requested.
+        directions: [N, 6, 5] of `crossgrad_core.contract.gaussians.Screen`; None unless requested.
     """
 
     means: Float32

@@ -1,11 +1,11 @@
-"""Real spherical harmonics up to degree 3 of sixteen directions at once.
+"""Real spherical harmonics up to degree 3, for sixteen directions at once.
 
-Loops over the directions without branches are vectorised by LLVM: each number of a direction has a
-row of sixteen. The kernels of coefficients want the numbers of one direction side by side instead,
-which is what `turned` is for.
+LLVM vectorises branch-free loops over the directions: each number of a direction has a row of
+sixteen. The coefficient kernels need the numbers of one direction side by side instead; `turned`
+transposes them.
 
-A Gaussian's coefficients are fifteen triples (red, green, blue), 45 floats. Three vectors of five
-triples and one float to spare hold them; basis functions are spread over their triples' lanes.
+A Gaussian's coefficients are fifteen triples (red, green, blue), 45 floats. Three vectors contain
+five triples and one spare float each. Basis functions are copied to the lanes of their triples.
 """
 
 import math
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.simd import WIDE, fma, load_wide, picking, store
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Numbers of sixteen directions: x, y, z and the inverse distance, each a row.
+#: Size of the rows x, y, z and inverse distance of sixteen directions.
 WAYS = 4 * WIDE
-#: Basis functions of all degrees, as many as a vector has numbers; those of sixteen directions.
+#: Number of basis functions of all degrees, equal to the lanes of a vector; and their floats for
+#: sixteen directions.
 BASIS = WIDE
 TABLE = BASIS * WIDE
 _X, _Y, _Z, _INVERSE = 0, WIDE, 2 * WIDE, 3 * WIDE
@@ -32,7 +33,8 @@ _C3_XYZ = 2.890611442640554  # sqrt(105 / (4 pi))
 _C3_XZZ = 0.4570457994644658  # sqrt(21 / (32 pi))
 _C3_ZZZ = 0.3731763325901154  # sqrt(7 / (16 pi))
 _C3_XXZ = 1.445305721320277  # sqrt(105 / (16 pi))
-# Two rows change places in blocks of so many lanes: what becomes of the first and of the second.
+# Two rows exchange blocks of s lanes. The first group gives the new first row, the second group the
+# new second row.
 _first_1, _first_2, _first_4, _first_8 = (
     picking([WIDE + lane - s if lane & s else lane for lane in range(WIDE)]) for s in (1, 2, 4, 8)
 )
@@ -45,7 +47,7 @@ _second_1, _second_2, _second_4, _second_8 = (
 def put_way(
     means: NDArray[np.float32], i: int, eye: NDArray[np.float64], ways: NDArray[np.float64], j: int
 ) -> None:
-    """Writes the way from the camera to Gaussian i to number j of the rows of x, y and z."""
+    """Write the vector from the camera to Gaussian i to number j of the rows of x, y and z."""
     ways[j + _X] = np.float64(means[i, 0]) - eye[0]
     ways[j + _Y] = np.float64(means[i, 1]) - eye[1]
     ways[j + _Z] = np.float64(means[i, 2]) - eye[2]
@@ -53,7 +55,7 @@ def put_way(
 
 @device
 def normalize(ways: NDArray[np.float64]) -> None:
-    """Makes unit vectors of sixteen ways, and writes the inverse distances."""
+    """Normalise sixteen vectors and write their inverse lengths."""
     for j in range(WIDE):
         x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
         inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
@@ -63,7 +65,7 @@ def normalize(ways: NDArray[np.float64]) -> None:
 
 @device
 def basis_of(degree: int, ways: NDArray[np.float64], table: NDArray[np.float32]) -> None:
-    """Writes the basis functions of degrees 0 to `degree` of sixteen unit vectors, a row each."""
+    """Write the basis functions of degrees 0 to `degree` of sixteen unit vectors, one row each."""
     for j in range(WIDE):
         table[j] = C0
     if degree < 1:
@@ -99,16 +101,16 @@ def basis_of(degree: int, ways: NDArray[np.float64], table: NDArray[np.float32])
 
 @device
 def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) -> None:
-    """Replaces sixteen unit vectors by the gradients of sum(v * basis) by their ways.
+    """Replace sixteen unit vectors by the gradients of sum(v * basis) by the original vectors.
 
     Args:
         degree: Active degree.
-        v: Gradients of the basis functions of degree 1 and higher, a row each.
+        v: Gradients of the basis functions of degree 1 and higher, one row each.
         ways: From `normalize`; x, y and z are replaced.
     """
     for j in range(WIDE):
         x, y, z = ways[j + _X], ways[j + _Y], ways[j + _Z]
-        # By x, y and z, taken as independent.
+        # Derivatives by x, y and z, taken as independent.
         v_x = v_y = v_z = 0.0
         if degree >= 1:
             v_x, v_y, v_z = -_C1 * v[j + 2 * WIDE], -_C1 * v[j], _C1 * v[j + WIDE]
@@ -148,7 +150,7 @@ def pull_ways(degree: int, v: NDArray[np.float32], ways: NDArray[np.float64]) ->
 
 @device
 def turned(source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
-    """Writes sixteen rows of sixteen numbers as columns."""
+    """Transpose sixteen rows of sixteen numbers."""
     for r in range(0, WIDE, 2):
         a, b = load_wide(source, r * WIDE), load_wide(source, (r + 1) * WIDE)
         store(target, r * WIDE, _first_1(a, b))
@@ -169,15 +171,15 @@ def turned(source: NDArray[np.float32], target: NDArray[np.float32]) -> None:
         store(target, (r + 8) * WIDE, _second_8(a, b))
 
 
-#: Basis functions of the higher degrees, and floats of their coefficients.
+#: Number of basis functions of degree 1 and higher, and of floats of their coefficients.
 HIGHER = BASIS - 1
 FLOATS = 3 * HIGHER
-_TRIPLES = 5  # of a vector
-_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # where the second and the last vector begin
+_TRIPLES = 5  # per vector
+_SECOND, _LAST = 3 * _TRIPLES, FLOATS - WIDE  # start of the second and of the last vector
 
 
 def _functions(first: int) -> list[int]:
-    """The basis functions of sixteen floats of the coefficients from `first` on."""
+    """Return the basis functions of sixteen coefficient floats, from `first` on."""
     return [1 + (first + lane) // 3 for lane in range(WIDE)]
 
 
@@ -185,8 +187,9 @@ def _channels(first: int) -> list[int]:
     return [(first + lane) % 3 for lane in range(WIDE)]
 
 
-# The first vector has a float of the second one in its last lane, and so has the second one; the
-# last vector has one of the second one in its first lane instead: nothing beyond the 45 is touched.
+# The last lane of the first vector belongs to the second vector, and the last lane of the second
+# vector belongs to the next. The last vector has an extra float in its first lane instead, so that
+# nothing beyond the 45 floats is read or written.
 _spread_first = picking([*_functions(0)[:-1], 0])
 _spread_second = picking([*_functions(_SECOND)[:-1], 0])
 _spread_last = picking(_functions(_LAST))
@@ -195,7 +198,8 @@ _onwards = picking([*range(1, WIDE), 0])
 _six_on = picking([*range(6, WIDE), *range(6)])
 #: Lanes 3 to 5 of the first vector, then 12 to 14 of the second one.
 _three_on, _twelve_on = picking([3, 4, 5, *range(3, WIDE)]), picking([28, 29, 30, *range(3, WIDE)])
-#: One channel of five triples of each vector: of two vectors, and then of the third.
+#: Select one channel of the five triples of each vector: first from two vectors, then from the
+#: third.
 _channel_of_two = [
     picking([*range(c, 15, 3), *range(WIDE + c, WIDE + 15, 3), *([0] * 6)]) for c in range(3)
 ]
@@ -214,18 +218,18 @@ def sum_up(
     at: int,
     colours: NDArray[np.float32],
 ) -> None:
-    """Writes the sums of basis functions times coefficients, red, green and blue, to colours[row:].
+    """Write the sums of basis functions times coefficients (red, green, blue) to colours[row:].
 
     Args:
         bases: Basis functions from `row` on.
         row: See `bases`.
-        rest: Coefficients, contiguous; those of the Gaussian begin at float `at`.
+        rest: Coefficients, contiguous; the Gaussian's coefficients begin at float `at`.
         at: See `rest`.
-        colours: Sixteen floats are written, of which three count.
+        colours: Sixteen floats are written; only the first three are used.
     """
     basis = load_wide(bases, row)
     last = load_wide(rest, at + _LAST)
-    # Lanes 0 to 14 count.
+    # Only lanes 0 to 14 are used.
     found = _spread_first(basis, basis) * load_wide(rest, at)
     found = fma(_spread_second(basis, basis), load_wide(rest, at + _SECOND), found)
     product = _spread_last(basis, basis) * last
@@ -242,18 +246,18 @@ def spread(
     v_rest: NDArray[np.float32],
     to: int,
 ) -> None:
-    """Writes the gradients of the coefficients.
+    """Write the gradients of the coefficients.
 
     Args:
-        bases: As in `sum_up`, like `row`.
-        row: See `bases`.
+        bases: As in `sum_up`.
+        row: As in `sum_up`.
         v_rgb: The gradients of the colour, from `row` on.
         v_rest: Written from float `to` on.
         to: See `v_rest`.
     """
     basis, three = load_wide(bases, row), load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
-    # In this order: the float to spare of a vector is written anew by the next one.
+    # The order matters: the spare float of a vector is overwritten by the next vector.
     store(v_rest, to, _spread_first(basis, basis) * rgb)
     store(v_rest, to + _SECOND, _spread_second(basis, basis) * rgb)
     store(v_rest, to + _LAST, _spread_last(basis, basis) * rgb_last)
@@ -267,14 +271,14 @@ def rest_basis_gradients(
     at: int,
     v_bases: NDArray[np.float32],
 ) -> None:
-    """Writes the gradients of the basis functions of higher degrees.
+    """Write the gradients of the basis functions of degree 1 and higher.
 
     Args:
         v_rgb: The gradients of the colour, from `row` on.
         row: See `v_rgb`.
         rest: Coefficients.
-        at: Where they begin.
-        v_bases: Written from `row` on: fifteen numbers, and one that does not count.
+        at: First float of the coefficients.
+        v_bases: Written from `row` on: fifteen numbers and one unused number.
     """
     three = load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)

@@ -1,7 +1,7 @@
 """Lists of the records that reach each tile, front to back.
 
-The tiles of a record are found in the order of the records, which is that of memory, and kept in
-consecutive slots; the tile lists are then filled in the order of depth.
+First the tiles of each record are found, in memory order, and stored in consecutive slots. Then the
+tile lists are filled in depth order.
 """
 
 import numpy as np
@@ -45,20 +45,21 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 from crossgrad_plugins.rasterizers.numba_kernels.sorting import order_by_depth
 
-#: Parts into which the chunks are divided for counting; fixed, so as not to depend on the threads.
+#: Number of parts of the chunks for counting. It is fixed, so that results do not depend on the
+#: number of threads.
 PARTS = 16
 
-#: Records whose spans are computed before the first of their tiles is written: loops of unknown
-#: length would make the processor wait for the roots of each record.
+#: Number of records whose spans are computed before the first of their tiles is written. Loops of
+#: unknown length would make the processor wait for the square roots of each record.
 _GROUP = 32
 
-#: Where the numbers of the ellipses of a group begin.
+#: Start of each number of the ellipses of a group.
 _OF_SLOPE, _OF_DECAY, _OF_WIDTH, _OF_BUDGET, _OF_EXTENT, _OF_TILT = range(0, 6 * _GROUP, _GROUP)
 
-#: Records ahead for which memory is asked: first the slot numbers, then the slots.
+#: Number of records ahead for memory prefetches: first for the slot numbers, then for the slots.
 _FAR, _NEAR = 32, 16
 
-#: What filing needs to know of a record.
+#: Data of a record for filling the lists.
 FIRST_SLOT, SLOTS, FIRST_ROW, LAST_ROW = 0, 1, 2, 3
 SHELF = 4
 
@@ -70,16 +71,16 @@ def collect(
     depths: NDArray[np.float64],
     shelves: NDArray[np.int32],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], int]:
-    """Closes the gaps between chunks.
+    """Remove the gaps between chunks.
 
     Args:
         drawn: [chunks] records per chunk.
         room: [chunks] slots per chunk.
-        depths: [N] per record.
-        shelves: [N, SHELF] per record; the first slots are made global.
+        depths: [N] depth of each record.
+        shelves: [N, SHELF] per record; the first slots become global slot numbers.
 
     Returns:
-        The records drawn [M], their depths [M] and the number of slots.
+        The drawn records [M], their depths [M] and the number of slots.
     """
     total = drawn.sum()
     items = np.empty(total, np.int32)
@@ -98,7 +99,7 @@ def collect(
 
 @device
 def _tile(position: Lanes, size: int) -> Lanes:
-    """Returns the tile that holds a pixel."""
+    """Return the tile that contains a pixel."""
     return round_down(position * splat(np.float32(1.0 / size)))
 
 
@@ -106,9 +107,9 @@ def _tile(position: Lanes, size: int) -> Lanes:
 def _ellipses(
     first: int, last: int, records: NDArray[np.float32], ellipses: NDArray[np.float32]
 ) -> None:
-    """Writes the form of the ellipses of a group of records, of which each row of tiles asks.
+    """Write the ellipse parameters of a group of records, which every row of tiles uses.
 
-    Roots and quotients are taken of eight records at once.
+    Square roots and quotients are computed for eight records at once.
     """
     for j in range(first, last):
         k, at = j - first, j * RECORD
@@ -119,7 +120,7 @@ def _ellipses(
     for k in range(0, last - first, LANES):
         slope, row_decay = load(ellipses, _OF_SLOPE + k), load(ellipses, _OF_DECAY + k)
         width, budget = load(ellipses, _OF_WIDTH + k), load(ellipses, _OF_BUDGET + k)
-        # The rightmost point is where slope dy + sqrt(width (budget - row_decay dy^2)) is largest.
+        # The rightmost point is at the maximum of slope dy + sqrt(width (budget - row_decay dy^2)).
         extent_y = square_root(budget / row_decay)
         tilt = slope * extent_y / square_root(fma(row_decay, width, slope * slope))
         store(ellipses, _OF_EXTENT + k, extent_y)
@@ -137,16 +138,16 @@ def _spans(
     ends: NDArray[np.float32],
     place: int,
 ) -> None:
-    """Writes the first and last tile reached in eight rows of tiles (first > last: none).
+    """Write the first and last tile reached in eight rows of tiles (first > last: none).
 
-    The record at `at` is that of ellipse k of the group.
+    The record at `at` belongs to ellipse k of the group.
 
-    The ends of an ellipse's rows form concave curves. Between two rows of pixels their extremes
-    lie at the ellipse's leftmost and rightmost point or in the row nearest to it.
+    The ends of an ellipse's rows form concave curves. Between two rows of pixels, their extremes
+    are at the ellipse's leftmost and rightmost point, or in the row nearest to that point.
     """
     zero = splat(np.float32(0.0))
     half = splat(np.float32(0.5))
-    # Pixel centres are at whole numbers here.
+    # Pixel centres are at whole numbers in this function.
     u = broadcast(records, at + U_WHOLE) + (broadcast(records, at + U_PART) - half)
     v = broadcast(records, at + V_WHOLE) + (broadcast(records, at + V_PART) - half)
     slope = broadcast(ellipses, _OF_SLOPE + k)
@@ -185,12 +186,12 @@ def _find(
     k: int,
     boxed: bool,
 ) -> int:
-    """Writes the tiles that record j, k of its group, reaches to its slots; counts them.
+    """Write the tiles that record j (number k of its group) reaches to its slots, and count them.
 
-    The spans of its first eight rows of tiles are there, unless all of the box is taken.
+    The spans of its first eight rows of tiles are already computed, unless the whole box is used.
 
     Returns:
-        Their number.
+        The number of tiles.
     """
     place = k * LANES
     left, right = np.float32(boxes[j, 0]), np.float32(boxes[j, 1] - 1)
@@ -206,7 +207,8 @@ def _find(
             if begin > end:
                 continue
             tile = (block + row) * tile_columns + begin
-            # Most rows have one tile or two, nobody knows which: no branch between these.
+            # Most rows have one or two tiles, unpredictably, so these two cases share branch-free
+            # code.
             more = np.intp(end > begin)
             tile_of_slot[slot] = tile
             tile_of_slot[slot + more] = tile + more
@@ -234,20 +236,20 @@ def find_tiles(
     depths: NDArray[np.float64],
     order: NDArray[np.int32],
 ) -> None:
-    """Finds the tiles that each footprint reaches, and the order of the records beside it.
+    """Find the tiles that each footprint reaches; a parallel job sorts the records by depth.
 
     Args:
         jobs: From `share`.
         tile_columns: Tiles in a row of tiles.
         records: Flat records.
         boxes: [N, 4] tile boxes per record.
-        boxed: Whether to take all tiles of the boxes (records of the analytic response).
+        boxed: Whether to use all tiles of the boxes (records of the analytic response).
         drawn: [chunks] records per chunk.
         shelves: [N, SHELF] per record, completed.
         tile_of_slot: [slots] written.
         counts: [PARTS, T] written: entries per part and tile; zero before.
-        depths: [M] of the records drawn.
-        order: [M] the records drawn; ordered by depth.
+        depths: [M] depths of the drawn records.
+        order: [M] the drawn records; sorted by depth in place.
     """
     chunks = drawn.shape[0]
     ellipses = np.zeros(6 * _GROUP, np.float32)
@@ -255,7 +257,7 @@ def find_tiles(
     ends = np.empty(_GROUP * LANES, np.float32)
     job = next_job(jobs, PARTS + 1)
     while job <= PARTS:
-        # To sort is one job, the longest one.
+        # Sorting is one job, and the longest one.
         if job == 0:
             order[:] = order_by_depth(depths, order)
             job = next_job(jobs, PARTS + 1)
@@ -294,13 +296,13 @@ def find_tiles(
 def start_tiles(
     counts: NDArray[np.int32], tile_columns: int, bands: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Returns the first entry of each tile [T + 1]; divides the rows of tiles into bands.
+    """Return the first entry of each tile [T + 1], and divide the rows of tiles into bands.
 
     Args:
         counts: [PARTS, T] entries per part and tile.
         tile_columns: Tiles in a row of tiles.
-        bands: [bands + 1] written: first row of tiles of each band, so that bands have about
-            equally many entries.
+        bands: [bands + 1] written: first row of tiles of each band; bands have about equal numbers
+            of entries.
     """
     tiles = counts.shape[1]
     starts = np.zeros(tiles + 1, np.int64)
@@ -328,7 +330,7 @@ def fill_tiles(
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
 ) -> None:
-    """Writes the tile lists, each band of rows of tiles by one job.
+    """Write the tile lists; each job writes one band of rows of tiles.
 
     Args:
         jobs: From `share`.
@@ -338,8 +340,7 @@ def fill_tiles(
         shelves: [N, SHELF] per record.
         tile_of_slot: [slots] from `find_tiles`.
         starts: [T + 1] first entry of each tile.
-        entries: [E, 2] written: the record and the slot of each entry, tile by tile, front to
-            back.
+        entries: [E, 2] written: the record and the slot of each entry, tile by tile, front to back.
     """
     count = order.shape[0]
     last = bands.shape[0] - 1

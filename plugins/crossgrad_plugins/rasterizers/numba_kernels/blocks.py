@@ -1,7 +1,7 @@
-"""Blocks: rows of BLOCK float64 numbers in one flat vector, number k of each for Gaussian k.
+"""Blocks: rows of BLOCK float64 numbers in one flat vector; number k of each row is for Gaussian k.
 
-Loops over k without branches are vectorised by LLVM, which must see that rows do not overlap:
-one vector, rows at constant distances.
+LLVM vectorises branch-free loops over k only if it knows that rows do not overlap. Therefore a
+block is one vector with rows at constant distances.
 """
 
 import numpy as np
@@ -10,39 +10,39 @@ from numpy.typing import NDArray
 from crossgrad_plugins.rasterizers.numba_kernels.ewa import Row, Triple
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Gaussians of a block; divides CHUNK.
+#: Number of Gaussians in a block; divides CHUNK.
 BLOCK = 128
 
 
 @device
 def get(block: NDArray[np.float64], row: int, k: int) -> float:
-    """Returns number k of a row."""
+    """Return number k of a row."""
     return block[row * BLOCK + k]
 
 
 @device
 def get_three(block: NDArray[np.float64], row: int, k: int) -> Triple:
-    """Returns number k of three rows."""
+    """Return number k of three rows."""
     at = row * BLOCK + k
     return block[at], block[at + BLOCK], block[at + 2 * BLOCK]
 
 
 @device
 def get_four(block: NDArray[np.float64], row: int, k: int) -> Row:
-    """Returns number k of four rows."""
+    """Return number k of four rows."""
     at = row * BLOCK + k
     return block[at], block[at + BLOCK], block[at + 2 * BLOCK], block[at + 3 * BLOCK]
 
 
 @device
 def put(block: NDArray[np.float64], row: int, k: int, value: float) -> None:
-    """Writes number k of a row."""
+    """Write number k of a row."""
     block[row * BLOCK + k] = value
 
 
 @device
 def put_three(block: NDArray[np.float64], row: int, k: int, values: Triple) -> None:
-    """Writes number k of three rows."""
+    """Write number k of three rows."""
     at = row * BLOCK + k
     block[at] = values[0]
     block[at + BLOCK] = values[1]
@@ -51,7 +51,7 @@ def put_three(block: NDArray[np.float64], row: int, k: int, values: Triple) -> N
 
 @device
 def put_four(block: NDArray[np.float64], row: int, k: int, values: Row) -> None:
-    """Writes number k of four rows."""
+    """Write number k of four rows."""
     at = row * BLOCK + k
     block[at] = values[0]
     block[at + BLOCK] = values[1]

@@ -1,6 +1,6 @@
 """The elliptical weighted average (EWA) projection of one Gaussian, and its gradients.
 
-Float64 throughout: the kernels are bound by memory here, and needles need the digits.
+All values are float64: memory limits the speed of these kernels, and needles need the precision.
 """
 
 import math
@@ -13,7 +13,7 @@ from crossgrad_core.numerics.raster_constants import JACOBIAN_MARGIN
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import SIGMA_FLOOR
 
-#: px^4; footprints whose determinant is not larger are erased by the antialiased response.
+#: px^4; the antialiased response removes footprints with a determinant up to this value.
 LEAST_DET = 1e-6
 Triple = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -21,12 +21,12 @@ Pose = tuple[Row, Row, Row]
 
 
 class KernelCamera(NamedTuple):
-    """A camera as the kernels take it (all float64).
+    """A camera in the format of the kernels (all float64).
 
     Attributes:
         pose: [3, 4] world to camera.
         fx, fy, cx, cy: Pixels.
-        left, right, top, bottom: Bounds of x/z and y/z within which the Jacobian is taken.
+        left, right, top, bottom: Bounds of x/z and y/z for the Jacobian.
         width, height: Pixels.
         eye: [3] camera centre, world.
     """
@@ -48,7 +48,7 @@ class KernelCamera(NamedTuple):
 def pinhole(
     viewmat: NDArray[np.floating], intrinsics: NDArray[np.floating], width: int, height: int
 ) -> KernelCamera:
-    """Makes a camera from a world-to-camera matrix [4, 4] and K [3, 3]."""
+    """Return a camera from a world-to-camera matrix [4, 4] and K [3, 3]."""
     fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     extra_x, extra_y = JACOBIAN_MARGIN * width / (2.0 * fx), JACOBIAN_MARGIN * height / (2.0 * fy)
     pose = np.array(viewmat, dtype=np.float64, order="C")[:3]
@@ -70,7 +70,7 @@ def pinhole(
 
 @device
 def in_registers(pose: NDArray[np.float64]) -> Pose:
-    """Returns a [3, 4] matrix as numbers: loops that write to memory need not read it again."""
+    """Return a [3, 4] matrix as scalars, so that loops that write to memory need not reload it."""
     return (
         (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
         (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
@@ -80,7 +80,7 @@ def in_registers(pose: NDArray[np.float64]) -> Pose:
 
 @device
 def to_camera(pose: Pose, point: Triple) -> Triple:
-    """Returns a point in the camera's frame."""
+    """Return a point in the camera's frame."""
     x, y, z = point
     return (
         pose[0][0] * x + pose[0][1] * y + pose[0][2] * z + pose[0][3],
@@ -91,7 +91,7 @@ def to_camera(pose: Pose, point: Triple) -> Triple:
 
 @device
 def unit_quaternion(quat: Row) -> tuple[Row, float]:
-    """Returns the quaternion wxyz at unit length and the inverse of its norm (0 for a zero one)."""
+    """Return the quaternion wxyz at unit length, and its inverse norm (0 for a zero quaternion)."""
     w, x, y, z = quat
     square = w * w + x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
@@ -100,7 +100,7 @@ def unit_quaternion(quat: Row) -> tuple[Row, float]:
 
 @device
 def rotation(unit: Row) -> tuple[Triple, Triple, Triple]:
-    """Returns the columns of the rotation matrix of a unit quaternion."""
+    """Return the columns of the rotation matrix of a unit quaternion."""
     w, x, y, z = unit
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
@@ -113,7 +113,7 @@ def rotation(unit: Row) -> tuple[Triple, Triple, Triple]:
 def jacobian_rows(
     camera: KernelCamera, pose: Pose, inverse_z: float, slope_x: float, slope_y: float
 ) -> tuple[Triple, Triple]:
-    """Returns both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
+    """Return both rows of (Jacobian of the projection) x (world-to-camera rotation)."""
     a, b = camera.fx * inverse_z, camera.fy * inverse_z
     return (
         (
@@ -131,31 +131,31 @@ def jacobian_rows(
 
 @device
 def dot(a: Triple, b: Triple) -> float:
-    """Returns the scalar product."""
+    """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @device
 def clamped(value: float, low: float, high: float) -> float:
-    """Returns the value moved into [low, high]."""
+    """Return the value clamped to [low, high]."""
     return min(max(value, low), high)
 
 
 @device
 def in_axes(row: Triple, columns: tuple[Triple, Triple, Triple]) -> Triple:
-    """Returns one row of (projection x rotation): the images of the Gaussian's unit axes."""
+    """Return one row of (projection x rotation): the images of the Gaussian's unit axes."""
     return dot(row, columns[0]), dot(row, columns[1]), dot(row, columns[2])
 
 
 @device
 def times(a: Triple, b: Triple) -> Triple:
-    """Returns the products, number by number."""
+    """Return the element-wise products."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @device
 def opacity_factor(raw_det: float, det: float) -> float:
-    """Returns what dilation leaves of the opacity at equal energy (Mip-Splatting), 0 if erased."""
+    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 if removed."""
     if not (raw_det > LEAST_DET and det > LEAST_DET):
         return 0.0
     return math.sqrt(raw_det / (det + LEAST_DET) + LEAST_DET)
@@ -165,9 +165,10 @@ def opacity_factor(raw_det: float, det: float) -> float:
 def covariance(
     m: Triple, n: Triple, dilation: float, antialiased: bool
 ) -> tuple[float, float, float, float, float]:
-    """Returns A, B, C and the determinant of [m; n] [m; n]^T + dilation I, and its opacity factor.
+    """Return A, B, C and the determinant of [m; n] [m; n]^T + dilation I, and the opacity factor.
 
-    The determinant is a sum of squares (Cauchy-Binet), so that nothing cancels.
+    The determinant is a sum of squares (Cauchy-Binet), so that no precision is lost by
+    cancellation.
     """
     raw_a, b, raw_c = dot(m, m), dot(m, n), dot(n, n)
     raw_det = (
@@ -182,7 +183,7 @@ def covariance(
 
 @device
 def combined(a: Triple, p: float, b: Triple, q: float) -> Triple:
-    """Returns a p + b q."""
+    """Return a p + b q."""
     return a[0] * p + b[0] * q, a[1] * p + b[1] * q, a[2] * p + b[2] * q
 
 
@@ -190,7 +191,7 @@ def combined(a: Triple, p: float, b: Triple, q: float) -> Triple:
 def covariance_gradient(
     b: float, c: float, det: float, sum_dd: float, sum_dy: float, sum_yy: float
 ) -> Triple:
-    """Returns the gradients of A, B (as one number) and C of the dilated covariance."""
+    """Return the gradients of A, B (as one number) and C of the dilated covariance."""
     inverse_c = 1.0 / c
     slope, inverse_variance = b * inverse_c, c / det
     v_variance = 0.5 * inverse_variance * inverse_variance * sum_dd
@@ -207,7 +208,7 @@ def covariance_gradient(
 def factor_gradient(
     m: Triple, n: Triple, dilation: float, det: float, factor: float, v_log_factor: float
 ) -> Triple:
-    """Returns what the antialiasing factor adds to the gradients of A, B and C."""
+    """Return the contribution of the antialiasing factor to the gradients of A, B and C."""
     a, b, c = dot(m, m), dot(m, n), dot(n, n)
     raw_det = det - dilation * (a + c) - dilation * dilation
     # factor^2 = raw_det / (det + e) + e, so d(log factor) = d(factor^2) / (2 factor^2)
@@ -231,10 +232,10 @@ def axes_gradient(
     sum_sigma_2: float,
     v_angle: float,
 ) -> Triple:
-    """Returns the gradients of A, B (as one number) and C of the analytic response.
+    """Return the gradients of A, B (as one number) and C of the analytic response.
 
-    The sums are those of gradients by the logarithms of the standard deviations. A floored one has
-    no gradient, and the axes of a round Gaussian do not turn.
+    The sums are sums of gradients by the logarithms of the standard deviations. A standard
+    deviation at its floor has no gradient, and the axes of a round Gaussian do not rotate.
     """
     floor = SIGMA_FLOOR * SIGMA_FLOOR
     v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0
@@ -251,7 +252,7 @@ def axes_gradient(
 
 @device
 def turn_gradient(q: Row, inverse_norm: float, x: Triple, y: Triple, z: Triple) -> Row:
-    """Returns the gradient of a quaternion, given those of its rotation matrix' columns."""
+    """Return the gradient of a quaternion from the gradients of its matrix' columns."""
     w, a, b, c = q
     v_w = 2.0 * (a * (y[2] - z[1]) + b * (z[0] - x[2]) + c * (x[1] - y[0]))
     v_a = 2.0 * (w * (y[2] - z[1]) + b * (x[1] + y[0]) + c * (x[2] + z[0])) - 4.0 * a * (
@@ -274,7 +275,7 @@ def turn_gradient(q: Row, inverse_norm: float, x: Triple, y: Triple, z: Triple) 
 
 @device
 def weighted_sum(columns: tuple[Triple, Triple, Triple], weights: Triple) -> Triple:
-    """Returns the sum of the three columns times their weights."""
+    """Return the sum of the three columns times their weights."""
     a, b, c = columns
     p, q, r = weights
     return (

@@ -1,4 +1,4 @@
-"""One rendered view as plain arrays: forward, backward, and what the two share."""
+"""One rendered view as plain arrays: forward pass, backward pass, and their common parts."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.marked import count_marke
 def forward(
     gaussians: GaussianArrays, camera: CameraArrays, background: Float32, options: DrawOptions
 ) -> Frame:
-    """Draws the Gaussians over a background [3]."""
+    """Render the Gaussians over a background [3]."""
     projected, boxes, shelves, depths, room = _project(gaussians, camera, options)
     lists = _bin(projected, boxes, shelves, depths, room, boxed=options.response == "analytic")
     shape = (camera.height, camera.width)
@@ -94,10 +94,10 @@ def backward(
     directions: bool = False,
     harmonics: bool = True,
 ) -> GaussianGradients:
-    """Returns the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
+    """Return the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
 
     Args:
-        frame: From `forward`; with a depth where `v_depth` is given.
+        frame: From `forward`; with a depth if `v_depth` is given.
         v_image: [H, W, 3].
         v_alpha: [H, W] or None.
         v_depth: [H, W] or None.
@@ -138,7 +138,7 @@ def backward(
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
-        # On the way to harmonics nobody reads those of Gaussians that were not drawn.
+        # With harmonics, the colour gradients of Gaussians that were not drawn are never read.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,
@@ -191,7 +191,7 @@ def backward(
 
 
 def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
-    """Room for the gradient of one field: zeros for all Gaussians, or rows for those drawn."""
+    """Return an array for the gradient of one field: zeros for all Gaussians, or the drawn rows."""
     if like is None:
         return None
     rows = frame.projected.rows
@@ -207,7 +207,7 @@ def _directions(
     v_depth: Float32 | None,
     written: NDArray[np.uint8],
 ) -> Float32:
-    """Returns the directions of the pixels' gradients [N, BINS, FIELDS], in a pass of their own."""
+    """Return the directions of the pixels' gradients [N, BINS, FIELDS], in a separate pass."""
     gaussians, projected, lists = frame.gaussians, frame.projected, frame.lists
     analytic = _analytic(frame.options)
     axes = np.empty(2 * gaussians.means.shape[0], np.float32)
@@ -260,14 +260,14 @@ def marked_pixels(
     options: DrawOptions,
     marked: NDArray[np.uint8],
 ) -> Int32:
-    """Returns in how many marked pixels of a drawn view each Gaussian was blended, [N].
+    """Return the number of marked pixels of a view in which each Gaussian was blended, [N].
 
     Args:
-        projected: Of the view's `Frame`, like all up to `options`.
-        lists: See `projected`.
-        masks: See `projected`.
-        options: See `projected`.
-        marked: [H, W], not 0 where a pixel is marked.
+        projected: From the view's `Frame`.
+        lists: From the view's `Frame`.
+        masks: From the view's `Frame`.
+        options: From the view's `Frame`.
+        marked: [H, W], non-zero if a pixel is marked.
     """
     counts = np.zeros(lists.slots, np.int32)
     parallel(
@@ -285,14 +285,18 @@ def marked_pixels(
 
 
 def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
-    """Sums of the counts [slots] by Gaussian, [N]."""
+    """Return the sums of the counts [slots] per Gaussian, [N]."""
     pixels = np.zeros_like(projected.radii)
     parallel(count_pixels, projected.drawn, projected.owners, lists.shelves, counts, pixels)
     return pixels
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:
-    """Any vector asks for the kernels of the analytic response, which compile when first used."""
+    """Return an array if the response is analytic, else None; kernels specialise on this type.
+
+    The content of the array is not used. Kernels of the analytic response are compiled at first
+    use.
+    """
     return np.empty(0, np.float32) if options.response == "analytic" else None
 
 

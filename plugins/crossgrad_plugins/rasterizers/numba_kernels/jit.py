@@ -1,7 +1,7 @@
-"""How the kernels of this package are compiled: IEEE arithmetic in the order written.
+"""Compilation of the kernels of this package, with IEEE arithmetic in the order of the source code.
 
-Without fast-math results do not depend on the compiler's choices, and infinities and NaN are seen
-by the tests that look for them.
+Without fast-math, results do not depend on choices of the compiler. Checks for infinities and NaN
+work as written.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,10 @@ R = TypeVar("R")
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles an entry point; cached on disk."""
+    """Compile an entry point; the result is cached on disk."""
     return compiled(function)
 
 
 def device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function that kernels call; becomes part of the caller."""
+    """Compile a function that kernels call; it becomes part of the caller."""
     return inlined(function)

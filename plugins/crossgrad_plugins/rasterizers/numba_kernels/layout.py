@@ -1,15 +1,15 @@
 """Sizes, the layout of a drawn Gaussian's record, and vector constants of the kernels.
 
-The 2-D Gaussian is kept by rows of pixels, which is well conditioned even for needles: with
-covariance [[A, B], [B, C]] (dilated), row offset dy and column offset dx from the mean,
+The 2-D Gaussian is stored by rows of pixels, which is well conditioned even for needles. With the
+(dilated) covariance [[A, B], [B, C]], row offset dy and column offset dx from the mean,
 
     exponent = -(dy^2 / C + (dx - k dy)^2 / V) / 2,   k = B / C,   V = (A C - B^2) / C,
 
 so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of log 2.
 
-As an argument they stay operands in memory (always in the first-level cache) of the instructions
-that use them. Written into the kernel they would be rebuilt in registers, which are scarce there:
-that made the forward pass 15 % slower.
+Vector constants are passed as an argument. So they remain memory operands (in the first-level
+cache) of the instructions that use them. As literals in the kernel they would occupy registers,
+which are scarce there and slow the forward pass down.
 """
 
 import math
@@ -22,21 +22,21 @@ from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, TRANSMITTA
 from crossgrad_core.numerics.simd import WIDE, Lanes, fma, load_wide, scale_by_power
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device
 
-#: Pixels of a tile.
+#: Width and height of a tile, in pixels.
 TILE_WIDTH = 64
 TILE_HEIGHT = 16
-#: A patch is 4 x 4 pixels, worked on together in vectors whose lanes are its pixels column by
-#: column: what the rows have in common is then a plain load. A tile's patches are numbered along
-#: its rows of patches, and are as many as an integer has bits.
+#: A patch is 4 x 4 pixels, processed together in vectors whose lanes are the pixels column by
+#: column. The common values of the rows are then a plain load. A tile's patches are numbered along
+#: its rows of patches. Their number equals the number of bits of an integer.
 SIDE = 4
 COLUMNS = TILE_WIDTH // SIDE
-#: Pixels from a tile's first column to the one from which columns are counted: the shorter the way,
-#: the finer is a place in float32.
+#: Columns are counted from this column of a tile. The shorter the distance, the more precise is a
+#: float32 position.
 MIDDLE = TILE_WIDTH // 2
 PATCHES = COLUMNS * TILE_HEIGHT // SIDE
-#: Gaussians that one job of the projection handles.
+#: Number of Gaussians that one job of the projection handles.
 CHUNK = 2048
-#: Floats of a record (one cache line), and what is where.
+#: Number of floats in a record (one cache line), followed by the positions of its fields.
 RECORD = 16
 U_WHOLE, U_PART = 0, 1  # projected mean, pixels: whole and fractional part
 V_WHOLE, V_PART = 2, 3
@@ -47,29 +47,29 @@ WIDTH = 7  # 1 / DECAY
 LOG_OPACITY = 8  # log2 of the opacity (with the antialiasing factor)
 RED, GREEN, BLUE = 9, 10, 11
 DEPTH = 12
-#: A record of the analytic response has these instead of SLOPE to LOG_OPACITY.
+#: Fields of a record of the analytic response that replace SLOPE to LOG_OPACITY.
 COSINE, SINE = 4, 5  # of the longer main axis
 INVERSE_1, INVERSE_2 = 6, 7  # 1 / standard deviation along each main axis, 1 / pixels
 PEAK = 8  # opacity times 2 pi times both standard deviations
 REACH_1, REACH_2 = 13, 14  # offsets along the main axes beyond which nothing is touched, pixels
-RADIUS = 15  # squared, in sigmas beyond half a pixel, likewise for both axes together
-#: Sums over pixels that the backward pass leaves per drawn Gaussian and tile.
+RADIUS = 15  # squared reach of both axes together, in sigmas beyond half a pixel
+#: Number of sums over pixels that the backward pass writes per drawn Gaussian and tile.
 PARTIAL = 16
 SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY = 0, 1, 2, 3, 4, 5
 SUM_RED, SUM_GREEN, SUM_BLUE = 6, 7, 8
 SUM_DEPTH = 9
 SUM_ABS_X, SUM_ABS_Y = 10, 11
-#: Of the analytic response instead of SUM_D to SUM_DY.
+#: Sums of the analytic response that replace SUM_D to SUM_DY.
 SUM_U, SUM_V, SUM_SIGMA_1, SUM_SIGMA_2, SUM_TURN = 1, 2, 3, 4, 5
 LOG2_E = 1.0 / math.log(2.0)
-#: A pixel is touched where the exponent plus log2 of the opacity reaches this.
+#: A pixel is touched if the exponent plus log2 of the opacity reaches this value.
 TOUCH = math.log2(ALPHA_THRESHOLD)
-#: Row extents are computed with this much to spare, so that rounding loses no touched pixel.
+#: Row extents are enlarged by this value, so that rounding loses no touched pixel.
 SPARE = 1e-4
-# 2**f on [-1/2, 1/2] by rising power: least largest relative error (9e-8) with 2**0 exact.
+# 2**f on [-1/2, 1/2] by rising power: minimal maximum relative error (9e-8) with 2**0 exact.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733953714371)
 _EXP2_HIGH = (0.009671512991189957, 0.001326472032815218)
-# Adding it rounds a small float32 to a whole number, left in the lowest bits of the sum.
+# Adding this number rounds a small float32 to a whole number, in the lowest bits of the sum.
 _ROUND = 1.5 * 2.0**23
 EXP2 = WIDE  # six coefficients, after the rounding constant
 LARGEST_ALPHA = 7 * WIDE
@@ -81,15 +81,15 @@ FIXED = FINISHED  # the odds of an alpha that no parameter changes
 CAPPED = 12 * WIDE
 LEAST = 13 * WIDE
 OFFSETS = 14 * WIDE  # pixel offsets from the middle, by columns of patches
-#: What `exp2` needs.
+#: The constants that `exp2` uses.
 Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 
 
 @lru_cache(maxsize=8)
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
-    """Returns the constants for one cap of alpha, WIDE equal numbers each but for the offsets.
+    """Return the constants for one cap of alpha, WIDE equal numbers each, except for the offsets.
 
-    One array for each cap, which is only read.
+    There is one shared array for each cap; do not write to it.
     """
     shared = (
         max_alpha,
@@ -105,7 +105,7 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     flat = np.concatenate([np.repeat(np.array(values, dtype=np.float32), WIDE), offsets])
     room = np.empty(len(flat) + WIDE, np.float32)
     shift = -(room.ctypes.data // room.itemsize) % WIDE
-    # From the beginning of a cache line on: no vector lies across two.
+    # The array starts at a cache line, so that no vector crosses two lines.
     found = room[shift : shift + len(flat)]
     found[:] = flat
     return found
@@ -113,9 +113,9 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
 
 @device
 def terms_of(constants: NDArray[np.float32]) -> Terms:
-    """Returns what `exp2` needs.
+    """Return the constants of `exp2`.
 
-    Loaded before a loop it stays in registers where there are 32 of them.
+    If they are loaded before a loop, they remain in registers on machines with 32 vector registers.
     """
     return (
         load_wide(constants, 0),
@@ -130,7 +130,10 @@ def terms_of(constants: NDArray[np.float32]) -> Terms:
 
 @device
 def exp2(power: Lanes, terms: Terms) -> Lanes:
-    """Returns 2**power, relative error below 2e-7 for powers in [-126, 127], else anything."""
+    """Return 2**power with a relative error below 2e-7.
+
+    The result is valid for powers in [-126, 127] and undefined for other powers.
+    """
     rounder, c0, c1, c2, c3, c4, c5 = terms
     shifted = power + rounder
     fraction = power - (shifted - rounder)

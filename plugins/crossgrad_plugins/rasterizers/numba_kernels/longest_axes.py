@@ -1,4 +1,4 @@
-"""The longest axis of each drawn Gaussian as the camera sees it, and sums along it."""
+"""The projected longest axis of each drawn Gaussian, and sums along it."""
 
 import math
 
@@ -21,9 +21,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.directions import BINS, FIELDS, SUMS
 
-#: An axis that the camera sees shorter than this (pixels) is seen end on and has no direction.
+#: An axis shorter than this on the image (pixels) is seen end on and has no direction.
 SHORTEST = 1e-6
-#: The gradients of plain records were left in this unit.
+#: The unit of the gradients of plain records.
 _PLAIN_UNIT = 2.0 * math.log(2.0)
 
 
@@ -34,7 +34,7 @@ def _axis(
     quat: NDArray[np.float32],
     scale: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """Returns a / |a|^2 with a the projection of the longest axis (one standard deviation), px."""
+    """Return a / |a|^2 with a the projection of the longest axis (one standard deviation), px."""
     pose = in_registers(camera.pose)
     x, y, z = to_camera(pose, (np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])))
     unit, _ = unit_quaternion(
@@ -67,7 +67,7 @@ def longest_axes(
     owners: NDArray[np.int32],
     axes: NDArray[np.float32],
 ) -> None:
-    """Projects the longest axis of every record.
+    """Project the longest axis of every record.
 
     Args:
         jobs: From `share`.
@@ -78,7 +78,7 @@ def longest_axes(
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         axes: [2 N] flat, written per record: a / |a|^2 with a the projected axis, one standard
-            deviation long, in pixels; 0 where it is seen end on.
+            deviation long, in pixels; 0 if it is seen end on.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)
@@ -100,7 +100,7 @@ def add_directions(
     found: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> None:
-    """Adds up each Gaussian's slots in their order.
+    """Sum each Gaussian's slots in their order.
 
     Args:
         jobs: From `share`.

@@ -1,4 +1,4 @@
-"""Projection of the Gaussians to the image: culling, records of those drawn, tile boxes."""
+"""Projection of the Gaussians to the image: culling, records of drawn Gaussians, tile boxes."""
 
 import math
 
@@ -52,10 +52,10 @@ from crossgrad_plugins.rasterizers.numba_kernels.records import (
     write_plain,
 )
 
-#: Standard deviations at which a Gaussian of opacity 1 has faded, and 1 % for poses that are not
-#: quite rigid.
+#: Number of standard deviations at which a Gaussian of opacity 1 has faded, plus 1 % for poses that
+#: are not exactly rigid.
 _SIGMAS = 1.01 * math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
-#: The same depth may be rounded in another way here.
+#: Factor for depth comparisons, because the same depth may be rounded differently here.
 _NEARER = 1.0 - 1e-9
 
 
@@ -85,10 +85,11 @@ def _may_be_drawn(
     opacities: NDArray[np.float32],
     flags: NDArray[np.uint8],
 ) -> None:
-    """Sets `flags` where one of `size` Gaussians may touch a pixel; no branches, so vectorised.
+    """Set `flags` for each of `size` Gaussians that may touch a pixel.
 
-    A footprint ends sqrt(2 log(255 opacity)) standard deviations from the mean, and the projected
-    standard deviation is at most that of a ball of the largest scale. All is times the depth.
+    The loop has no branches, so it is vectorised. A footprint ends sqrt(2 log(255 opacity))
+    standard deviations from the mean. The projected standard deviation is at most the projection of
+    a ball with the radius of the largest scale. All values are multiplied by the depth.
     """
     pose = in_registers(camera.pose)
     steep_x = max(abs(camera.left), abs(camera.right))
@@ -107,7 +108,7 @@ def _may_be_drawn(
         inside = (off_x <= (half_x + spare) * z + ball_x * ball) & (
             off_y <= (half_y + spare) * z + ball_y * ball
         )
-        # The footprint of an opacity beyond 1 reaches farther.
+        # The footprint of an opacity above 1 reaches farther.
         flags[k] = (z > near * _NEARER) & (opacity >= ALPHA_THRESHOLD) & (inside | (opacity > 1.0))
 
 
@@ -123,10 +124,10 @@ def _picked(
     chosen: NDArray[np.int64],
     picked: NDArray[np.float32],
 ) -> int:
-    """Copies those of a block that may be drawn side by side; returns their number.
+    """Copy the Gaussians of a block that may be drawn to consecutive places; return their number.
 
-    `chosen` says which they are; `picked` has their means, their quaternions, their scales and
-    their opacities.
+    `chosen` receives their indices; `picked` receives their means, quaternions, scales and
+    opacities.
     """
     count = 0
     for k in range(size):
@@ -155,9 +156,9 @@ def _project_block(
     scales: NDArray[np.float32],
     found: NDArray[np.float64],
 ) -> None:
-    """Projects the first `count` Gaussians, seen or not; no branches, so it is vectorised.
+    """Project the first `count` Gaussians, visible or not; branch-free, so it is vectorised.
 
-    All arrays are flat: LLVM must see the strides.
+    All arrays are flat, because LLVM must know the strides.
     """
     pose = in_registers(camera.pose)
     for k in range(count):
@@ -183,7 +184,7 @@ def _project_block(
 
 @device
 def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]) -> bool:
-    """Writes the colour of Gaussian i to record j; returns whether it is finite."""
+    """Write the colour of Gaussian i to record j; return whether it is finite."""
     red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
     records[j * RECORD + RED] = red
     records[j * RECORD + GREEN] = green
@@ -193,7 +194,7 @@ def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[n
 
 @device
 def _give_slots(first: int, end: int, boxes: NDArray[np.int32], shelves: NDArray[np.int32]) -> int:
-    """Reserves a slot for each tile in the records' boxes; returns their number."""
+    """Reserve a slot for each tile in the records' boxes; return the number of slots."""
     slots = 0
     for j in range(first, end):
         shelves[j, FIRST_SLOT] = slots
@@ -218,7 +219,7 @@ def _record_block(
     boxes: NDArray[np.int32],
     owners: NDArray[np.int32],
 ) -> int:
-    """Makes records of the chosen Gaussians that touch a pixel; returns the next record."""
+    """Write records of the chosen Gaussians that touch a pixel; return the next record."""
     j = first_record
     width, height = camera.width, camera.height
     for k in range(chosen.size):
@@ -228,7 +229,7 @@ def _record_block(
         if limits is not None:
             published, within = square(k, width, height, found)
             if z > near and z < math.inf:
-                # Seen by the published code, whether or not it touches a pixel.
+                # Visible for the published code, even if it touches no pixel.
                 radii[i] = published
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue
@@ -257,7 +258,7 @@ def _record_block(
 
 @kernel
 def listed(drawn: NDArray[np.int64], owners: NDArray[np.int32]) -> NDArray[np.int32]:
-    """[R] the Gaussians that have a record, sorted."""
+    """Return [R] the Gaussians that have a record, sorted."""
     rows = np.empty(drawn.sum(), np.int32)
     place = 0
     for chunk in range(drawn.shape[0]):
@@ -290,28 +291,29 @@ def project(
     drawn: NDArray[np.int64],
     room: NDArray[np.int64],
 ) -> None:
-    """Projects N Gaussians; those drawn of each chunk take the first records of that chunk.
+    """Project N Gaussians; the drawn Gaussians of each chunk use the first records of that chunk.
 
     Args:
         jobs: From `share`.
         camera: The view.
         near: Least depth.
         dilation: Added to both variances, px^2.
-        antialiased: Whether opacities are lowered by what the dilation adds in area.
-        analytic: Any vector asks for records of the analytic response (with no dilation).
+        antialiased: Whether opacities are lowered to compensate the area that the dilation adds.
+        analytic: Any vector selects records of the analytic response (without dilation); None:
+            plain.
         limits: [N, 2] written per record: first and last column of 16 pixels that it may touch, by
-            the published footprint; None asks for the footprint alpha >= 1/255.
+            the published footprint; None selects the footprint alpha >= 1/255.
         means: [N, 3].
         quats: [N, 4] wxyz, any norm.
         scales: [N, 3] linear.
         opacities: [N].
         colors: [N, 3] RGB; None leaves the records' colours to `sh_forward`.
-        radii: [N] written, pixels; 0 where nothing is touched.
+        radii: [N] written, pixels; 0 if nothing is touched.
         records: [N * RECORD] written.
         depths: [N] written per record.
         boxes: [N, 4] written per record: tile columns and rows [x0, x1), [y0, y1).
-        owners: [N] written per record: its Gaussian.
-        shelves: [N, SHELF] first slots written per record: tiles of the boxes before it in its
+        owners: [N] written per record: index of its Gaussian.
+        shelves: [N, SHELF] first slots written per record: number of tiles in earlier boxes of the
             chunk.
         drawn: [chunks] written: records of each chunk.
         room: [chunks] written: tiles in the boxes of each chunk.

@@ -60,7 +60,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 from crossgrad_plugins.rasterizers.numba_kernels.reduction import add_up
 from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import main_axes
 
-# Rows of a block: the sums by their own numbers, what its Gaussians bring along, what is found.
+# Rows of a block: the sums in their order, the parameters of its Gaussians, and the results.
 _MEAN = PARTIAL
 _QUAT = _MEAN + 3
 _SCALE = _QUAT + 4
@@ -81,7 +81,7 @@ def _unproject_block(
     analytic: NDArray[np.float32] | None,
     block: NDArray[np.float64],
 ) -> None:
-    """Finds the gradients of `count` Gaussians; no branches on them, so it is vectorised."""
+    """Compute the gradients of `count` Gaussians; branch-free, so it is vectorised."""
     pose = in_registers(camera.pose)
     pose_x, pose_y, pose_z = pose[0][:3], pose[1][:3], pose[2][:3]
     for k in range(count):
@@ -168,7 +168,7 @@ def _bring(
     scales: NDArray[np.float32],
     block: NDArray[np.float64],
 ) -> None:
-    """Puts the sums and the parameters of Gaussian i into place k of a block."""
+    """Copy the sums and the parameters of Gaussian i to number k of a block."""
     for number in range(SUM_DEPTH):
         put(block, number, k, sums[number])
     put(block, SUM_DEPTH, k, sums[SUM_DEPTH] if with_depth else 0.0)
@@ -199,10 +199,10 @@ def _fill_block(
     v_colors: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Fills a block with Gaussians that have gradients, and writes what needs no projection.
+    """Fill a block with Gaussians that have gradients, and write gradients without projection.
 
     Returns:
-        The next record, and how many Gaussians there are in the block; `numbers` says which.
+        The next record, and the number of Gaussians in the block; `numbers` receives their indices.
     """
     size = 0
     j = first_record
@@ -238,7 +238,7 @@ def _write_block(
     v_centres: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> None:
-    """Writes the gradients of a block."""
+    """Write the gradients of a block."""
     for k in range(size):
         i = numbers[k]
         for axis in range(3):
@@ -279,15 +279,15 @@ def project_backward(
     v_centres: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> None:
-    """Adds up each Gaussian's slots and carries the sums on to its parameters.
+    """Sum each Gaussian's slots, and convert the sums to gradients of its parameters.
 
     Args:
         jobs: From `share`.
-        camera: As in `project`, like all up to `owners`.
+        camera: As in `project`; this holds for all arguments up to `owners`.
         dilation: Px^2.
         antialiased: Whether opacities were lowered.
-        analytic: Any vector says that the response is analytic.
-        with_depth: Whether the partial sums hold gradients of the depth.
+        analytic: Any vector selects the analytic response; None: plain.
+        with_depth: Whether the partial sums contain gradients of the depth.
         means: [N, 3].
         quats: [N, 4].
         scales: [N, 3].
@@ -297,13 +297,13 @@ def project_backward(
         shelves: [N, SHELF] from binning.
         written: [slots] from `differentiate`.
         partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
-        v_means: [N, 3] written, zero for Gaussians without gradients; like all below.
+        v_means: [N, 3] written, zero for Gaussians without gradients; so are all below.
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].
-        v_colors: [N, 3], of the RGB drawn; written for all drawn, others stay as they are.
+        v_colors: [N, 3], by the rendered RGB; written for drawn Gaussians only.
         v_centres: [N, 2], of the projected mean, per pixel.
-        v_absolute: [N, 2], sums of absolute values; [0, 2] where not computed.
+        v_absolute: [N, 2], sums of absolute values; [0, 2] if not computed.
     """
     sums = np.empty(PARTIAL, np.float32)
     block = np.empty(_ROWS * BLOCK, np.float64)

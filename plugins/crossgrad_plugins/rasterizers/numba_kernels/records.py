@@ -1,4 +1,4 @@
-"""Records of the Gaussians that touch a pixel, made from projected ones."""
+"""Records of the Gaussians that touch a pixel, computed from projected Gaussians."""
 
 import math
 
@@ -42,33 +42,33 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.analytic import (
     window,
 )
 
-#: Rows of a block of projected Gaussians, seen or not: camera depth, projected mean (pixels),
-#: dilated 2-D covariance (px^2) and its determinant (negative for what cannot be drawn), and the
-#: factor of the opacity.
+#: Rows of a block of projected Gaussians, visible or not: camera depth, projected mean (pixels),
+#: dilated 2-D covariance (px^2), its determinant (negative if the Gaussian cannot be drawn), and
+#: the factor of the opacity.
 CAMERA_DEPTH, MEAN_U, MEAN_V, VARIANCE_X, COVARIANCE, VARIANCE_Y, DETERMINANT, FACTOR = range(8)
-#: Of the plain response: 1 / variance in y, the slope of the rows' centres, their variance and
-#: decay, log2 of the opacity, and both half extents of the footprint, pixels.
+#: Rows of the plain response: 1 / variance in y, slope of the rows' centres, variance and decay of
+#: the rows, log2 of the opacity, and both half-extents of the footprint, pixels.
 _INVERSE_C, _SLOPE, _VARIANCE, _DECAY, _LOG_OPACITY, _EXTENT_X, _EXTENT_Y = range(8, 15)
 FOUND = 15
 
-#: The published footprint: standard deviations, least square of half the difference of the
-#: variances (px^4), and side of its tiles, pixels.
+#: The published footprint: number of standard deviations, lower bound of the squared half
+#: difference of the variances (px^4), and side of its tiles, pixels.
 SIGMAS, LEAST_SPREAD, SQUARE = 3.0, 0.1, 16.0
 #: First and last pixel column, first and last pixel row.
 Rectangle = tuple[float, float, float, float]
-#: What a record says besides mean and colour, in the order of the layout: of the plain response
-#: SLOPE to LOG_OPACITY; of the analytic one COSINE to INVERSE_2, REACH_1 to RADIUS, PEAK.
+#: Numbers of a record except mean and colour, in the order of the layout. Plain response: SLOPE to
+#: LOG_OPACITY. Analytic response: COSINE to INVERSE_2, REACH_1 to RADIUS, PEAK.
 Plain = tuple[float, float, float, float, float]
 Analytic = tuple[float, float, float, float, float, float, float, float]
 
 _LARGEST_RADIUS = 2.0**30
-# Projected values beyond this are dropped; well inside float32.
+# Gaussians with larger projected values are dropped; the limit is well inside float32.
 _LARGEST = 1e30
 _STEEPEST = 1e15
-# Smallest decay in a record (px^-2): flat over any image, and its inverse is a float32.
+# Smallest decay in a record (px^-2): constant over any image, and its inverse is a valid float32.
 _FLAT = 1e-30
 
-# A float64's bits: those of the mantissa, the exponent of 1, the bits of 1.0.
+# The bits of a float64: number of mantissa bits, exponent of 1, and the bits of 1.0.
 _MANTISSA_BITS, _BIAS = 52, 1023
 _MANTISSA, _ONE = np.int64((1 << _MANTISSA_BITS) - 1), np.int64(_BIAS << _MANTISSA_BITS)
 _ROOT_OF_TWO = math.sqrt(2.0)
@@ -76,13 +76,13 @@ _ROOT_OF_TWO = math.sqrt(2.0)
 
 @device
 def first_pixel(low: float) -> float:
-    """Returns the first pixel (from 0) whose centre is not before `low`."""
+    """Return the first pixel (from 0) whose centre is at or after `low`."""
     return max(np.ceil(low - 0.5), 0.0)
 
 
 @device
 def last_pixel(high: float, size: int) -> float:
-    """Returns the last pixel of `size` whose centre is not beyond `high`."""
+    """Return the last pixel of `size` whose centre is at or before `high`."""
     return min(np.floor(high - 0.5), size - 1.0)
 
 
@@ -97,7 +97,7 @@ def _row_hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Whether the footprint covers a pixel centre in image row `y`."""
+    """Return whether the footprint covers a pixel centre in image row `y`."""
     dy = y + 0.5 - v
     left_over = (reach - dy * dy * inverse_c) * variance
     if not left_over >= 0.0:
@@ -119,7 +119,7 @@ def _hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Whether the footprint covers any pixel centre in the image rows y0 to y1."""
+    """Return whether the footprint covers any pixel centre in the image rows y0 to y1."""
     middle = clamped(np.floor(v), y0, y1)
     if _row_hits(middle, u, v, inverse_c, slope, variance, reach, width):
         return True
@@ -141,7 +141,7 @@ def _pixels(
     height: int,
     within: Rectangle,
 ) -> Rectangle:
-    """Returns the pixels that a footprint may touch (x0 > x1 or y0 > y1: none)."""
+    """Return the pixels that a footprint may touch (x0 > x1 or y0 > y1: none)."""
     return (
         max(first_pixel(u - extent_x), within[0]),
         min(last_pixel(u + extent_x, width), within[1]),
@@ -159,7 +159,7 @@ def place_record(
     records: NDArray[np.float32],
     boxes: NDArray[np.int32],
 ) -> None:
-    """Writes mean and tile box of record j."""
+    """Write the mean and the tile box of record j."""
     at = j * RECORD
     records[at + U_WHOLE] = np.floor(u)
     records[at + U_PART] = u - np.float64(records[at + U_WHOLE])
@@ -173,10 +173,11 @@ def place_record(
 
 @device
 def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple[int, Rectangle]:
-    """Returns the published radius of projected Gaussian k and the pixels that it may touch.
+    """Return the published radius of projected Gaussian k and the pixels that it may touch.
 
-    They are those of the 16 x 16 tiles that a square of that half-side around the mean overlaps; a
-    square off the image has radius 0 (3DGS: three standard deviations, at least of variance 0.1).
+    They are the pixels of all 16 x 16 tiles that overlap a square of that half-side around the
+    mean. A square outside the image has radius 0 (3DGS: three standard deviations; the squared half
+    difference of the variances is at least 0.1).
     """
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)
@@ -202,29 +203,29 @@ def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple
 
 @device
 def first_tile(low: float) -> float:
-    """Returns the first tile of the published grid that is not before `low`, pixels."""
+    """Return the first tile of the published grid at or after `low`, pixels."""
     return max(np.floor((low - 0.5) / SQUARE), 0.0)
 
 
 @device
 def last_tile(high: float) -> float:
-    """Returns the last tile of the published grid that is not beyond `high`, pixels; -1: none."""
+    """Return the last tile of the published grid at or before `high`, pixels; -1: none."""
     return max(np.floor((high - 0.5) / SQUARE), -1.0)
 
 
 @device
 def _radius(extent: float) -> int:
-    """Returns the radius that is reported for a footprint of half-extent `extent`."""
+    """Return the radius that is reported for a footprint of half-extent `extent`."""
     return np.int32(max(1.0, np.ceil(min(extent, _LARGEST_RADIUS))))
 
 
 @device
 def log2_of(value: float) -> float:
-    """Returns log2 of a normal positive number, error below 1e-13.
+    """Return log2 of a normal positive number, with an error below 1e-13.
 
-    It is at most -1000 for smaller ones, 0 and negative ones, and anything for NaN and infinity:
-    callers look before. Loops that call it are vectorised, which those that call the C library are
-    not.
+    For smaller numbers, 0 and negative numbers, the result is at most -1000. For NaN and infinity
+    it is undefined, so callers check their arguments. LLVM vectorises loops that call this
+    function, but not loops that call the C library.
     """
     raw = np.float64(value).view(np.int64)
     exponent = (raw >> _MANTISSA_BITS) - _BIAS
@@ -243,7 +244,7 @@ def log2_of(value: float) -> float:
 
 @device
 def shape_block(count: int, opacities: NDArray[np.float32], found: NDArray[np.float64]) -> None:
-    """Finds what the plain response of `count` projected Gaussians is like, drawn or not."""
+    """Compute the plain response of `count` projected Gaussians, drawn or not."""
     for k in range(count):
         a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
         inverse_c = 1.0 / c
@@ -261,7 +262,7 @@ def shape_block(count: int, opacities: NDArray[np.float32], found: NDArray[np.fl
 
 @device
 def _reach(log_opacity: float) -> float:
-    """Returns the largest squared distance of a touched pixel, in standard deviations."""
+    """Return the largest squared distance of a touched pixel, in standard deviations."""
     return 2.0 / LOG2_E * (log_opacity - TOUCH)
 
 
@@ -269,10 +270,10 @@ def _reach(log_opacity: float) -> float:
 def plain_shape(
     k: int, width: int, height: int, within: Rectangle, found: NDArray[np.float64]
 ) -> tuple[int, Rectangle, Plain]:
-    """Returns the radius of projected Gaussian k, its pixels, and what its record says.
+    """Return the radius of projected Gaussian k, its pixels, and the numbers of its record.
 
-    The radius is 0 where it touches no pixel. Nothing is written here: Numba counts references to
-    the arrays of a function with several ways out, which takes time.
+    The radius is 0 if it touches no pixel. The function writes no array: Numba counts references to
+    the arrays of a function with several returns, which takes time.
     """
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
@@ -280,7 +281,7 @@ def plain_shape(
     inverse_c, slope, variance, decay = get_four(found, _INVERSE_C, k)
     log_opacity = get(found, _LOG_OPACITY, k)
     reach = _reach(log_opacity)
-    # The sums are NaN or infinite if any term is, and then fail the comparison.
+    # The sums are NaN or infinite if any term is, and then they fail the comparison.
     if not (
         det > 0.0
         and reach >= 0.0
@@ -306,7 +307,7 @@ def plain_shape(
 
 @device
 def write_plain(j: int, numbers: Plain, records: NDArray[np.float32]) -> None:
-    """Writes what record j of the plain response says."""
+    """Write the numbers of record j of the plain response."""
     at = j * RECORD
     records[at + SLOPE] = numbers[0]
     records[at + ROW_DECAY] = numbers[1]
@@ -326,7 +327,7 @@ def _covers(
     reach: tuple[float, float],
     opacity: float,
 ) -> bool:
-    """Whether the analytic response touches pixel (x, y)."""
+    """Return whether the analytic response touches pixel (x, y)."""
     dx, dy = x + 0.5 - u, y + 0.5 - v
     along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
     if abs(along) > reach[0] or abs(across) > reach[1]:
@@ -343,7 +344,7 @@ def analytic_shape(
     within: Rectangle,
     found: NDArray[np.float64],
 ) -> tuple[int, Rectangle, Analytic]:
-    """As `plain_shape` for the analytic response."""
+    """Like `plain_shape`, for the analytic response."""
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)
@@ -393,7 +394,7 @@ def analytic_shape(
 
 @device
 def write_analytic(j: int, numbers: Analytic, records: NDArray[np.float32]) -> None:
-    """Writes what record j of the analytic response says."""
+    """Write the numbers of record j of the analytic response."""
     at = j * RECORD
     records[at + COSINE], records[at + SINE] = numbers[0], numbers[1]
     records[at + INVERSE_1], records[at + INVERSE_2] = numbers[2], numbers[3]

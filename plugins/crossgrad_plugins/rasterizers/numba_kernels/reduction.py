@@ -9,7 +9,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.binning import FIRST_SLOT, SLOT
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 from crossgrad_plugins.rasterizers.numba_kernels.layout import CHUNK, PARTIAL
 
-#: Slots ahead for whose rows memory is asked: records follow each other in it.
+#: Number of slots ahead for memory prefetches; records are consecutive in memory.
 _AHEAD = 32
 
 
@@ -21,7 +21,7 @@ def add_up(
     partials: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> bool:
-    """Adds up the rows of a record's slots that were written; returns whether there were any.
+    """Sum the written rows of a record's slots; return whether there were any.
 
     `partials` ends with a row of zeros.
     """
@@ -48,7 +48,7 @@ def count_pixels(
     counts: NDArray[np.int32],
     pixels: NDArray[np.int32],
 ) -> None:
-    """Adds up the pixels in which each Gaussian was blended.
+    """Sum the pixels in which each Gaussian was blended.
 
     Args:
         jobs: From `share`.
@@ -56,7 +56,7 @@ def count_pixels(
         owners: [N] from `project`.
         shelves: [N, SHELF] from binning.
         counts: [slots] pixels per slot.
-        pixels: [N] written for the Gaussians drawn; zero before.
+        pixels: [N] written for the drawn Gaussians; zero before.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)

@@ -5,15 +5,15 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.rasterizers.numba_kernels.jit import device, kernel
 
-#: Bits of a digit, at most: more would not leave the first-level cache to what is sorted.
+#: Maximum number of bits of a digit. With more, the counters would fill the first-level cache.
 _DIGIT = 11
-#: Low bits of the float64 that are dropped: depths that agree to 2e-10 count as equal.
+#: Number of low bits of the float64 that are dropped: depths that agree to 2e-10 count as equal.
 _DROPPED = 20
 
 
 @device
 def _width(number: int) -> int:
-    """Returns the bits of a number that is not negative."""
+    """Return the number of bits of a number that is not negative."""
     width = 0
     while number >> width:
         width += 1
@@ -22,30 +22,31 @@ def _width(number: int) -> int:
 
 @kernel
 def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Returns `items` by rising depth; equal depths keep their order.
+    """Return `items` by rising depth; equal depths keep their order.
 
     Args:
         depths: [M] positive camera depths of the items.
-        items: [M] whatever is to be ordered.
+        items: [M] the items to sort.
     """
     count = items.shape[0]
     if count == 0:
         return items.copy()
-    # Positive floating-point numbers order like their bit patterns. Counted from the least one they
-    # are short, so that the place of an item fits beside its key and a digit or two less is sorted.
+    # Positive floating-point numbers have the same order as their bit patterns. Relative to the
+    # smallest pattern they are short. So the index of an item fits into the same integer, and fewer
+    # digits are sorted.
     bits = depths.view(np.int64)
     least, most = bits[0] >> _DROPPED, bits[0] >> _DROPPED
     for i in range(count):
         least, most = min(least, bits[i] >> _DROPPED), max(most, bits[i] >> _DROPPED)
     of_key, of_place = _width(most - least), _width(count - 1)
-    # Of a million items whose depths have all orders of magnitude that there are.
+    # Needed only for about a million items whose depths span all orders of magnitude.
     coarser = max(0, of_key + of_place - 63)
     of_key -= coarser
-    # One at least: a number of bits must not be negative.
+    # At least one pass, because the number of bits must not be negative.
     passes = max(1, (of_key + _DIGIT - 1) // _DIGIT)
     of_digit = (of_key + passes - 1) // passes
     last_bin = (1 << of_digit) - 1
-    # Indices that cannot be negative are not looked at.
+    # Unsigned indices, so that the compiled code does not check for negative values.
     bins = np.zeros((passes, last_bin + 1), np.uint32)
     packed, spare = np.empty(count, np.int64), np.empty(count, np.int64)
     for i in range(count):

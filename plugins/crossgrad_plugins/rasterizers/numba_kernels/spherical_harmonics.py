@@ -1,4 +1,4 @@
-"""View-dependent colour by real spherical harmonics up to degree 3."""
+"""View-dependent colour from real spherical harmonics up to degree 3."""
 
 import math
 
@@ -31,16 +31,16 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     RED,
 )
 
-#: Floats of a cache line.
+#: Number of floats in a cache line.
 _LINE = 16
-#: Gaussians whose basis functions are worked out before any of them is used; coefficients are asked
-#: for so many ahead.
+#: Number of Gaussians whose basis functions are computed before the first is used. Coefficients are
+#: prefetched this number of Gaussians ahead.
 _BLOCK = WIDE
 
 
 @device
 def _bring_near(rest: NDArray[np.float32], i: int) -> None:
-    """Asks for the memory of the coefficients of Gaussian i before they are needed."""
+    """Prefetch the coefficients of Gaussian i."""
     width = 3 * rest.shape[1]
     for at in range(0, width, _LINE):
         prefetch(rest, i * width + at)
@@ -58,7 +58,7 @@ def _look(
     table: NDArray[np.float32],
     bases: NDArray[np.float32],
 ) -> None:
-    """Writes unit vectors and inverse distances of a block, and a row of basis functions each."""
+    """Write unit vectors and inverse distances of a block, and one row of basis functions each."""
     for j in range(last - first):
         put_way(means, np.intp(owners[first + j]), eye, ways, j)
     normalize(ways)
@@ -79,7 +79,7 @@ def sh_forward(
     records: NDArray[np.float32],
     radii: NDArray[np.int32],
 ) -> None:
-    """Writes max(0, 1/2 + harmonics(direction)) to the colours of the records.
+    """Write max(0, 1/2 + harmonics(direction)) to the colours of the records.
 
     Args:
         jobs: From `share`.
@@ -87,11 +87,11 @@ def sh_forward(
         eye: [3] camera centre.
         means: [N, 3].
         dc: [N, 1, 3] coefficients of degree 0.
-        rest: [N, B - 1, 3] of the higher degrees; only those active are read.
+        rest: [N, B - 1, 3] coefficients of higher degrees; only active degrees are read.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
-        records: Flat records, colours written; a colour that is not finite draws nothing.
-        radii: [N] set to 0 for these.
+        records: Flat records, colours written; a record with a non-finite colour is not drawn.
+        radii: [N] set to 0 for records with a non-finite colour.
     """
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
@@ -121,7 +121,7 @@ def sh_forward(
                     colour = 0.5 + C0 * np.float64(dc[i, 0, channel])
                     colour += np.float64(colours[row + channel])
                     if not math.isfinite(colour):
-                        # Reaches no pixel.
+                        # The record reaches no pixel.
                         records[j * RECORD + LOG_OPACITY] = -math.inf
                         radii[i] = 0
                     records[j * RECORD + RED + channel] = max(colour, 0.0)
@@ -144,11 +144,11 @@ def sh_backward(
     v_means: NDArray[np.float32],
     wanted: tuple[bool, bool, bool],
 ) -> None:
-    """Carries gradients of the colours on to coefficients and centres.
+    """Propagate gradients of the colours to coefficients and centres.
 
     Args:
         jobs: From `share`.
-        degree: As in `sh_forward`, like the next six.
+        degree: As in `sh_forward`; this holds for the next six arguments too.
         eye: [3].
         means: [N, 3].
         rest: [N, B - 1, 3].
@@ -156,8 +156,8 @@ def sh_backward(
         owners: [N].
         records: Flat records.
         v_colors: [N, 3] gradients of the clamped colours.
-        v_dc: [N, 1, 3] written for the Gaussians drawn; zero before.
-        v_rest: [N, B - 1, 3] likewise, active degrees only; no rows where it is not written.
+        v_dc: [N, 1, 3] written for the drawn Gaussians; zero before.
+        v_rest: [N, B - 1, 3] like `v_dc`, active degrees only; without rows if it is not written.
         v_means: [N, 3] added to.
         wanted: Whether `v_dc` and `v_rest` have a row for each record instead, in their order (such
             rows are written whole, and need not be zero before), and whether `v_rest` is written.

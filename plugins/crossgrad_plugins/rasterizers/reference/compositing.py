@@ -12,10 +12,10 @@ from crossgrad_core.plugin import Response
 from crossgrad_plugins.rasterizers.reference.projection import Shape, coverage
 from crossgrad_plugins.rasterizers.reference.statistics import offsets
 
-#: Channels that are composited: RGB, depth, and ones for the accumulated opacity.
+#: Number of composited channels: RGB, depth, and ones for the accumulated opacity.
 CHANNELS = 5
-#: Up to so many (pixel, Gaussian) entries the backward pass finds all intermediates in memory
-#: (about 0.4 GB in float64); beyond, each tile is drawn a second time when its gradient is due.
+#: Up to this number of (pixel, Gaussian) entries, all intermediates are kept for the backward pass
+#: (about 0.4 GB in float64). With more entries, each tile is rendered again in the backward pass.
 REMEMBERED_ENTRIES = 2**21
 #: Side of a tile, pixels.
 TILE = 16
@@ -28,7 +28,7 @@ class Drawing:
     Attributes:
         size: Width and height of the image, pixels.
         response: How a Gaussian fills a pixel.
-        max_alpha: Cap of alpha; what is capped has no gradient.
+        max_alpha: Cap of alpha; a capped alpha has no gradient.
         probed: Number R of the probe's columns.
     """
 
@@ -39,14 +39,14 @@ class Drawing:
 
 
 def splat_table(means: Tensor, depths: Tensor, colors: Tensor, shapes: Shape) -> Tensor:
-    """[N, 7 + S] one row per Gaussian, as `composite` reads it."""
+    """Return [N, 7 + S] one row per Gaussian, in the layout that `composite` reads."""
     columns = (means, shapes.opacities[:, None], colors, depths[:, None], shapes.parameters)
     return torch.cat(columns, -1)
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Lists of all tiles, one after the other, tiles in row-major order.
+    """The lists of all tiles, concatenated, with tiles in row-major order.
 
     Attributes:
         rows: [P] int64 rows of the Gaussians' table, front to back within each tile.
@@ -60,17 +60,17 @@ class TileLists:
 def composite_tiles(
     table: Tensor, lists: TileLists, drawing: Drawing
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blends all tiles of an image.
+    """Blend all tiles of an image.
 
     Args:
-        table: [V, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
+        table: [V, R + 7 + S] the probe's columns and the columns of `splat_table`, front to back.
         lists: The rows of each tile.
         drawing: Data common to all tiles.
 
     Returns:
-        `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as of `composite`.
+        `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as in `composite`.
     """
-    # An embedding's backward adds in a fixed order on every device; that of indexing need not.
+    # The backward pass of an embedding adds in a fixed order on every device; indexing may not.
     tiles = torch.split(embedding(lists.rows, table), lists.sizes)
     again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
     images, touched, blended = [], [], []
@@ -91,17 +91,17 @@ def composite_tiles(
 
 
 def _tile_centers(size: tuple[int, int], like: Tensor) -> list[Tensor]:
-    """[h, w, 2] pixel centres of each tile, row-major; smaller tiles at the far borders."""
+    """Return [h, w, 2] pixel centres of each tile, row-major; border tiles can be smaller."""
     columns, rows = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in size)
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)  # [H, W, 2]
     return [tile for band in torch.split(grid, TILE) for tile in torch.split(band, TILE, 1)]
 
 
 def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Blends the Gaussians of one tile over its pixels.
+    """Blend the Gaussians of one tile over its pixels.
 
     Args:
-        table: [G, R + 7 + S] the probe's columns and those of `splat_table`, front to back.
+        table: [G, R + 7 + S] the probe's columns and the columns of `splat_table`, front to back.
         centers: [P, 2] pixel centres.
         drawing: Data common to all tiles.
 
@@ -118,10 +118,10 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
 
 @dataclass(frozen=True, eq=False)
 class PixelCounter:
-    """Counts pixels of a drawn view; see `Screen.count`.
+    """A function that counts pixels of a rendered view; see `Screen.count`.
 
     Attributes:
-        table: [V, R + 7 + S] as of `composite_tiles`, detached.
+        table: [V, R + 7 + S] as in `composite_tiles`, detached.
         lists: The rows of each tile.
         drawing: Data common to all tiles.
         index: [V] int64, the Gaussian of each row.
@@ -136,7 +136,7 @@ class PixelCounter:
 
     @torch.no_grad()
     def __call__(self, marked: Tensor) -> Tensor:
-        """[N] int32, in how many of the marked pixels [H, W] each Gaussian was blended."""
+        """Return [N] int32, in how many of the marked pixels [H, W] each Gaussian was blended."""
         rows = self.lists.rows
         tiles = torch.split(self.table[rows], self.lists.sizes)
         found = rows.new_zeros(len(rows))
@@ -151,7 +151,7 @@ class PixelCounter:
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """[P, G] of a tile: whether alpha >= 1/255, whether it was blended, and with which weight."""
+    """Return [P, G] of a tile: if alpha >= 1/255, if the Gaussian was blended, and its weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)
@@ -161,20 +161,20 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     alpha = torch.where(touching, alpha, 0.0)
     after = (1 - alpha).cumprod(-1)  # transmittance behind each Gaussian, if nothing stops
     before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
-    # Transmittance only falls, so this also stops everything behind the first that stops.
+    # Transmittance never rises, so everything behind the first Gaussian that stops is excluded too.
     blended = touching & (after >= TRANSMITTANCE_STOP)
     return touching, blended, torch.where(blended, alpha * before, 0.0)
 
 
 def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
-    """[N, 4] int64 tile boxes (x0, y0, x1, y1), ends excluded; empty where off the image.
+    """Return [N, 4] int64 tile boxes (x0, y0, x1, y1), ends excluded; empty if outside the image.
 
     Args:
         means: [N, 2] pixels; finite.
         reach: [N, 2] half-extents, pixels.
         size: Width and height of the image, pixels.
     """
-    # One pixel of slack so that no rounding here can cut a footprint.
+    # One pixel is added on each side, so that rounding cannot cut a footprint.
     low, high = means - reach - 1, means + reach + 1
     limit = torch.tensor(size).to(means, non_blocking=True)
     seen = (high > 0) & (low < limit)
@@ -184,7 +184,7 @@ def tile_boxes(means: Tensor, reach: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def tile_lists(boxes: Tensor, size: tuple[int, int]) -> TileLists:
-    """Fills the lists of all tiles from `boxes` [N, 4], which are in depth order."""
+    """Return the lists of all tiles for `boxes` [N, 4], which are in depth order."""
     across, down = (-(-pixels // TILE) for pixels in size)
     x0, y0, x1, y1 = boxes.unbind(-1)
     counts = (x1 - x0) * (y1 - y0)

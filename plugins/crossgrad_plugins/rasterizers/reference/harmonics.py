@@ -9,10 +9,10 @@ from crossgrad_core.plugin import Gaussians
 
 
 def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
-    """[N, 3] RGB as seen from `center` [3].
+    """Return [N, 3] RGB as seen from `center` [3].
 
-    RGB is returned as given. Spherical harmonics become max(0, 0.5 + sum of bands); bands above the
-    active degree are left out, and what is clamped at 0 has no gradient.
+    RGB colours are returned unchanged. Spherical harmonics become max(0, 0.5 + sum of bands). Bands
+    above the active degree are left out. A value that is clamped at 0 has no gradient.
     """
     if gaussians.colors is not None:
         return gaussians.colors
@@ -25,7 +25,7 @@ def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
 
 
 def coefficients_of(gaussians: Gaussians) -> Tensor | None:
-    """[N, (degree + 1)^2, 3] the bands up to the active degree; None where there are none."""
+    """Return [N, (degree + 1)^2, 3] the bands up to the active degree; None if there are none."""
     if gaussians.sh_dc is None or gaussians.sh_rest is None:
         return gaussians.sh_dc
     active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]
@@ -33,9 +33,9 @@ def coefficients_of(gaussians: Gaussians) -> Tensor | None:
 
 
 def harmonics(directions: Tensor, degree: int) -> Tensor:
-    """[N, (degree + 1)^2] basis functions at unit vectors [N, 3].
+    """Return [N, (degree + 1)^2] basis functions at unit vectors [N, 3].
 
-    Order and signs are those of the field's PLY files: per band l the orders m = -l..l, with the
+    Order and signs are as in 3DGS PLY files: per band l the orders m = -l..l, with the
     Condon-Shortley phase.
     """
     x, y, z = directions.unbind(-1)

@@ -1,7 +1,7 @@
-"""From world space to the image plane (EWA splatting), and how a Gaussian fills a pixel.
+"""Projection from world space to the image plane (EWA splatting), and the response in a pixel.
 
-A response is a pair of functions: one turns a projection into a `Shape`, the other turns the offset
-of pixel centres from the mean into a coverage, so that alpha = min(max_alpha, opacity * coverage).
+A response is a pair of functions. One maps a projection to a `Shape`. The other maps the offset of
+pixel centres from the mean to a coverage, so that alpha = min(max_alpha, opacity * coverage).
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from crossgrad_core.numerics.raster_constants import ALPHA_THRESHOLD, JACOBIAN_M
 from crossgrad_core.numerics.rotations import unit_rotation_matrices
 from crossgrad_core.plugin import Camera, Response
 
-#: Mip-Splatting draws nothing whose 2-D determinant is at most this, px^4.
+#: Mip-Splatting does not render Gaussians with a 2-D determinant up to this value, px^4.
 MIP_EPSILON = 1e-6
 #: Smallest standard deviation along an axis of the analytic response, px.
 SIGMA_FLOOR = 1e-3
@@ -32,7 +32,7 @@ class Projection:
         xx: [N] entry of the 2-D covariance, px^2; likewise `xy` and `yy`.
         xy: See `xx`.
         yy: See `xx`.
-        det: [N] determinant of the 2-D covariance, px^4; never negative.
+        det: [N] determinant of the 2-D covariance, px^4; not negative.
         factors: [N, 2, 3] projections of the three axes, one standard deviation long, pixels.
     """
 
@@ -46,10 +46,10 @@ class Projection:
 
 
 def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projection:
-    """Projects Gaussians by the local affine approximation (EWA, Zwicker et al. 2001).
+    """Project Gaussians by the local affine approximation (EWA, Zwicker et al. 2001).
 
-    Nothing is culled here: a row behind the camera or with a zero quaternion is not finite or has
-    no meaning, and the caller leaves it out.
+    The function culls nothing. A row behind the camera or with a zero quaternion is not finite or
+    not meaningful; the caller leaves it out.
 
     Args:
         means: [N, 3] local units.
@@ -63,7 +63,8 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     u = camera.fx * slope_x + camera.cx
     v = camera.fy * slope_y + camera.cy
 
-    # Far outside the image the affine approximation is useless and its Jacobian explodes.
+    # Far outside the image, the affine approximation is useless and its Jacobian becomes very
+    # large.
     slope_x = slope_x.clamp(*_slopes(camera.width, camera.fx, camera.cx))
     slope_y = slope_y.clamp(*_slopes(camera.height, camera.fy, camera.cy))
     zero = torch.zeros_like(z)
@@ -71,18 +72,18 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     row_v = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1)
     jacobian = torch.stack([row_u, row_v], 1)  # [N, 2, 3]
 
-    # The covariance is factor @ factor.T. Of a zero quaternion, all of this is NaN.
+    # The covariance is factor @ factor.T. For a zero quaternion, all of this is NaN.
     axes = unit_rotation_matrices(quats / quats.norm(dim=-1, keepdim=True)) * scales[:, None, :]
     factor = jacobian @ pose[:3, :3] @ axes  # [N, 2, 3]
     first, second = factor.unbind(1)
-    # Cauchy-Binet: a sum of squares, where xx * yy - xy^2 would cancel for needles.
+    # Cauchy-Binet: a sum of squares. The formula xx * yy - xy^2 would lose precision for needles.
     det = torch.linalg.cross(first, second).square().sum(-1)
     xx, xy, yy = first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1)
     return Projection(torch.stack([u, v], -1), z, xx, xy, yy, det, factor)
 
 
 def _slopes(size: int, focal: float, center: float) -> tuple[float, float]:
-    """The range of x / z in which the Jacobian is evaluated: the image and a margin around it."""
+    """Return the range of x / z for the Jacobian: the image and a margin around it."""
     margin = JACOBIAN_MARGIN * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin
 
@@ -92,13 +93,13 @@ class Shape:
     """The footprints of N Gaussians.
 
     Attributes:
-        parameters: [N, S] what `coverage` needs: the conic (a, b, c), or for the analytic response
+        parameters: [N, S] input of `coverage`: the conic (a, b, c), or for the analytic response
             (cosine, sine, sigma1, sigma2) of the main axes.
         opacities: [N] factor of the coverage.
         peaks: [N] alpha at the mean, before the cap.
-        reach: [N, 2] half-extents in pixels of a box that holds every pixel centre with
+        reach: [N, 2] half-extents in pixels of a box that contains every pixel centre with
             alpha >= 1/255.
-        radii: [N] half-extent in pixels to be reported.
+        radii: [N] half-extent in pixels that is reported.
     """
 
     parameters: Tensor
@@ -109,7 +110,10 @@ class Shape:
 
 
 def shape(projection: Projection, opacities: Tensor, dilation: float, response: Response) -> Shape:
-    """Footprints of projected Gaussians with `opacities` [N]; the analytic one ignores dilation."""
+    """Return the footprints of projected Gaussians with `opacities` [N].
+
+    The analytic response ignores the dilation.
+    """
     if response == "analytic":
         return _windowed(projection, opacities)
     xx, yy = projection.xx + dilation, projection.yy + dilation
@@ -123,7 +127,7 @@ def shape(projection: Projection, opacities: Tensor, dilation: float, response: 
 
 
 def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> Tensor:
-    """[P, N] share of its opacity that each Gaussian gives to each pixel.
+    """Return [P, N] share of its opacity that each Gaussian contributes to each pixel.
 
     Args:
         dx: [P, N] mean minus pixel centre, pixels; likewise `dy`.
@@ -138,26 +142,29 @@ def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> 
         return 2 * pi * sigma1 * sigma2 * _window(u, sigma1) * _window(v, sigma2)
     a, b, c = parameters.unbind(-1)
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-    # Only rounding can make the power positive. The clamp keeps exp and its gradient finite there.
+    # Only rounding can make the power positive. The clamp keeps exp and its gradient finite then.
     return power.clamp(max=0.0).exp() * (power <= 0)
 
 
 def _mip_factor(before: Tensor, after: Tensor) -> Tensor:
-    """Mip-Splatting, 2-D filter: what the dilation added in area is taken off the opacity."""
+    """Return the opacity factor that compensates the area added by dilation.
+
+    Source: Mip-Splatting, 2-D filter.
+    """
     drawn = (before > MIP_EPSILON) & (after > MIP_EPSILON)
     factor = (before / (after + MIP_EPSILON) + MIP_EPSILON).sqrt()
     return torch.where(drawn, factor, 0.0)
 
 
 def _log_contrast(peaks: Tensor) -> Tensor:
-    """Natural logarithm of how far `peaks` are above the threshold; not below 0."""
+    """Return the natural logarithm of the ratio of `peaks` to the threshold, at least 0."""
     return (peaks / ALPHA_THRESHOLD).log().clamp(min=0.0)
 
 
 def _windowed(projection: Projection, opacities: Tensor) -> Shape:
-    """Analytic-Splatting: the Gaussian is integrated over the pixel, turned onto its main axes."""
+    """Return the shape for Analytic-Splatting: integrals over the pixel along the main axes."""
     middle, half = (projection.xx + projection.yy) / 2, (projection.xx - projection.yy) / 2
-    # A round Gaussian has no main axes: take those of the image, without derivative.
+    # A round Gaussian has no main axes; the axes of the image are used, without derivative.
     round_ = (half == 0) & (projection.xy == 0)
     half = torch.where(round_, 1.0, half)
     xy = torch.where(round_, 0.0, projection.xy)
@@ -185,15 +192,16 @@ def _windowed(projection: Projection, opacities: Tensor) -> Shape:
 
 
 def _floored_root(squares: Tensor) -> Tensor:
-    """Standard deviations of `squares`, not below the floor and without gradient at it."""
+    """Return standard deviations of `squares`; at the floor they have no gradient."""
     return squares.clamp(min=SIGMA_FLOOR**2).sqrt()
 
 
 def _window(offset: Tensor, sigma: Tensor) -> Tensor:
-    """Mass of a 1-D Gaussian at `offset` from the centre of a window of one pixel.
+    """Return the mass of a 1-D Gaussian in a window of one pixel.
 
-    This is F(x + h) - F(x - h) with F(x) = sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and
-    h = 0.5 / sigma, as a product so that neither tails nor wide Gaussians cancel.
+    The window's centre is at `offset` from the mean. The mass is F(x + h) - F(x - h) with F(x) =
+    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. It is computed as a
+    product, so that precision is not lost for tails or for wide Gaussians.
     """
     x = -offset.abs() / sigma
     h = 0.5 / sigma
@@ -207,10 +215,10 @@ def _cubic(x: Tensor) -> Tensor:
 
 
 def _window_reach(sigma: Tensor, log_contrast: Tensor) -> Tensor:
-    """Offset beyond which `_window` is below exp(-log_contrast).
+    """Return the offset beyond which `_window` is below exp(-log_contrast).
 
-    Beyond half a pixel the window is below sigmoid(-y) < exp(-y), y = LINEAR t + CUBIC t^3 and
-    t = (offset - 0.5) / sigma; the cubic y(t) = log_contrast has this one real root.
+    Beyond half a pixel the window is below sigmoid(-y) < exp(-y), y = LINEAR t + CUBIC t^3 and t =
+    (offset - 0.5) / sigma. The cubic y(t) = log_contrast has only one real root.
     """
     p = LINEAR / (3 * CUBIC)
     t = 2 * sqrt(p) * torch.sinh(torch.asinh(log_contrast / (2 * CUBIC * p * sqrt(p))) / 3)

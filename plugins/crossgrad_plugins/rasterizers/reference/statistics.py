@@ -1,4 +1,4 @@
-"""Gradients of the projected means, from the backward pass: signed, absolute, binned."""
+"""Gradients of the projected means from the backward pass: signed, absolute, binned."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,23 +9,23 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import Screen
 
-#: Edges of the bins, standard deviations along the axis.
+#: Edges of the bins, in standard deviations along the axis.
 EDGES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 BINS, FIELDS = len(EDGES) + 1, 5
-#: An axis that the camera sees shorter than this (pixels) is seen end on and has no direction.
+#: An axis shorter than this on the image (pixels) is seen end on and has no direction.
 SHORTEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Recorder:
-    """Where the gradients of the drawn rows belong.
+    """The destination of the gradients of the drawn rows.
 
     Attributes:
-        screen: Receives the gradients; each backward pass replaces those of the last.
+        screen: Receives the gradients; each backward pass replaces the gradients of the last.
         index: [V] int64, the Gaussian of each drawn row.
         count: Number N of all Gaussians.
-        absolute: Whether absolute gradients were asked for.
-        axes: [V, 2] longest axes, where directions were asked for; else None.
+        absolute: Whether absolute gradients were requested.
+        axes: [V, 2] longest axes if directions were requested; else None.
     """
 
     screen: Screen
@@ -35,7 +35,7 @@ class Recorder:
     axes: Tensor | None = None
 
     def record(self, signed: Tensor, sums: Tensor) -> None:
-        """Takes the gradients [V, 2] of the drawn rows and the sums that came to their probes."""
+        """Store the gradients [V, 2] of the drawn rows, and the sums from their probes."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
             self.screen.abs_gradient = self._scattered(sums[:, :2])
@@ -44,7 +44,7 @@ class Recorder:
             self.screen.directions = binned.view(self.count, BINS, FIELDS)
 
     def probe(self, like: Tensor) -> Tensor:
-        """[V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero for each sum of a bin."""
+        """Return [V, 2] zeros, or [V, 34]: two zeros, the axes, and a zero per sum of a bin."""
         zeros = like.new_zeros(len(like), 2)
         if self.axes is None:
             return zeros
@@ -57,10 +57,10 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """The same table [V, C], noted in the backward pass, and a probe [V, R].
+    """Return the same table [V, C], which the backward pass records, and a probe [V, R].
 
-    The first two columns are projected means. The probe reaches the pixels as means do and changes
-    nothing there; what comes back to it as its gradient are sums over pixels (see `offsets`).
+    The first two columns are projected means. The probe reaches the pixels like the means and
+    changes nothing there. Its gradient contains sums over pixels (see `offsets`).
     """
     result: tuple[Tensor, Tensor] = _Recorded.apply(table, recorder)  # type: ignore[no-untyped-call]
     return result
@@ -69,11 +69,11 @@ def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
 def offsets(
     means: Tensor, probe: Tensor, pixels: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Mean minus pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
+    """Return the mean minus the pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
 
-    Backward sums the pixels' gradients for the means; for the probe's first two columns it sums
-    their absolute values, and for the columns after the axes, where there are any, what
-    `binned_directions` finds.
+    The backward pass sums the pixels' gradients for the means. For the probe's first two columns it
+    sums their absolute values. For the columns after the axes, if there are any, it sums the result
+    of `binned_directions`.
 
     Args:
         means: [G, 2] pixels.
@@ -127,11 +127,11 @@ class _Offsets(torch.autograd.Function):
 
 
 def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
-    """[N, 2] a / |a|^2 with a the projection of each longest axis, px^-1; 0 where seen end on.
+    """Return [N, 2] a / |a|^2 with a the projection of each longest axis, px^-1; 0 if seen end on.
 
     Args:
         factors: [N, 2, 3] from `Projection`: the projections of the three axes.
-        scales: [N, 3]; the first of equals counts as the largest.
+        scales: [N, 3]; of equal scales, the first counts as the largest.
     """
     longest = scales.argmax(-1)[:, None, None].expand(-1, 2, 1)
     axis = factors.gather(-1, longest).squeeze(-1)
@@ -142,7 +142,7 @@ def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
 def binned_directions(
     gradients: Tensor, offsets: Tensor, axes: Tensor, size: tuple[int, int]
 ) -> Tensor:
-    """[G, BINS, FIELDS] of `crossgrad_core.contract.gaussians.Screen.directions`, of some pixels.
+    """Return [G, BINS, FIELDS] of `Screen.directions`, summed over some pixels.
 
     Args:
         gradients: [2, P, G] by the projected mean of each Gaussian, of each pixel.
@@ -151,7 +151,7 @@ def binned_directions(
         size: Width and height of the image, pixels.
     """
     scaled = gradients * torch.tensor(size).to(gradients, non_blocking=True)[:, None, None]
-    # Divided by the larger one first: their squares could be below the smallest number.
+    # Divide by the larger component first, because squares could underflow.
     largest = scaled.abs().amax(0)
     moved = largest > 0
     scaled = scaled / torch.where(moved, largest, 1.0)

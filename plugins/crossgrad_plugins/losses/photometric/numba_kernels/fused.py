@@ -1,18 +1,19 @@
 """The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
 
-With s = x + y and d = x - y (x the image, y the target) SSIM needs four windowed means instead of
-five, M_s, M_d, E[s^2], E[d^2], and factors without cancellation between the two images:
+x is the image and y the target; s = x + y and d = x - y. With s and d, SSIM needs four windowed
+means instead of five: M_s, M_d, E[s^2], E[d^2]. Its factors have no cancellation between the two
+images:
 
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 
-with V = E[.^2] - M^2. Its gradient is G * a + s (G * b) + d (G * c), where G * is the same window
-and a, b, c hold the derivatives by M_s + M_d, V_s and V_d. Variances are differences of nearly
-equal numbers where the image is smooth, so s and d are taken relative to a centre: their means over
-the tile (per channel).
+with V = E[.^2] - M^2. The gradient is G * a + s (G * b) + d (G * c). G * is a convolution with the
+same window; a, b, c are the derivatives by M_s + M_d, V_s and V_d. In smooth parts of an image,
+variances are differences of nearly equal numbers. Therefore s and d are taken relative to a centre,
+their mean over the tile (per channel).
 
-The image is cut into tiles whose size depends on the image's size only. A tile runs down its rows
-with ring buffers of sixteen rows (s, d, mask; a, b, c), so that the working set stays in the
-second-level cache and memory does not grow with the image. Every tile recomputes its halo, so
+The image is divided into tiles whose size depends only on the image's size. A tile is processed row
+by row with ring buffers of sixteen rows (s, d, mask; a, b, c). So the working set stays in the
+second-level cache, and memory does not grow with the image. Every tile recomputes its halo, so
 tiles are independent and the result has the same bits for any number of threads.
 """
 
@@ -63,14 +64,14 @@ def _tile(
     mask: _Flags, is_masked: bool, gradient: _Floats, with_gradient: bool,
     box: _Box, height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
 ) -> tuple[float, float]:  # fmt: skip
-    """Sums of |x - y| and 1 - SSIM over a tile; its gradient is written to `gradient`."""
+    """Return the sums of |x - y| and 1 - SSIM over a tile; write its gradient to `gradient`."""
     top, bottom, left, right = box
     columns = right - left
     halo = RADIUS if with_gradient else 0
     absolute, dissimilarity = 0.0, 0.0
     set_centres(scratch, image, target, target_8bit, is_8bit, mask, is_masked, box, width)
     loaded = top - halo - RADIUS
-    # In pairs of rows; the last one may have a row that nobody needs.
+    # Rows are processed in pairs; the last pair may contain an unused row.
     for first in range(top - halo, bottom + halo, 2):
         while loaded <= first + 1 + RADIUS:
             load_row(
@@ -106,7 +107,7 @@ def _all_tiles(
     height: int, width: int, l1_weight: np.float32, ssim_weight: np.float32,
     sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Runs every tile; their sums [rows of tiles, columns of tiles, 2] are written."""
+    """Process every tile; write the sums [rows of tiles, columns of tiles, 2]."""
     down, across = sums.shape[0], sums.shape[1]
     rows, columns = (height + down - 1) // down, (width + across - 1) // across
     tiles = down * across
@@ -135,14 +136,14 @@ def loss_terms(
     gradient: NDArray[np.float32] | None = None,
     ssim_weight: float = 0.2,
 ) -> tuple[float, float]:
-    """Means of |x - y| and of 1 - SSIM over the kept pixels, and the gradient by the image.
+    """Return the means of |x - y| and of 1 - SSIM over the kept pixels; write the gradient.
 
     Args:
         image: [H, W, 3], C-contiguous.
         target: [H, W, 3], C-contiguous; 8-bit values are divided by 255.
         mask: [H, W], True where the pixel counts; None keeps all.
         gradient: [H, W, 3], C-contiguous, receives the gradient of (1 - w) * L1 + w * (1 - SSIM);
-            None leaves out that half of the work.
+            None skips that half of the work.
         ssim_weight: w.
 
     Returns:

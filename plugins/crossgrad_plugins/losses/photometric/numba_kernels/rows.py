@@ -1,6 +1,6 @@
-"""The rows of a tile: layout, loading into rings, sums over the 11-wide window.
+"""The rows of a tile: memory layout, loading into ring buffers, sums over the 11-wide window.
 
-Rows are kept interleaved, [column * 3 + channel]: a step of one column is three floats.
+Rows are interleaved, [column * 3 + channel], so adjacent columns are three floats apart.
 """
 
 from typing import TypeAlias
@@ -25,19 +25,19 @@ from crossgrad_plugins.losses.photometric.reference import RADIUS, WINDOW, gauss
 
 TILE_ROWS = 64
 TILE_COLUMNS = 384
-#: Rows of a ring; a power of two, more than WINDOW: those of two rows overlap.
+#: Rows of a ring: a power of two, larger than WINDOW, because the windows of two rows overlap.
 SLOTS = 16
 CHANNELS = 3
-#: Floats of the columns that a window reaches beyond its centre.
+#: Number of floats by which a window extends beyond its centre column.
 HALO = CHANNELS * RADIUS
-# Room for a tile with twice the halo on both sides, and for vectors that start before its end.
+# Space for a tile with twice the halo on both sides, and for vectors that start before its end.
 _ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
 STRIDE = _ROOM + -_ROOM % WIDE
 #: Ring of s - centre.
 SUM = 0
 #: Ring of d - centre.
 DIFFERENCE = SUM + SLOTS * STRIDE
-#: Ring of 1 where a pixel counts, else 0.
+#: Ring of 1 if a pixel counts, else 0.
 KEEP = DIFFERENCE + SLOTS * STRIDE
 #: s, s^2, d, d^2 of two rows, summed down the columns.
 PARTIAL = KEEP + SLOTS * STRIDE
@@ -47,12 +47,12 @@ BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
 BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
 #: a, b, c of two rows, summed down the columns.
 BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
-#: A row of results.
+#: One row of results.
 LINE = BACK + 6 * STRIDE
-#: What is subtracted from s and from d.
+#: The centres that are subtracted from s and from d.
 CENTRE_SUM = LINE + STRIDE
 CENTRE_DIFFERENCE = CENTRE_SUM + STRIDE
-#: Floats in all.
+#: Total number of floats.
 SCRATCH = CENTRE_DIFFERENCE + STRIDE
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Bytes: TypeAlias = NDArray[np.uint8]  # 1-D
@@ -67,10 +67,13 @@ def set_centres(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, box: _Box, width: int,
 ) -> None:  # fmt: skip
-    """Per channel, means of s and d over every eighth row of the tile, x and y clipped."""
+    """Write the centres: per channel, means of s and d over every eighth row of the tile.
+
+    x and y are clipped to [0, 1].
+    """
     top, bottom, left, right = box
     for channel in range(CHANNELS):
-        count = 1e-9  # nothing kept: the sums are 0, and so are the centres
+        count = 1e-9  # if nothing is kept, the sums are 0, and so are the centres
         sum_x, sum_y = 0.0, 0.0
         for row in range(top, bottom, 8):
             for column in range(left, right):
@@ -79,7 +82,7 @@ def set_centres(
                 count += 1.0
                 i = (row * width + column) * CHANNELS + channel
                 y = np.float32(target_8bit[i]) / _WHITE if is_8bit else target[i]
-                # In this order a NaN counts as 0.
+                # In this order of arguments, a NaN counts as 0.
                 sum_x += float(min(max(_ZERO, image[i]), _ONE))
                 sum_y += float(min(max(_ZERO, y), _ONE))
         centre_sum = np.float32((sum_x + sum_y) / count)
@@ -89,12 +92,12 @@ def set_centres(
             scratch[CENTRE_DIFFERENCE + j] = centre_difference
 
 
-# Loops over views from 0 on, because an index that may be negative keeps LLVM from vectorising.
+# Loops run over views from index 0, because LLVM does not vectorise with possibly negative indices.
 
 
 @part
 def fill(array: _Floats, start: int, count: int, value: np.float32) -> None:
-    """Sets `count` elements from `start` on."""
+    """Set `count` elements from `start` on to a value."""
     view = array[start : start + count]
     for j in range(count):
         view[j] = value
@@ -102,7 +105,7 @@ def fill(array: _Floats, start: int, count: int, value: np.float32) -> None:
 
 @part
 def copy(destination: _Floats, start: int, source: _Floats, source_start: int, count: int) -> None:
-    """Copies `count` elements."""
+    """Copy `count` elements."""
     view, values = destination[start : start + count], source[source_start : source_start + count]
     for j in range(count):
         view[j] = values[j]
@@ -121,7 +124,7 @@ def _copy_8bit(
 def _copy_mask(
     destination: _Floats, start: int, mask: _Flags, mask_start: int, pixels: int
 ) -> None:
-    """Each pixel's mask, once per channel, as 0 or 1."""
+    """Write each pixel's mask as 0 or 1, once per channel."""
     view, values = destination[start : start + CHANNELS * pixels], mask[mask_start:]
     for pixel in range(pixels):
         keep = np.float32(values[pixel])
@@ -133,9 +136,9 @@ def load_row(
     scratch: _Floats, image: _Floats, target: _Floats, target_8bit: _Bytes, is_8bit: bool,
     mask: _Flags, is_masked: bool, row: int, box: _Box, height: int, width: int,
 ) -> None:  # fmt: skip
-    """Puts s, d (relative to their centres) and the mask of a row into the rings.
+    """Load s, d (relative to their centres) and the mask of a row into the rings.
 
-    Outside the image and at masked-out pixels both images are 0.
+    Outside the image and at masked-out pixels, both images are 0.
     """
     first = CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
     count = CHANNELS * (box[3] - box[2] + 4 * RADIUS)
@@ -144,7 +147,7 @@ def load_row(
     begin, end = 0, 0
     if 0 <= row < height:
         begin, end = max(0, -first), min(count, CHANNELS * width - first)
-    # x and y themselves come first, and are turned into s and d in place.
+    # x and y are loaded first, and are then replaced by s and d in place.
     for ring in (s, d, keep):
         fill(scratch, ring, begin, _ZERO)
         fill(scratch, ring + end, count - end, _ZERO)
@@ -175,7 +178,7 @@ _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in gaussian_window().numpy()
 
 @device
 def across(array: _Floats, start: int) -> Lanes:
-    """Window sum over eleven columns, the first of them at element `start`."""
+    """Return the window sum over eleven columns; the first column is at element `start`."""
     total = load_wide(array, start + 5 * CHANNELS) * splat_wide(_W5)
     pair = load_wide(array, start + 4 * CHANNELS) + load_wide(array, start + 6 * CHANNELS)
     total = fma(pair, splat_wide(_W4), total)
@@ -191,13 +194,13 @@ def across(array: _Floats, start: int) -> Lanes:
 
 @device
 def _tap(ring: _Floats, start: int, row: int) -> Lanes:
-    """Column `start` of a row of the ring."""
+    """Return column `start` of a row of the ring."""
     return load_wide(ring, start + (row & _LAST) * STRIDE)
 
 
 @device
 def _taps(ring: _Floats, start: int, row: int) -> _Taps:
-    """The twelve rows that the windows around `row` and the row below it reach."""
+    """Return the twelve rows that the windows around `row` and around the next row contain."""
     return (
         _tap(ring, start, row - 5),
         _tap(ring, start, row - 4),
@@ -219,7 +222,7 @@ def _sum(
     a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
-    """Window sum of eleven rows."""
+    """Return the window sum of eleven rows."""
     total = middle * splat_wide(_W5)
     total = fma(e + f, splat_wide(_W4), total)
     total = fma(d + g, splat_wide(_W3), total)
@@ -233,7 +236,7 @@ def _sum_squares(
     a: Lanes, b: Lanes, c: Lanes, d: Lanes, e: Lanes, middle: Lanes,
     f: Lanes, g: Lanes, h: Lanes, i: Lanes, j: Lanes,
 ) -> Lanes:  # fmt: skip
-    """Window sum of the squares of eleven rows."""
+    """Return the window sum of the squares of eleven rows."""
     total = middle * middle * splat_wide(_W5)
     total = fma(fma(e, e, f * f), splat_wide(_W4), total)
     total = fma(fma(d, d, g * g), splat_wide(_W3), total)
@@ -244,13 +247,14 @@ def _sum_squares(
 
 @device
 def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
-    """Window sums over the rows of a ring around `row` and around the next one.
+    """Return the window sums over the rows of a ring, around `row` and around the next row.
 
-    Both at once: what they need comes from the second-level cache, and is mostly the same.
+    Both are computed together, because they share most of their data, which comes from the
+    second-level cache.
 
     Args:
-        ring: Rows, of which `SLOTS` are kept.
-        start: Element where the column begins.
+        ring: Ring buffer of `SLOTS` rows.
+        start: Element at which the column begins.
         row: Number of a row.
     """
     a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
@@ -262,7 +266,10 @@ def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
 
 @device
 def down_with_squares(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """As `down`: the sums of the values and of their squares, then the same around the next row."""
+    """Like `down`, but return the sums of values and of squares.
+
+    The first two results are for `row`, the last two for the next row.
+    """
     a, b, c, d, e, f, g, h, i, j, k, last = _taps(ring, start, row)
     return (
         _sum(a, b, c, d, e, f, g, h, i, j, k),

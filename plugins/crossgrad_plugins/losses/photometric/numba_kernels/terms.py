@@ -1,4 +1,4 @@
-"""SSIM, its derivatives and the gradient of the loss, one or two rows of a tile at a time."""
+"""SSIM, its derivatives and the gradient of the loss, for one or two rows of a tile."""
 
 from typing import TypeAlias
 
@@ -38,7 +38,7 @@ _TWICE_C1, _TWICE_C2 = np.float32(2 * C1), np.float32(2 * C2)
 
 @part
 def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
-    """Sums s, s^2, d and d^2 down the columns, around a row and around the next one."""
+    """Sum s, s^2, d and d^2 down the columns, around a row and around the next row."""
     for j in range(0, CHANNELS * (columns + 4 * RADIUS), WIDE):
         values, squares, next_values, next_squares = down_with_squares(scratch, SUM + j, row)
         store(scratch, PARTIAL + j, values)
@@ -54,9 +54,9 @@ def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
 
 @part
 def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
-    """Writes 1 - SSIM of a row to the line and a, b, c to their rings, 0 where nothing counts.
+    """Write 1 - SSIM of a row to the line, and a, b, c to their rings.
 
-    The row's sums down the columns begin at element `partial`.
+    They are 0 for pixels that do not count. The column sums of the row begin at element `partial`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE
     zero, one, two = splat_wide(_ZERO), splat_wide(_ONE), splat_wide(_TWO)
@@ -67,7 +67,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         local_d = across(scratch, partial + 2 * STRIDE + j)
         variance_s = fnma(local_s, local_s, across(scratch, partial + STRIDE + j))
         variance_d = fnma(local_d, local_d, across(scratch, partial + 3 * STRIDE + j))
-        # Rounding may take a variance of nothing slightly below zero.
+        # Rounding may make a variance of zero slightly negative.
         variance_s = where(zero < variance_s, variance_s, zero) + twice_c2
         variance_d = where(zero < variance_d, variance_d, zero)
         mean_s = local_s + load_wide(scratch, CENTRE_SUM + j)
@@ -76,7 +76,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
         dark = mean_d * mean_d
         over_mean = one / (bright + dark)
         over_variance = one / (variance_s + variance_d)
-        # 1 minus the luminance term and 1 minus the contrast-structure term: exactly 0 where x = y.
+        # 1 minus the luminance term and 1 minus the contrast-structure term: exactly 0 if x = y.
         luminance_loss = two * dark * over_mean
         contrast_loss = two * variance_d * over_variance
         dissimilarity = fnma(luminance_loss, contrast_loss, luminance_loss + contrast_loss)
@@ -98,7 +98,7 @@ def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
 
 @part
 def clear_row(scratch: _Floats, row: int, columns: int) -> None:
-    """Sets a, b, c of a row outside the image to 0."""
+    """Set a, b, c of a row outside the image to 0."""
     slot = (row & (SLOTS - 1)) * STRIDE
     for ring in (BY_MEAN, BY_SUM_VARIANCE, BY_DIFFERENCE_VARIANCE):
         fill(scratch, ring + slot, CHANNELS * (columns + 2 * RADIUS), _ZERO)
@@ -106,7 +106,7 @@ def clear_row(scratch: _Floats, row: int, columns: int) -> None:
 
 @part
 def sum_gradient_rows(scratch: _Floats, row: int, columns: int) -> None:
-    """Sums a, b and c down the columns, around a row and around the next one."""
+    """Sum a, b and c down the columns, around a row and around the next row."""
     for j in range(0, CHANNELS * (columns + 2 * RADIUS), WIDE):
         this, below = down(scratch, BY_MEAN + j, row)
         store(scratch, BACK + j, this)
@@ -128,9 +128,9 @@ def gradient_row(
     l1_weight: np.float32,
     ssim_weight: np.float32,
 ) -> None:
-    """Writes the loss's gradient at a row of the tile to the line.
+    """Write the gradient of the loss for a row of the tile to the line.
 
-    The row's sums down the columns begin at element `back`.
+    The column sums of the row begin at element `back`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE + 2 * HALO
     zero, plus, weight = splat_wide(_ZERO), splat_wide(l1_weight), splat_wide(ssim_weight)
@@ -149,7 +149,7 @@ def gradient_row(
 
 @sum_kernel
 def sum_of(array: _Floats, start: int, count: int) -> float:
-    """Sum of `count` elements in float64."""
+    """Return the sum of `count` elements in float64."""
     view = array[start : start + count]
     total = 0.0
     for j in range(count):
@@ -159,7 +159,10 @@ def sum_of(array: _Floats, start: int, count: int) -> float:
 
 @sum_kernel
 def sum_absolute(scratch: _Floats, start: int, count: int) -> float:
-    """Sum of |d| from element `start` of the ring on; the pixel at `start` begins a period."""
+    """Return the sum of |d| over `count` elements from `start` on.
+
+    The centres are added first. The element at `start` is the first channel of a pixel.
+    """
     view, centre = scratch[start : start + count], scratch[CENTRE_DIFFERENCE:]
     total = 0.0
     for j in range(count):

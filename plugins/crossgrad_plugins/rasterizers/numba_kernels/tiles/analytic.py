@@ -1,15 +1,15 @@
-"""The analytic response: a Gaussian integrated over the pixel, turned onto its main axes.
+"""The analytic response: a Gaussian, rotated to its main axes and integrated over the pixel.
 
 Analytic-Splatting approximates the normal distribution by F(x) = sigmoid(1.6 x + 0.07 x^3). A pixel
-at offset (u, v) along the main axes of standard deviations sigma1 and sigma2 gets the share
-2 pi sigma1 sigma2 W(u, sigma1) W(v, sigma2) of the opacity, where the window of one pixel is
+at offset (u, v) along the main axes of standard deviations sigma1 and sigma2 gets the share 2 pi
+sigma1 sigma2 W(u, sigma1) W(v, sigma2) of the opacity. The window W of one pixel is
 
     W(u, sigma) = F((|u| + 1/2) / sigma) - F((|u| - 1/2) / sigma).
 
-With t = |u| / sigma, h = 1 / (2 sigma), c the cubic, and D = c(t + h) - c(t - h) in closed form,
-W = (1 - exp(-D)) / ((1 + U) (1 + L)) where U = exp(c(t - h)) and L = exp(-c(t + h)), so that
-exp(-D) = U L. Where D is small a series takes its place, so that wide Gaussians do not cancel. The
-derivatives below keep to the same terms.
+Let t = |u| / sigma, h = 1 / (2 sigma), c the cubic, and D = c(t + h) - c(t - h) in closed form.
+Then W = (1 - exp(-D)) / ((1 + U) (1 + L)) with U = exp(c(t - h)) and L = exp(-c(t + h)), so that
+exp(-D) = U L. For small D, a series replaces 1 - exp(-D), so that wide Gaussians do not lose
+precision by cancellation. The derivatives below use the same terms.
 """
 
 import math
@@ -57,13 +57,13 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.footprint import reached_
 LINEAR, CUBIC = 1.6, 0.07
 #: Smallest standard deviation along a main axis, px.
 SIGMA_FLOOR = 1e-3
-#: Largest one: flat over any image, and the product of two still is a float32.
+#: Largest standard deviation: constant over any image, and the product of two is a valid float32.
 SIGMA_CEILING = 1e18
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, F'(0) = LINEAR / 4; a test makes sure.
+#: F'(x) <= F'(0) exp(-TAIL x^2 / 2) for all x, with F'(0) = LINEAR / 4; a test checks this.
 TAIL = 0.9975
 
-# (1 - exp(-D)) / D on [0, 1/2] by rising power: least largest relative error (8e-8).
+# (1 - exp(-D)) / D on [0, 1/2] by rising power: minimal maximum relative error (8e-8).
 _SERIES = (
     0.999999922724565,
     -0.4999924984754078,
@@ -72,29 +72,30 @@ _SERIES = (
     0.006771038068732109,
 )
 
-#: Row buffer: offset along both axes of the pixel centre in the row's middle column.
+#: Row buffer: offsets along both axes of the pixel centre in the middle column of each row.
 ROW_U = 0
 ROW_V = TILE_HEIGHT
 
 
 @device
 def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, float, float]:
-    """Returns cosine and sine of the longer axis and both variances, px^2.
+    """Return cosine and sine of the longer axis, and both variances, px^2.
 
-    A round Gaussian has no main axes: it gets those of the image. The angle is in (-90, 90]
-    degrees; it is halved without trigonometric functions, so that loops over it are vectorised.
+    A round Gaussian has no main axes; the axes of the image are used. The angle is in (-90, 90]
+    degrees. It is halved without trigonometric functions, so that loops over this function are
+    vectorised.
 
     Args:
         a: Entry of the undilated covariance [[a, b], [b, c]], px^2.
         b: See `a`.
         c: See `a`.
-        det: Its determinant.
+        det: Determinant of the covariance.
     """
     half = 0.5 * (a - c)
     spread = math.sqrt(half * half + b * b)
     double_cosine = half / spread if spread > 0.0 else 1.0
     double_sine = b / spread if spread > 0.0 else 0.0
-    # Of cosine and sine, the one that is not small by its own square root.
+    # Compute the larger of |cosine| and |sine| by a square root, and the smaller from it.
     main = math.sqrt(0.5 * (1.0 + abs(double_cosine)))
     other = 0.5 * abs(double_sine) / main
     cosine = main if half >= 0.0 else other
@@ -111,7 +112,7 @@ def _cubic(x: float) -> float:
 
 @device
 def window(offset: float, sigma: float) -> float:
-    """Returns sqrt(2 pi) sigma W(offset, sigma), in double precision."""
+    """Return sqrt(2 pi) sigma W(offset, sigma), in double precision."""
     t, h = abs(offset) / sigma, 0.5 / sigma
     upper, lower = math.exp(min(_cubic(t - h), 700.0)), math.exp(-_cubic(t + h))
     difference = 2.0 * h * (LINEAR + CUBIC * (3.0 * t * t + h * h))
@@ -121,20 +122,20 @@ def window(offset: float, sigma: float) -> float:
 
 @device
 def central_window(sigma: float) -> float:
-    """Returns `window` at offset 0."""
+    """Return `window` at offset 0."""
     return _ROOT_2_PI * sigma * math.tanh(0.5 * _cubic(0.5 / sigma))
 
 
 @device
 def squared_radius(opacity: float) -> float:
-    """Returns R^2 such that a pixel is touched only where d1^2 + d2^2 <= R^2.
+    """Return R^2 such that a pixel can be touched only if d1^2 + d2^2 <= R^2.
 
-    d is how far beyond half a pixel the pixel centre is from the mean along an axis, in sigmas. As
-    a mean of F' over [t - h, t + h], sigma W is at most F'(0) exp(-TAIL d^2 / 2), so that alpha is
-    at most 2 pi F'(0)^2 exp(-TAIL (d1^2 + d2^2) / 2) times the opacity.
+    d is the distance from the mean to the pixel centre along an axis, minus half a pixel, in
+    sigmas. sigma W is a mean of F' over [t - h, t + h], so it is at most F'(0) exp(-TAIL d^2 / 2).
+    Therefore alpha is at most 2 pi F'(0)^2 exp(-TAIL (d1^2 + d2^2) / 2) times the opacity.
     """
     contrast = 2.0 * math.pi * (LINEAR / 4.0) ** 2 * opacity / ALPHA_THRESHOLD
-    # The spare outweighs the rounding of everything that is compared with it.
+    # `SPARE` is larger than the rounding errors of all values that are compared with the result.
     return 2.0 / TAIL * math.log(max(contrast, 1.0)) + SPARE
 
 
@@ -147,7 +148,7 @@ def fill_axis_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """As `footprint.fill_rows`: the patches within reach along both main axes."""
+    """Like `footprint.fill_rows`: return the patches within reach along both main axes."""
     half, zero = _number(0.5), _number(0.0)
     middle = _number(MIDDLE)
     dx = (splat_wide(left) + middle) - broadcast_wide(records, record + U_WHOLE)
@@ -157,13 +158,13 @@ def fill_axis_rows(
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     reach_1 = broadcast_wide(records, record + REACH_1)
     reach_2 = broadcast_wide(records, record + REACH_2)
-    # One lane for each row of the tile.
+    # One lane per row of the tile.
     dy = first_dy + ramp_wide()
     u = fma(sine, dy, cosine * dx)
     v = fnma(sine, dx, cosine * dy)
     store(rows, base + ROW_U, u)
     store(rows, base + ROW_V, v)
-    # Pixel x is at u + cosine x and v - sine x. Dividing by zero gives infinite bounds.
+    # Pixel x is at u + cosine x and v - sine x. A division by zero gives infinite bounds.
     low_1, high_1 = (zero - reach_1 - u) / cosine, (reach_1 - u) / cosine
     low_2, high_2 = (v - reach_2) / sine, (v + reach_2) / sine
     first = round_up(larger(smaller(low_1, high_1), smaller(low_2, high_2)))
@@ -178,13 +179,13 @@ def _number(value: float) -> Lanes:
 
 @device
 def _power(x: Lanes) -> Lanes:
-    """Returns c(x) in units of log 2."""
+    """Return c(x) in units of log 2."""
     return x * fma(_number(CUBIC * LOG2_E), x * x, _number(LINEAR * LOG2_E))
 
 
 @device
 def _share(difference: Lanes, both: Lanes) -> Lanes:
-    """Returns 1 - exp(-D) given D >= 0 and exp(-D), right to a few roundings also for small D."""
+    """Return 1 - exp(-D) given D >= 0 and exp(-D), accurate to a few roundings also for small D."""
     series = _number(_SERIES[4])
     series = fma(series, difference, _number(_SERIES[3]))
     series = fma(series, difference, _number(_SERIES[2]))
@@ -197,7 +198,7 @@ def _share(difference: Lanes, both: Lanes) -> Lanes:
 def _window_terms(
     offset: Lanes, inverse_sigma: Lanes, constants: NDArray[np.float32]
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Returns U, L, 1 - exp(-D) and (1 + U) (1 + L); powers beyond 2**+-100 are cut there."""
+    """Return U, L, 1 - exp(-D) and (1 + U) (1 + L); powers are clamped to 2**-100 .. 2**100."""
     zero, one = _number(0.0), _number(1.0)
     t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
     least, most = _number(-100.0), _number(100.0)
@@ -214,7 +215,7 @@ def _window_terms(
 def near_enough(
     u: Lanes, v: Lanes, inverse_1: Lanes, inverse_2: Lanes, squared: Lanes
 ) -> np.uint64:
-    """Returns as bits which pixels may be touched (see `squared_radius`)."""
+    """Return as bits the pixels that may be touched (see `squared_radius`)."""
     zero, half = _number(0.0), _number(0.5)
     first = larger(magnitude(u) - half, zero) * inverse_1
     second = larger(magnitude(v) - half, zero) * inverse_2
@@ -230,7 +231,7 @@ def coverages(
     inverse_2: Lanes,
     constants: NDArray[np.float32],
 ) -> Lanes:
-    """Returns alpha before the cap at offsets (u, v) along the main axes.
+    """Return alpha before the cap at offsets (u, v) along the main axes.
 
     Args:
         peak: 2 pi sigma1 sigma2 times the opacity.
@@ -254,9 +255,9 @@ def _log_window_gradients(
     share: Lanes,
     inverse_both: Lanes,
 ) -> tuple[Lanes, Lanes]:
-    """Returns sigma times the derivatives of log(sigma W) by the offset and by sigma.
+    """Return sigma times the derivatives of log(sigma W) by the offset and by sigma.
 
-    `inverse_both` is 1 / ((1 + U) (1 + L)); the others are as in `_window_terms`.
+    `inverse_both` is 1 / ((1 + U) (1 + L)); the other arguments are as in `_window_terms`.
     """
     zero, one = _number(0.0), _number(1.0)
     t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
@@ -264,7 +265,7 @@ def _log_window_gradients(
     spread = fma(_number(3.0), t * t, h * h)
     difference = inverse_sigma * fma(_number(CUBIC), spread, _number(LINEAR))
     slope, linear = _number(3.0 * CUBIC), _number(LINEAR)
-    # g = 1 / (exp(D) - 1); above, 1 - F; below, F: of which d(log W) consists.
+    # The terms of d(log W): g = 1 / (exp(D) - 1); `above` contains 1 - F; `below` contains F.
     g = (one - share) / share
     above = fma(slope, p * p, linear) * (upper * (one + lower)) * inverse_both
     below = fma(slope, q * q, linear) * (lower * (one + upper)) * inverse_both
@@ -283,9 +284,10 @@ def coverage_gradients(
     inverse_2: Lanes,
     constants: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
-    """Returns alpha as `coverages` does, and derivatives of its logarithm.
+    """Return alpha as `coverages` does, and the derivatives of its logarithm.
 
-    They are by u, v, sigma1 and sigma2, each times its sigma; anything where alpha is tiny.
+    The derivatives are by u, v, sigma1 and sigma2, each times its sigma. They are undefined for
+    tiny alpha.
     """
     upper_1, lower_1, share_1, both_1 = _window_terms(u, inverse_1, constants)
     upper_2, lower_2, share_2, both_2 = _window_terms(v, inverse_2, constants)
@@ -304,7 +306,7 @@ def coverage_gradients(
 def axis_offsets(
     cosine: Lanes, sine: Lanes, offsets: Lanes, rows: NDArray[np.float32], row: int
 ) -> tuple[Lanes, Lanes]:
-    """Returns the offsets along the main axes of pixels `offsets` from the middle of four rows."""
+    """Return the offsets along the main axes of pixels `offsets` from the middle of four rows."""
     u = fma(cosine, offsets, broadcast_four_wide(rows, row + ROW_U))
     v = fnma(sine, offsets, broadcast_four_wide(rows, row + ROW_V))
     return u, v

@@ -1,13 +1,13 @@
 """Gradients of the tiles' pixels, summed per entry (Gaussian and tile), front to back.
 
-With S the part of the loss' linear form still to come behind the Gaussian at hand (its start value
-is the gradient of the pixel times the pixel), and c the gradient times the Gaussian's colour,
+S is the part of the loss' linear form behind the current Gaussian. Its start value is the gradient
+of the pixel times the pixel. c is the gradient times the Gaussian's colour. Then
 
     dL/d(alpha) = T c - S / (1 - alpha),
 
-so one pass in drawing order suffices, and the transmittance T is the forward pass' own, bit for
-bit. The gradient of the accumulated opacity only lowers the start value of S by itself times the
-final transmittance; the accumulated depth is one more colour channel.
+so one pass in drawing order is enough, and the transmittance T has the same bits as in the forward
+pass. A gradient of the accumulated opacity only reduces the start value of S by this gradient times
+the final transmittance. The accumulated depth is one more colour channel.
 """
 
 import numpy as np
@@ -98,11 +98,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     start_tile,
 )
 
-#: Numbers of a patch, WIDE each: alpha (later the gradient by the exponent) and its odds.
+#: Numbers of a patch, WIDE each: alpha (later replaced by the gradient by the exponent) and its
+#: odds.
 _ALPHA, _ODDS = 0, WIDE
 _RESPONSE = 2 * WIDE
 
-#: Entries whose row buffers are filled before the first of them is processed.
+#: Number of entries whose row buffers are filled before the first of them is processed.
 BATCH = 8
 
 
@@ -117,10 +118,10 @@ def _respond(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> None:
-    """Writes the plain response in patches, one after the other.
+    """Write the plain response in patches, one after the other.
 
-    A loop of its own: nothing in it waits for the transmittance, which a patch gets from the
-    Gaussian before, so that the processor works on several patches at once.
+    This is a separate loop, because nothing in it depends on the transmittance that the previous
+    Gaussian leaves in a patch. So the processor can work on several patches at once.
     """
     decay = broadcast_wide(records, record + DECAY)
     terms = terms_of(constants)
@@ -134,7 +135,7 @@ def _respond(
         dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
         power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
-        # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
+        # Alpha is undefined (possibly NaN) where a pixel is not touched: select, never multiply.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
         store(responses, at + _ALPHA, alpha)
@@ -156,7 +157,7 @@ def _blend(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Blends a plain Gaussian into patches; turns alpha into the gradient by the exponent.
+    """Blend a plain Gaussian into patches; replace alpha by the gradient by the exponent.
 
     Returns:
         The sums of the gradients by red, green, blue and the depth.
@@ -205,10 +206,10 @@ def _moments(
     absolute: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
-    """Returns SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
+    """Return SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
 
-    Both halves of a patch's lanes have the same rows, hence the same dy: they are added before it
-    is multiplied by. Six sums of eight lanes also fit into the registers of machines with sixteen.
+    Both halves of a patch's lanes have the same rows and therefore the same dy, so they are added
+    before the multiplication by dy. Six sums of eight lanes also fit into sixteen vector registers.
     """
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
     decay_row = broadcast(records, record + ROW_DECAY)
@@ -260,9 +261,9 @@ def _gather(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Sums the gradients of one plain Gaussian over patches into partials[partial:].
+    """Sum the gradients of one plain Gaussian over patches into partials[partial:].
 
-    `capped` is None for Gaussians whose alpha reaches the largest one nowhere.
+    `capped` is None for Gaussians whose alpha reaches the cap in no pixel.
     """
     _respond(patches, records, record, rows, base, constants, capped, responses)
     sum_red, sum_green, sum_blue, sum_depth = _blend(
@@ -296,7 +297,7 @@ def _gather_analytic(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """As `_gather` for the analytic response."""
+    """Like `_gather`, for the analytic response."""
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
     blue = broadcast_wide(records, record + BLUE)
@@ -385,7 +386,7 @@ def _backward(
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
-    """Sums the gradients of one tile's entries."""
+    """Sum the gradients of one tile's entries."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
@@ -401,7 +402,7 @@ def _backward(
             prefetch(records, np.intp(entries[min(entry + 2 * BATCH, stop - 1), 0]) * RECORD)
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             batch[filled] = entry
-            # No branch: an entry without a mask is overwritten by the next one.
+            # Branch-free: an entry without a mask is overwritten by the next entry.
             filled += np.intp(masks[entry] != 0)
             entry += 1
         for k in range(filled):
@@ -422,7 +423,7 @@ def _backward(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,
                     partials, partial,
                 )  # fmt: skip
-            # Two loops: that of the many Gaussians that no pixel caps has less to do.
+            # Two variants: most Gaussians are never capped, and their variant has less work.
             elif records[record + LOG_OPACITY] <= constants[CAPPED]:
                 _gather(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,
@@ -454,25 +455,25 @@ def differentiate(
     partials: NDArray[np.float32],
     written: NDArray[np.uint8],
 ) -> None:
-    """Sums the gradients of every entry with a mask over its tile's pixels.
+    """Sum the gradients of every entry with a mask over its tile's pixels.
 
     Args:
         jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] patches per entry, as the forward pass left them.
+        masks: [E] patches per entry, from the forward pass.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
-        image: [H, W, 3] as drawn, background included.
-        alpha: [H, W] as drawn.
-        depth: [H, W] as drawn, or None.
+        image: [H, W, 3] as rendered, with the background.
+        alpha: [H, W] as rendered.
+        depth: [H, W] as rendered, or None.
         v_image: [H, W, 3] gradient of the loss by the image.
         v_alpha: [H, W] gradient by alpha, or None.
         v_depth: [H, W] gradient by the depth, or None.
-        absolute: Any vector asks for the sums of absolute gradients; None leaves them out.
+        absolute: Any vector selects the sums of absolute gradients; None omits them.
         analytic: As in `composite`.
         partials: [slots * PARTIAL] written for slots of entries with a mask.
-        written: [slots] 1 written for these; zero before.
+        written: [slots] 1 written for slots of entries with a mask; zero before.
     """
     tiles = starts.shape[0] - 1
     tile = next_job(jobs, tiles)

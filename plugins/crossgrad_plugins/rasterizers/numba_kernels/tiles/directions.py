@@ -1,11 +1,11 @@
 """Gradients of single pixels by a Gaussian's projected mean, and their directions.
 
-A pass of its own after the backward pass, for those who ask for it: it draws the tiles again with
-the same operations as `backward`, hence with the same gradients, and sums per entry and bin what
-`crossgrad_core.contract.gaussians.Screen.directions` describes.
+This is a separate pass after the backward pass, for densifiers that need directions. It renders the
+tiles again and sums per entry and bin the fields of
+`crossgrad_core.contract.gaussians.Screen.directions`.
 
-The operations are those of `backward` in its order, hence with its bits; only what the sums of
-other gradients need is left out.
+The operations are those of `backward`, in the same order, so the gradients have the same bits. Only
+the operations for sums of other gradients are left out.
 """
 
 import numpy as np
@@ -99,9 +99,9 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
 )
 
 BINS, FIELDS = 6, 5
-#: Sums per entry: those of the bins, and two that are not used.
+#: Number of sums per entry: the sums of the bins, and two that are not used.
 SUMS = 4 * LANES
-#: Entries ahead for whose records memory is asked.
+#: Number of entries ahead for prefetches of records.
 _AHEAD = 8
 _SMALL, _UP = np.float32(2.0**-60), np.float32(2.0**90)
 _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
@@ -109,14 +109,14 @@ _LARGE, _DOWN = np.float32(2.0**60), np.float32(2.0**-66)
 
 @device
 def _add(binned: NDArray[np.float32], number: int, inside: Mask, value: Lanes) -> None:
-    """Adds the values inside a bin to sum `number`."""
+    """Add the values inside a bin to sum `number`."""
     at = number * LANES
     store(binned, at, load(binned, at) + where(inside, value, splat(np.float32(0.0))))
 
 
 @device
 def _bin(place: float) -> int:
-    """Returns the bin of a place along the axis."""
+    """Return the bin of a position along the axis."""
     return np.intp(min(max(np.floor(place), np.float32(-3.0)), np.float32(2.0))) + 3
 
 
@@ -130,28 +130,28 @@ def _spread(
     places: NDArray[np.float32],
     binned: NDArray[np.float32],
 ) -> None:
-    """Adds the gradients of two columns of four pixels to the sums of the bins that hold them.
+    """Add the gradients of two columns of four pixels to the sums of their bins.
 
     Args:
         gx: Gradients by the projected mean, px^-1; likewise `gy`.
         gy: See `gx`.
-        along: Places along the axis, standard deviations.
-        width: Of the image, pixels; likewise `height`. A direction is that in NDC units.
+        along: Positions along the axis, standard deviations.
+        width: Width of the image, pixels; likewise `height`. Directions are in NDC units.
         height: See `width`.
-        places: [LANES] room for `along`.
+        places: [LANES] buffer for `along`.
         binned: [BINS * FIELDS * LANES].
     """
     one = splat(np.float32(1.0))
     hx, hy = gx * splat(width), gy * splat(height)
     largest = larger(magnitude(hx), magnitude(hy))
     moved = splat(np.float32(0.0)) < largest
-    # Powers of two that keep the squares within float32, whatever the gradients.
+    # Powers of two that keep the squares within the range of float32, for any gradients.
     scale = where(largest < splat(_SMALL), splat(_UP), one)
     scale = where(splat(_LARGE) < largest, splat(_DOWN), scale)
     hx, hy = hx * scale, hy * scale
     inverse = one / square_root(fma(hx, hx, hy * hy))
     hx, hy, gx, gy = hx * inverse, hy * inverse, magnitude(gx), magnitude(gy)
-    # Places rise or fall along rows and columns of pixels: those at the corners bound the bins.
+    # Positions rise or fall along rows and columns of pixels, so the corners bound the bins.
     store(places, 0, along)
     a, b = _bin(places[0]), _bin(places[SIDE - 1])
     c, d = _bin(places[LANES - SIDE]), _bin(places[LANES - 1])
@@ -174,7 +174,7 @@ def _weighted_color(
     state: NDArray[np.float32],
     v_depth: NDArray[np.float32] | None,
 ) -> Lanes:
-    """The gradients of a patch's pixels times the colour of the Gaussian."""
+    """Return the gradients of a patch's pixels times the colour of the Gaussian."""
     at = patch * STATE
     weighted_color = load_wide(state, at + V_RED) * broadcast_wide(records, record + RED)
     weighted_color = fma(
@@ -201,9 +201,10 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blends into a patch; returns its pixels' gradients by the projected mean (x and y).
+    """Blend into a patch; return its pixels' gradients by the projected mean (x and y).
 
-    The gradients of plain records are in units of 2 log 2 px^-1, the others in px^-1.
+    Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records in
+    px^-1.
     """
     row = base + row_of(patch)
     offsets = load_wide(constants, OFFSETS + column_of(patch) * WIDE)
@@ -262,7 +263,7 @@ def _entry(
     found: NDArray[np.float32],
     at: int,
 ) -> None:
-    """Writes the sums of one Gaussian over the reached patches of a tile to found[at:]."""
+    """Write the sums of one Gaussian over the reached patches of a tile to found[at:]."""
     half = splat(np.float32(0.5))
     axis_x, axis_y = broadcast(axes, axis), broadcast(axes, axis + 1)
     # Pixel centres are at whole numbers here, as in `fill_rows`.
@@ -287,7 +288,7 @@ def _entry(
         dy = y + splat(np.float32(row_of(patch))) - v
         along = fma(axis_x, dx, axis_y * dy)
         _spread(first_half(gx), first_half(gy), along, width, height, places, binned)
-        # Half a patch further to the right.
+        # The second half of the patch is to the right.
         along = fma(axis_x, dx + splat(np.float32(SIDE // 2)), axis_y * dy)
         _spread(last_half(gx), last_half(gy), along, width, height, places, binned)
     for group in range(SUMS // LANES):
@@ -323,11 +324,11 @@ def bin_directions(
     analytic: NDArray[np.float32] | None,
     found: NDArray[np.float32],
 ) -> None:
-    """Sums the directions of every entry with a mask over its tile's pixels.
+    """Sum the directions of every entry with a mask over its tile's pixels.
 
     Args:
         jobs: From `share`.
-        starts: As in `differentiate`, like all up to `analytic` but `axes`.
+        starts: As in `differentiate`; so are all arguments up to `analytic`, except `axes`.
         entries: [E, 2].
         masks: [E].
         records: Records of the drawn Gaussians, flat.
@@ -339,7 +340,7 @@ def bin_directions(
         v_image: [H, W, 3].
         v_alpha: [H, W] or None.
         v_depth: [H, W] or None.
-        analytic: Any vector says that the response is analytic.
+        analytic: Any vector selects the analytic response; None: plain.
         found: [slots * SUMS] written for slots of entries with a mask.
     """
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH

@@ -1,4 +1,4 @@
-"""Which patches of a tile a Gaussian reaches, and its 1-D Gaussian in each row."""
+"""The patches of a tile that a Gaussian reaches, and its 1-D Gaussian in each row."""
 # ruff: noqa: ANN401 - Numba's and LLVM's objects have no types.
 
 from collections.abc import Callable
@@ -46,12 +46,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
     WIDTH,
 )
 
-#: Row buffer of one Gaussian: centre of each row, its largest exponent, its dy.
+#: Row buffer of one Gaussian: centre, largest exponent and dy of each row.
 ROW_CENTRE = 0
 ROW_EXPONENT = TILE_HEIGHT
 ROW_DY = 2 * TILE_HEIGHT
 ROWS = 3 * TILE_HEIGHT
-# How bits are shifted and joined below is for patches of 4 x 4 pixels and sixteen columns of them.
+# The bit shifts below assume patches of 4 x 4 pixels and sixteen columns of patches.
 _LAST = float(TILE_WIDTH - 1)
 
 
@@ -68,7 +68,7 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     )
     low = build.select(build.fcmp_ordered(">", first, zero), first, zero)
     high = build.select(build.fcmp_ordered("<", last, end), last, end)
-    # Where nothing is inside there may be NaN, of which no whole number can be made.
+    # Edges outside may be NaN, which cannot be converted to an integer.
     columns = [
         build.lshr(build.fptosi(build.select(inside, edge, zero), whole), number(whole, 2))
         for edge in (low, high)
@@ -84,9 +84,9 @@ def _reached_patches(at: Site, first: Any, last: Any) -> Any:
     return build.bitcast(four, ir.IntType(64))
 
 
-#: Returns the patches reached in the sixteen rows of a tile, given the first and the last pixel of
-#: each (none where these do not compare): in bit 16 r + c the patch of columns 4 c to 4 c + 3 of
-#: rows 4 r to 4 r + 3. Pixels are counted from 0 to 63; others are left out.
+#: Return the reached patches of the sixteen rows of a tile, given the first and last pixel of each
+#: row (no pixel if the comparison first <= last fails). Bit 16 r + c is the patch of columns 4 c to
+#: 4 c + 3 and rows 4 r to 4 r + 3. Pixels are counted from 0 to 63; others are left out.
 reached_patches: Callable[[Lanes, Lanes], np.uint64] = emitted(
     _reached_patches, types.uint64, SIXTEEN, SIXTEEN
 )
@@ -101,10 +101,10 @@ def fill_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """Writes the row buffer at `base` and returns the reached patches as bits.
+    """Write the row buffer at `base` and return the reached patches as bits.
 
-    `left`, `top` are the tile's corner in pixels; row centres are relative to the middle of a pixel
-    of the middle column.
+    `left` and `top` are the tile's corner in pixels. Row centres are relative to the centre of a
+    pixel in the middle column.
     """
     half = splat_wide(np.float32(0.5))
     middle = splat_wide(np.float32(MIDDLE))
@@ -115,14 +115,14 @@ def fill_rows(
         broadcast_wide(records, record + V_PART) - half
     )
     row_decay = broadcast_wide(records, record + ROW_DECAY)
-    # One lane for each row of the tile.
+    # One lane per row of the tile.
     dy = ramp_wide() - v
     exponent = fnma(row_decay * dy, dy, broadcast_wide(records, record + LOG_OPACITY))
     centre = fma(broadcast_wide(records, record + SLOPE), dy, u)
     store(rows, base + ROW_CENTRE, centre)
     store(rows, base + ROW_EXPONENT, exponent)
     store(rows, base + ROW_DY, dy)
-    # NaN in rows that the Gaussian does not reach; NaN passes no comparison.
+    # Rows that the Gaussian does not reach are NaN, and NaN fails every comparison.
     budget = (exponent + splat_wide(np.float32(SPARE - TOUCH))) * broadcast_wide(
         records, record + WIDTH
     )

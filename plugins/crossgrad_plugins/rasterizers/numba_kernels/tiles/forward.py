@@ -77,11 +77,12 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Entries whose reach is computed before any of them is blended: hides the latency of their
-#: memory reads and row extents, and is how often finished patches are looked for.
+#: Number of entries whose reach is computed before any of them is blended. This hides the latency
+#: of their memory reads and row extents. Finished patches are detected once per batch.
 BATCH = 16
 
-# Side of the squares that limits count, pixels; the patches of the first such column as bits.
+# Side of the squares in which limits are counted, pixels; and the patches of the first column of
+# squares as bits.
 _SQUARE = int(SQUARE)
 _ABREAST = np.uint64(
     sum(1 << patch for patch in range(PATCHES) if patch % COLUMNS < _SQUARE // SIDE)
@@ -98,7 +99,7 @@ _DEPTHS = PATCHES * _STATE
 def _start(
     state: NDArray[np.float32], width: int, height: int, constants: NDArray[np.float32]
 ) -> np.uint64:
-    """Clears the state of a tile of width x height pixels; returns its patches as bits."""
+    """Clear the state of a tile of width x height pixels; return its patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
     x = load_wide(constants, OFFSETS) + splat_wide(np.float32(MIDDLE))
@@ -114,7 +115,7 @@ def _start(
 
 @device
 def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
-    """Returns the patches of a tile, whose first column is `left`, within a record's limits."""
+    """Return the patches of a tile (first column `left`) within a record's limits."""
     inside = np.uint64(0)
     for column in range(0, COLUMNS, _SQUARE // SIDE):
         square = (left + column * SIDE) // _SQUARE
@@ -125,7 +126,7 @@ def _within(limits: NDArray[np.int32], record: int, left: int) -> np.uint64:
 
 @device
 def _unfinished(state: NDArray[np.float32], live: np.uint64) -> np.uint64:
-    """Returns the live patches that still have an unfinished pixel."""
+    """Return the live patches that still have an unfinished pixel."""
     rest = live
     going = np.uint64(0)
     while rest != np.uint64(0):
@@ -148,7 +149,7 @@ def _coverage(
     record: int,
     constants: NDArray[np.float32],
 ) -> tuple[Lanes, np.uint64]:
-    """The analytic response in a patch.
+    """Compute the analytic response in a patch.
 
     Returns:
         Alpha, and `left` without the patch if it is out of reach.
@@ -178,10 +179,11 @@ def _blend(
     counts: NDArray[np.int32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[int, np.uint64]:
-    """Blends one Gaussian into the reached patches.
+    """Blend one Gaussian into the reached patches.
 
     Returns:
-        The number of pixels blended, and the patches without those found to be out of reach.
+        The number of pixels blended, and the reached patches except patches found to be out of
+            reach.
     """
     left = rest = reached
     decay = broadcast_wide(records, record + DECAY)
@@ -207,7 +209,7 @@ def _blend(
         else:
             alpha, left = _coverage(left, patch, offsets, rows, row, records, record, constants)
             touched = alpha >= least
-        # Where nothing is touched alpha may be anything, NaN included: select, never multiply.
+        # Alpha is undefined (possibly NaN) where a pixel is not touched: select, never multiply.
         alpha = where(touched, smaller(alpha, most), zero)
         before = load_wide(state, at + _T)
         weight = alpha * before
@@ -237,7 +239,7 @@ def _finish_row(
     image: NDArray[np.float32],
     alpha: NDArray[np.float32],
 ) -> None:
-    """Adds the background to eight pixels and writes them from a flat index on."""
+    """Add the background to eight pixels and write them from a flat index on."""
     through = magnitude(passed)
     store_triples(
         image,
@@ -259,7 +261,7 @@ def _finish_two(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
 ) -> None:
-    """Writes a patch and the one on its right, whose pixels begin at a flat index."""
+    """Write a patch and its right neighbour, whose pixels begin at a flat index."""
     at, width = patch * _STATE, image.shape[1]
     t = _rows_at(state, at + _T, _STATE)
     r = _rows_at(state, at + _RED, _STATE)
@@ -279,7 +281,7 @@ def _finish_two(
 
 @device
 def _rows_at(state: NDArray[np.float32], at: int, ahead: int) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Returns the rows of a patch and of the next one, `ahead` of it."""
+    """Return the rows of a patch and of the next patch, `ahead` floats later."""
     return four_rows(load_wide(state, at), load_wide(state, at + ahead))
 
 
@@ -293,10 +295,10 @@ def _finish(
     alpha: NDArray[np.float32],
     depth: NDArray[np.float32] | None,
 ) -> None:
-    """Adds the background and writes the tile's pixels."""
+    """Add the background and write the tile's pixels."""
     width = image.shape[1]
     high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
-    # Two patches side by side where all of their pixels are there, then single pixels.
+    # Write pairs of complete patches first, then the remaining pixels one by one.
     whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
     for y in range(0, whole_high, SIDE):
         for x in range(0, whole_wide, LANES):
@@ -332,7 +334,7 @@ def _composite(
     limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composites one tile and leaves in `masks` the patches that each entry was blended into."""
+    """Composite one tile and write to `masks` the patches that each entry was blended into."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
@@ -360,7 +362,7 @@ def _composite(
                 reached &= _within(limits, np.intp(entries[k, 0]), left)
             masks[k] = np.uint64(reached)
             batch[filled] = k
-            # No branch: an entry that reaches nothing is overwritten by the next one.
+            # Branch-free: an entry that reaches nothing is overwritten by the next entry.
             filled += np.intp(reached != np.uint64(0))
         for k in range(filled):
             record = np.intp(entries[batch[k], 0]) * RECORD
@@ -391,7 +393,7 @@ def composite(
     limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composites all tiles.
+    """Composite all tiles.
 
     Args:
         jobs: From `share`.
@@ -404,7 +406,7 @@ def composite(
         alpha: [H, W] written.
         depth: [H, W] written, or None.
         counts: [slots] pixels blended per slot, written; zero before. None: not counted.
-        analytic: Any vector says that the records are of the analytic response; None: plain.
+        analytic: Any vector selects records of the analytic response; None: plain.
         limits: [N, 2] first and last column of 16 pixels per record; None: no limits.
         masks: [E] patches per entry, written; zero before.
     """

@@ -1,8 +1,8 @@
-"""Counts, among marked pixels, of those in which each Gaussian of a drawn view was blended.
+"""The number of marked pixels in which each Gaussian of a rendered view was blended.
 
-A pass of its own over a finished render, for those who can only tell from it which pixels they ask
-about: it takes the tile lists of the forward pass and repeats its blending, without colours, in the
-patches that hold a marked pixel. The operations are those of `forward`, and so are the decisions.
+This is a separate pass after a render, for callers that mark pixels only when they know the render.
+It uses the tile lists of the forward pass and repeats the blending, without colours, in the patches
+with a marked pixel. The operations and decisions are the same as in `forward`.
 """
 
 import numpy as np
@@ -62,16 +62,16 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Entries ahead for whose records memory is asked.
+#: Number of entries ahead for prefetches of records.
 _AHEAD = 8
 
 
 @device
 def _start(state: NDArray[np.float32], marked: NDArray[np.uint8], top: int, left: int) -> np.uint64:
-    """Writes the transmittances of a tile: 1 in marked pixels, -1 in all others.
+    """Write the transmittances of a tile: 1 in marked pixels, -1 in all others.
 
     Returns:
-        The patches that hold a marked pixel, as bits.
+        The patches that contain a marked pixel, as bits.
     """
     state[:] = np.float32(-1.0)
     live = np.uint64(0)
@@ -94,7 +94,7 @@ def _count(
     constants: NDArray[np.float32],
     analytic: NDArray[np.float32] | None,
 ) -> int:
-    """Blends one Gaussian into the reached patches; returns the number of pixels."""
+    """Blend one Gaussian into the reached patches; return the number of pixels."""
     decay = broadcast_wide(records, record + DECAY)
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -121,7 +121,8 @@ def _count(
         alpha = where(touched, smaller(alpha, load_wide(constants, LARGEST_ALPHA)), zero)
         before = load_wide(state, patch * WIDE)
         after = before - alpha * before
-        # It only falls: a pixel that has stopped, or is not marked, is never blended again.
+        # Transmittance never rises: a pixel that has stopped, or is not marked, is never blended
+        # again.
         store(state, patch * WIDE, after)
         pixels += count_bits(bits(touched & (after >= load_wide(constants, STOPPED))))
     return pixels
@@ -139,16 +140,16 @@ def count_marked(
     analytic: NDArray[np.float32] | None,
     counts: NDArray[np.int32],
 ) -> None:
-    """Counts per entry the marked pixels of its tile in which it was blended.
+    """Count, per entry, the marked pixels of its tile in which it was blended.
 
     Args:
         jobs: From `share`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] records and slots of each tile, front to back.
-        masks: [E] patches per entry, as the forward pass left them.
+        masks: [E] patches per entry, from the forward pass.
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
-        marked: [H, W], not 0 where a pixel counts.
+        marked: [H, W], non-zero if a pixel counts.
         analytic: As in `composite`.
         counts: [slots] written; zero before.
     """

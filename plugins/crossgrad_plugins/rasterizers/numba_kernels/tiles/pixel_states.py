@@ -1,4 +1,4 @@
-"""A tile's patches, and the states of their pixels in the backward passes."""
+"""The patches of a tile, and the states of their pixels in the backward passes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,11 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 
 _PLACES = [(x, y) for x in range(SIDE) for y in range(SIDE)]
-# Of two rows of eight pixels, then two more: the patch on the left and the one on the right.
+# From two rows of eight pixels and two more rows: the left patch and the right patch.
 _left_patch, _right_patch = (
     picking([y * LANES + start + x for x, y in _PLACES]) for start in (0, SIDE)
 )
-# Of the patch on the left and the one on the right: the first and the last two rows of pixels.
+# From the left and the right patch: the first two and the last two rows of pixels.
 _first_rows, _last_rows = (
     picking([x // SIDE * WIDE + x % SIDE * SIDE + y for y in rows for x in range(LANES)])
     for rows in ((0, 1), (2, 3))
@@ -46,38 +46,38 @@ _first_rows, _last_rows = (
 
 @device
 def row_of(patch: int) -> int:
-    """Returns the first row of pixels of a patch."""
+    """Return the first row of pixels of a patch."""
     return (patch // COLUMNS) * SIDE
 
 
 @device
 def column_of(patch: int) -> int:
-    """Returns the column of patches."""
+    """Return the column of patches that contains a patch."""
     return patch & (COLUMNS - 1)
 
 
 @device
 def place_of(x: int, y: int) -> tuple[int, int]:
-    """Returns the patch of pixel (x, y) of a tile, and its lane there."""
+    """Return the patch that contains pixel (x, y) of a tile, and the pixel's lane."""
     return (y // SIDE) * COLUMNS + x // SIDE, (x % SIDE) * SIDE + y % SIDE
 
 
 @device
 def two_patches(a: Lanes, b: Lanes, c: Lanes, d: Lanes) -> tuple[Lanes, Lanes]:
-    """Returns two patches, side by side, of four rows of eight pixels."""
+    """Return two adjacent patches from four rows of eight pixels."""
     above, below = joined(a, b), joined(c, d)
     return _left_patch(above, below), _right_patch(above, below)
 
 
 @device
 def four_rows(left: Lanes, right: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Returns the four rows of eight pixels of two patches side by side."""
+    """Return the four rows of eight pixels of two adjacent patches."""
     above, below = _first_rows(left, right), _last_rows(left, right)
     return first_half(above), last_half(above), first_half(below), last_half(below)
 
 
-#: State of a patch, WIDE numbers each: transmittance (negative once finished), the part
-#: S of the loss' linear form still to come (see `backward`), gradient of the three channels.
+#: State of a patch, WIDE numbers each: transmittance (negative once finished), the remaining part S
+#: of the loss' linear form (see `backward`), and gradients of the three channels.
 PASSED, REST, V_RED, V_GREEN, V_BLUE = 0, WIDE, 2 * WIDE, 3 * WIDE, 4 * WIDE
 STATE = 5 * WIDE
 #: The gradients of the depths of all patches follow the states of all patches.
@@ -96,7 +96,7 @@ def _eight(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> _Eight:
-    """Returns what the state of eight pixels begins with, from a flat index on."""
+    """Return the initial state of eight pixels, from a flat index on."""
     r, g, b = load_triples(image, 3 * pixel)
     red, green, blue = load_triples(v_image, 3 * pixel)
     rest = red * r + green * g + blue * b
@@ -113,7 +113,7 @@ def _eight(
 def _store_two(
     state: NDArray[np.float32], at: int, ahead: int, a: Lanes, b: Lanes, c: Lanes, d: Lanes
 ) -> None:
-    """Writes four rows of eight pixels to a patch and to the next one, `ahead` of it."""
+    """Write four rows of eight pixels to a patch and to the next patch, `ahead` floats later."""
     left, right = two_patches(a, b, c, d)
     store(state, at, left)
     store(state, at + ahead, right)
@@ -131,7 +131,7 @@ def _start_two(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Fills the states of a patch and the one on its right, from a flat index of pixels on."""
+    """Write the states of a patch and its right neighbour, from a flat pixel index on."""
     at, width = patch * STATE, image.shape[1]
     a = _eight(pixel, image, alpha, depth, v_image, v_alpha, v_depth)
     b = _eight(pixel + width, image, alpha, depth, v_image, v_alpha, v_depth)
@@ -161,7 +161,7 @@ def _start_pixel(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Fills the state of a lane of a patch, which is pixel (i, j) of the image."""
+    """Write the state of a lane of a patch for pixel (i, j) of the image."""
     at = patch * STATE + lane
     red, green, blue = v_image[i, j, 0], v_image[i, j, 1], v_image[i, j, 2]
     rest = red * image[i, j, 0] + green * image[i, j, 1] + blue * image[i, j, 2]
@@ -189,14 +189,14 @@ def start_tile(
     v_alpha: NDArray[np.float32] | None,
     v_depth: NDArray[np.float32] | None,
 ) -> None:
-    """Fills the state of a tile."""
+    """Write the initial state of a tile."""
     width = image.shape[1]
     high, wide = min(TILE_HEIGHT, image.shape[0] - top), min(TILE_WIDTH, width - left)
     if high < TILE_HEIGHT or wide < TILE_WIDTH:
         state[:] = np.float32(0.0)
         for patch in range(PATCHES):
             store(state, patch * STATE + PASSED, splat_wide(np.float32(-1.0)))
-    # Two patches side by side where all of their pixels are there, then single pixels.
+    # Pairs of complete patches first, then the remaining pixels one by one.
     whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
     for y in range(0, whole_high, SIDE):
         for x in range(0, whole_wide, LANES):
@@ -214,7 +214,7 @@ def start_tile(
 
 @device
 def odds_of(alpha: Lanes, constants: NDArray[np.float32]) -> Lanes:
-    """Returns alpha / (1 - alpha)."""
+    """Return alpha / (1 - alpha)."""
     return alpha / (load_wide(constants, ONE) - alpha)
 
 
@@ -228,16 +228,15 @@ def blend(
     at: int,
     constants: NDArray[np.float32],
 ) -> tuple[Lanes, Lanes]:
-    """Blends a Gaussian into the pixels of a patch.
+    """Blend a Gaussian into the pixels of a patch.
 
     Args:
-        alpha: The Gaussian's opacity in the pixels, at most the largest; 0 where it is not drawn.
-        odds: alpha / (1 - alpha); negative where alpha does not depend on the parameters, since it
-            is capped.
-        capped: None says that no odds are negative.
+        alpha: The Gaussian's alpha in the pixels, at most the cap; 0 where it is not drawn.
+        odds: alpha / (1 - alpha); negative where alpha is capped and does not depend on parameters.
+        capped: None if no odds are negative.
         weighted_color: The gradients of the pixels times the colour of the Gaussian.
         state: State of the tile.
-        at: Where that of the patch begins.
+        at: First element of the patch's state.
         constants: From `vector_constants`.
 
     Returns:
