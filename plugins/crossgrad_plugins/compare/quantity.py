@@ -46,7 +46,7 @@ class Quantity:
 
     @classmethod
     def of(cls, name: str, margin: float | None = None, *, falls: bool = False) -> "Quantity":
-        """Return the figure with the given name, and its default margin unless another one is given.
+        """Return the figure with the given name, with its default margin unless another is given.
 
         Args:
             name: Name of the figure.

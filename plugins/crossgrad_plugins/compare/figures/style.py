@@ -96,7 +96,7 @@ class Look:
 
 
 def looks(arms: Sequence[str]) -> dict[str, Look]:
-    """Return the look of each arm; arms differ in marker and line too, for print without colours."""
+    """Return arm -> look; arms also differ in marker and line style, for print without colours."""
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
