@@ -101,8 +101,8 @@ class Bootstrap:
     def _tail(self, share: float, distance: float) -> float:
         """Return the p-value for a share of the draws, consistent with the expanded intervals.
 
-        If a border is beyond all draws, its distance from their median in standard deviations is used
-        instead. Otherwise the number of draws would limit the p-value.
+        If a border is beyond all draws, its distance from their median in standard deviations is
+        used instead. Otherwise the number of draws would limit the p-value.
         """
         from scipy.special import ndtri, stdtr
 
@@ -323,7 +323,7 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 
 
 def corrected(values: Sequence[float]) -> list[float]:
-    """Return the p-values of a table of comparisons; above five comparisons, adjust them by Holm."""
+    """Return the p-values of a table of comparisons, adjusted by Holm if there are more than 5."""
     return holm(values) if len(values) > UNCORRECTED else list(values)
 
 

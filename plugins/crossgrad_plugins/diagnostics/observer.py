@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
 
-#: Probes of a run whose interval the user does not set.
+#: Number of probes of a run, if the user does not set an interval.
 _PROBES = 8
 
 
@@ -32,18 +32,18 @@ class Diagnostics(Observer):
     )
     seed: int = Field(0, ge=0, description="seed of the choice of views and of the bootstrap")
 
-    # What was found so far; no part of the run's state.
+    # The results so far; they are not part of the run's state.
     _run: RunInfo | None = PrivateAttr(default=None)
     _watch: "Watch | None" = PrivateAttr(default=None)
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Remembers where results go."""
+        """Remember the run and its output folder."""
         self._run, self._watch = run, None
 
     @hookimpl
     def crossgrad_model_ready(self, model: Model) -> None:
-        """Probes where it is time, and writes the table."""
+        """Probe the model when a probe is due, and write the table."""
         if self._watch is None:
             self._watch = self._start(model)
         watch = self._watch
@@ -58,7 +58,7 @@ class Diagnostics(Observer):
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Writes the picture and what does not change over the run."""
+        """Write the picture and the tables that do not change during the run."""
         folder, watch, run = self._folder(), self._watch, self._run
         if folder is None or watch is None or run is None or watch.last is None:
             return
@@ -68,7 +68,7 @@ class Diagnostics(Observer):
         return None if self._run is None else self._run.folder
 
     def _start(self, model: Model) -> "Watch":
-        """The views to look at, and the rows of a run that is being continued."""
+        """Choose the views to probe, and read the rows of a resumed run."""
         from crossgrad_plugins.diagnostics.plan import (
             DEFAULT_GROUPING,
             OF_THE_RUN,
