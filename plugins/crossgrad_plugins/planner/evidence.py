@@ -87,7 +87,7 @@ class Evidence:
 
     @property
     def degree(self) -> int | None:
-        """The highest degree of its spherical harmonics; None if the backbone has no such option."""
+        """The highest degree of its spherical harmonics; None without such an option."""
         degree = self.backbone.model_dump().get("sh_degree")
         return degree if isinstance(degree, int) else None
 

@@ -80,7 +80,7 @@ class Modes:
 
     @cached_property
     def bimodality(self) -> float:
-        """Sarle's coefficient of the distances, in the form used for decisions; NaN if undefined."""
+        """Sarle's coefficient of the distances, in the form for decisions; NaN if undefined."""
         return bimodality(self.logs).deciding
 
     @cached_property
