@@ -30,7 +30,7 @@ _SAME = 2
 #: Smaller distances count as this one, so that a photo taken twice does not outweigh all others.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
-# Cached, because a run requests each held-out photo at every evaluation and a scene does not change.
+# Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
 _KNOWN: "WeakKeyDictionary[Scene, Neighbours]" = WeakKeyDictionary()
 
 
@@ -150,7 +150,7 @@ class Neighbours:
         self._regimes = np.unique([view.regime for view in views], return_inverse=True)[1]
 
     def rows_and_weights(self, camera: Camera) -> tuple[NDArray[np.int64], _Floats]:
-        """Return the photos [N] that predict a photo with this camera, and their weights, of sum 1."""
+        """Return the photos [N] that predict a photo with this camera, and weights of sum 1."""
         rows, weights = self._told(self._place(camera)[None], min(TELLING, len(self._places)))
         return rows[0], weights[0]
 
@@ -161,8 +161,8 @@ class Neighbours:
             values: [P, V] of the photos, P > 1.
 
         Returns:
-            The error of the prediction by neighbours, and the error of the mean over the other photos
-            of the regime. A photo alone in its regime uses the mean over all other photos.
+            The error of the prediction by neighbours, and the error of the mean over the other
+            photos of the regime. A photo alone in its regime uses the mean of all other photos.
         """
         rows, weights = self._others
         near = (weights[..., None] * values[rows]).sum(axis=1)
