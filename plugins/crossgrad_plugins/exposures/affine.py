@@ -48,8 +48,8 @@ class Affine(ExposurePerPhoto):
 
     @override
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        # Adding the difference would change the relative exposure of photos, and could make dark values
-        # negative. So a photo's map is applied after `end` and then the inverse of `start`.
+        # Adding the difference would change the relative exposure of photos, and could make dark
+        # values negative. So a photo's map is applied after `end` and then the inverse of `start`.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
             return super().shift(name, values, start, end)

@@ -176,8 +176,8 @@ class Sweep:
         """Carry out the runs that are not finished.
 
         Returns:
-            The exit code: 0 if all runs are finished, 1 if one failed, or 128 plus the number of the
-            signal that stopped the sweep.
+            The exit code: 0 if all runs are finished, 1 if one failed, or 128 plus the number of
+            the signal that stopped the sweep.
 
         Raises:
             UserError: Another sweep is active in the folder, or the folder is not writable.

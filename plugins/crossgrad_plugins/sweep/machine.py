@@ -1,4 +1,4 @@
-"""The number of parallel runs on this machine: each run has its own cores, and all fit in memory."""
+"""The number of parallel runs on this machine: separate cores for each, memory for all."""
 
 import time
 from collections.abc import Sequence

@@ -109,7 +109,7 @@ def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
     """Return the rows of runs.csv; empty if there is no such table, or one with other columns.
 
     Raises:
-        UserError: The table cannot be read, or has other columns and would be overwritten (`writes`).
+        UserError: The table cannot be read, or `writes` would overwrite one with other columns.
     """
     if not layout.plan.is_file():
         return []

@@ -47,7 +47,7 @@ class Work:
         options: Options of the engine as the user gave them.
         machine: The division of this machine; None for an engine that runs elsewhere.
         stop: The stop requests of the user.
-        command: The command that trains a run; core numbers and the arguments of `crossgrad` follow.
+        command: The command that trains a run; core numbers and arguments of `crossgrad` follow.
     """
 
     jobs: Sequence[Job]
@@ -85,7 +85,7 @@ class Engine(Protocol):
         zero, no run is started, and active runs stop with a checkpoint.
 
         Raises:
-            UserError: The engine, one of its options, or its cluster is missing; no run was started.
+            UserError: The engine, one of its options, or its cluster is missing; no run started.
         """
         ...
 
