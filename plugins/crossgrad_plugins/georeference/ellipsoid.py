@@ -59,7 +59,7 @@ def geocentric(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def place_at(point: NDArray[np.float64]) -> Place | None:
-    """Return the place of geocentric coordinates [3]; None if it is far from the Earth's surface."""
+    """Return the place of geocentric coordinates [3]; None if far from the Earth's surface."""
     x, y, z = (float(value) for value in point)
     around = math.hypot(x, y)
     if not abs(math.hypot(around, z) - _AXIS) < _HIGHEST:

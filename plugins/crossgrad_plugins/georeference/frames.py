@@ -26,7 +26,7 @@ _FAR: Final = 4.0
 _ROUNDING: Final = 1e-9
 #: Maximum standard error of the turn about the longest extent, radians.
 _LARGEST_TILT: Final = np.radians(10.0)
-#: Points closer to a line than this share of their extent are on the line, even if measured exactly.
+#: Points closer to a line than this share of their extent count as collinear, even if exact.
 _THINNEST: Final = 1e-5
 
 

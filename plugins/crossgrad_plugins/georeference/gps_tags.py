@@ -36,7 +36,7 @@ def is_place(latitude: float, longitude: float) -> bool:
 
 
 def _degrees(side: object, value: object) -> float:
-    """Convert degrees, minutes, seconds to degrees, negative in the south and west; NaN if invalid."""
+    """Convert degrees, minutes, seconds to degrees; negative in south and west, NaN if invalid."""
     if not isinstance(value, tuple) or not 1 <= len(value) <= len(_STEPS):
         return math.nan
     degrees = sum(number(part) / step for part, step in zip(value, _STEPS, strict=False))

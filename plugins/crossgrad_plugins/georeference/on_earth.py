@@ -131,7 +131,7 @@ class OnEarth:
         return replace(placed, notes=projection.messages)
 
     def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert points [N, 3] of the input to metres east, north and up from the origin [N, 3]."""
+        """Convert points [N, 3] of the input to metres east, north, up from the origin [N, 3]."""
         if self.system is None:
             return self.to_enu.points(points)
         return self.origin.to_enu.points(self.system.geocentric(points))

@@ -164,8 +164,8 @@ def meetings(
 ) -> Iterator[Row]:
     """Yield few admitted rows in which one value meets every value of the other factors.
 
-    First, the values of all factors are taken in turn. Values that do not occur in an admitted row are
-    then tried with the default values of the other factors, and with one of these changed at a time.
+    First, the values of all factors are taken in turn. Values that do not occur in an admitted row
+    are then tried with the default values of the other factors, of which one at a time is changed.
     Not every row is tried, because many factors have too many rows.
 
     Args:

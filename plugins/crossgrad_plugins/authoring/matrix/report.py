@@ -42,7 +42,7 @@ class Tally:
     def admits(self, row: Row, slots: tuple[str, ...]) -> bool:
         """Return True if a run of the combination can start; record the reasons if it cannot.
 
-        An error other than a refusal occurs again, and is recorded, when the combination is trained.
+        An error other than a refusal occurs again in training, and is recorded then.
         """
         try:
             reasons = reasons_to_refuse(config_of(row, slots))
