@@ -123,7 +123,7 @@ def _value(default: object) -> str:
 
 
 def _type_name(annotation: object) -> str:
-    """Return the type as text for users: choices and unions joined by a bar, no constraints."""
+    """Return the type as text: choices and unions joined by a bar, without constraints."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _type_name(arguments[0])

@@ -92,7 +92,7 @@ class Comparison:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Notes on what is not compared, and why."""
+        """Notes on figures and costs that are not compared, with the reason."""
         return (*self.checked, *_without(self.main, self.quantity))
 
     @cached_property

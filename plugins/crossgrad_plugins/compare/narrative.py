@@ -1,4 +1,4 @@
-"""The results in plain words: the winner, by how much, how sure, at what cost."""
+"""The results as sentences: the best arm, the difference, its certainty and its cost."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _NONE_BEATEN = "but it is surely better than no other arm"
 
 @dataclass(frozen=True)
 class Sentence:
-    """A statement and what supports it."""
+    """A statement and its evidence."""
 
     claim: str
     support: str

@@ -88,7 +88,7 @@ def with_pictures(
 ) -> tuple[list[WorstView], list[str]]:
     """Return the worst views of each scene with pictures, and notes on unreadable pictures.
 
-    Only views of which all shown runs kept pictures count. Pictures are made smaller until all
+    A view is included only if all shown runs kept its pictures. Pictures are made smaller until all
     of them fit into the page.
     """
     shown: list[tuple[WorstView, list[tuple[str, Run]]]] = []

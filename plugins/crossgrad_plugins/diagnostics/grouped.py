@@ -155,7 +155,7 @@ def geometric_mean(ratios: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class VarianceSplit:
-    """Unbiased estimates of the paper's variances; `between` may come out negative.
+    """Unbiased estimates of the paper's variances; `between` may be negative.
 
     Attributes:
         within: sigma_w^2, weighted mean over groups of E||g - group mean||^2.

@@ -15,12 +15,12 @@ _PROBES = 8
 
 
 class Diagnostics(Observer):
-    """Measures the gradients of chosen views at an interval, parameters frozen.
+    """Measures the gradients of chosen views at an interval, at frozen parameters.
 
     Writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's folder. The
-    views are drawn by the observer's own generator; training is not changed by a bit. A probe
-    costs a forward and a backward pass of each probed view, off the training clock; the column
-    `probe_seconds` tells how long it took.
+    views are drawn by the observer's own generator, so the result of training does not change. A
+    probe costs a forward and a backward pass of each probed view. This time does not count as
+    training time; the column `probe_seconds` contains it.
     """
 
     every: int | None = Field(

@@ -156,7 +156,9 @@ def _figure(value: float, form: str) -> str:
 
 
 def read_probes(path: Path) -> list[Row]:
-    """Read rows of probes from a file of `write_table`; empty cells are NaN, no file is no rows.
+    """Read rows of probes from a file of `write_table`; empty cells are NaN.
+
+    Without a file, there are no rows.
 
     Raises:
         UserError: The file cannot be read, or a row lacks cells or a step.

@@ -169,7 +169,7 @@ class Watch:
 
     def due(self, step: int) -> bool:
         """Return True if a probe is due after this step."""
-        # The probe at the end replaces the one shortly before it.
+        # The probe at the end replaces a probe shortly before it.
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl

@@ -19,7 +19,7 @@ _DARKEST = 2.0**-20
 
 
 class Affine(ExposurePerPhoto):
-    """Each photo has A x + b for the render's sRGB value x; the mean of all maps is the identity.
+    """Each photo shows A x + b for the render's sRGB value x; the mean of all maps is the identity.
 
     The twelve numbers per photo can also model effects other than exposure. They suit many photos
     with much overlap.

@@ -1,4 +1,4 @@
-"""Similarities from one frame of the world to another, known or fitted to points.
+"""Similarities between two frames of the world, known or fitted to points.
 
 Source of the least-squares similarity: Umeyama 1991; of the search among triples by their median
 residual: Rousseeuw 1984.

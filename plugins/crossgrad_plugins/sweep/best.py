@@ -1,4 +1,4 @@
-"""The best parameters of each arm and scene: tuned on some seeds, to be tested on others."""
+"""The best parameters of each arm and scene, tuned on some seeds for tests on further seeds."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -148,7 +148,7 @@ class Grid(_Part):
     @model_validator(mode="before")
     @classmethod
     def _axes_with_names(cls, given: object) -> object:
-        """Move scenes and seeds out of the parameters, where other grid formats put them."""
+        """Move scenes and seeds out of the parameters; other grid formats list them there."""
         if not isinstance(given, dict) or not isinstance(given.get("parameters"), dict):
             return given
         moved = {"scene": "scenes", "seed": "seeds"}
