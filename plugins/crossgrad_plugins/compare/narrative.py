@@ -216,7 +216,7 @@ def _named(texts: Iterable[str], separator: str = ", ") -> str:
 
 
 def _why(contrasts: Sequence[Contrast]) -> str:
-    """Return why arms are equivalent, or the evidence that the most similar arm needs."""
+    """Return why arms are equivalent, or the pairs needed for the arm hardest to distinguish."""
     if contrasts[0].verdict is Verdict.EQUIVALENT:
         return f"within {_margin(contrasts[0])}"
     return needed_text(max(contrasts, key=lambda c: (c.estimate and c.estimate.needed) or inf))

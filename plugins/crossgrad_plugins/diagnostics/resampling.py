@@ -121,7 +121,7 @@ class Resamples:
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # If part of a finite population was probed, only the unprobed share of the noise remains.
+        # In a finite population, only the unprobed share of the noise's variance remains.
         root_f, root_g = f**0.5, g**0.5
         near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
         far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])

@@ -110,7 +110,7 @@ def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], 
 
 
 def _part(measurement: Measurement, places: list[int]) -> Measurement:
-    """Return the measurement of some of its views."""
+    """Restrict a measurement to some of its views."""
     square = np.ix_(range(len(measurement.blocks)), places, places)
     return Measurement(
         step=measurement.step,

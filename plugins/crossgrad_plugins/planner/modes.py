@@ -20,7 +20,7 @@ FEWEST: Final = 10
 LEAST_SHARE: Final = 0.1
 #: Of this many evenly spread samples, one may be separated as well as two modes.
 ONE_OF: Final = 100
-#: The distance of a view, if views show SfM points.
+#: The kind of distance that is used if views show SfM points.
 DEPTH: Final = "depth over focal length"
 FROM_THE_MEAN: Final = "distance from the mean camera"
 HEIGHT: Final = "height"

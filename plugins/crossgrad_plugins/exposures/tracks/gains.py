@@ -30,8 +30,8 @@ LEAST = 8
 #: minimum ratio of that deviation to its own standard error, and minimum share of the deviation of
 #: observations from their points that the gains remove. Results: docs/exposure.md.
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
-#: From this number of photos on, the photo farthest from the mean is ignored: an object that is
-#: hidden in other photos may cover all its points.
+#: From this number of photos on, the photo farthest from the mean is ignored, because all its
+#: points may be on an object that the other photos hide.
 _ENOUGH = 5
 #: Maximum number of photos for the decision. Of more photos, runs of consecutive ones are used,
 #: because consecutive photos show the same points.
