@@ -54,7 +54,7 @@ def draw_differences(c: Comparison) -> Drawn | None:
         ax = figure.subplots()
         ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
         ax.axvline(0.0, color=FAINT, linewidth=0.8)
-        # The pairs limit the axis: if a table row has only two pairs, its interval can span many dB.
+        # The pairs limit the axis: with two pairs, the interval of a table row can span many dB.
         dots = [pair.difference for row in rows for pair in row.pairs]
         low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
         ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
