@@ -1,1 +1,1 @@
-"""For authors and users of plugins: lists, explanations, contract checks, new packages."""
+"""Commands for authors and users of plugins: lists, descriptions, contract checks, new packages."""

@@ -22,7 +22,7 @@ _INDENT = " " * 6
 
 
 def check_package(package: str) -> tuple[str, bool]:
-    """Checks every plugin of a package.
+    """Check every plugin of a package.
 
     Args:
         package: Name of a distribution, or of an import package that holds plugins.
@@ -52,12 +52,12 @@ def check_package(package: str) -> tuple[str, bool]:
 
 
 def _strays_of(package: str) -> list[Stray]:
-    """Entry points of a package in groups that do not exist."""
+    """Return the entry points of a package in groups that do not exist."""
     return [each for each in strays() if _normalized(each.distribution) == _normalized(package)]
 
 
 def entries_of(package: str) -> list[Entry]:
-    """The plugins of a package by slot and name.
+    """Return the plugins of a package by slot and name.
 
     Raises:
         UserError: See `check_package`.
@@ -85,12 +85,12 @@ def entries_of(package: str) -> list[Entry]:
 
 
 def _names_of(entry: Entry) -> tuple[str, str]:
-    """Distribution and import package of an entry."""
+    """Return the distribution and the import package of an entry."""
     return entry.distribution, entry.package
 
 
 def _normalized(name: str) -> str:
-    """A distribution's name as pip compares it."""
+    """Normalize a distribution's name as pip does."""
     return name.lower().replace("_", "-").replace(".", "-")
 
 
@@ -119,9 +119,9 @@ def _verdict(results: Sequence[Result], failures: Sequence[Result]) -> str:
 
 
 def _reason(result: Result) -> str:
-    """`check: reason`, wrapped and indented below its plugin, and the place on a line of its own.
+    """Return `check: reason`, wrapped and indented, and the location on a separate line.
 
-    The place is not wrapped, so that it can be clicked and copied.
+    The location is not wrapped, so that it can be clicked and copied.
     """
     text = f"{result.check}: {result.failure}"
     reason = fill(

@@ -1,4 +1,4 @@
-"""A plugin in words: docstring, options, bounds, origin. Imports the plugin."""
+"""The description of a plugin: docstring, options, bounds, origin. Imports the plugin."""
 
 import inspect
 import json
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 _WIDTH = 80
 _MARGIN = "  "
-#: Sections of docstrings that say nothing to users: options are listed with their bounds.
+#: Sections of docstrings that are not for users; options are listed separately with their bounds.
 _SECTIONS = ("Attributes:", "Args:", "Returns:", "Raises:")
 _SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 _LENGTHS = {"min_length": "at least", "max_length": "at most"}
-#: Class attributes that say what a component needs or gives, with their label.
+#: Class attributes that describe requirements and results of a component -> label.
 _TRAITS = {
     "views": "views per step",
     "default_views": "default views",
@@ -42,7 +42,7 @@ _TRAITS = {
 
 
 def describe(entry: Entry) -> str:
-    """Everything a user wants to know before choosing a plugin, in 80 columns.
+    """Describe a plugin for users who choose one, in 80 columns.
 
     Raises:
         UserError: The plugin cannot be loaded.
@@ -65,20 +65,20 @@ def _heading(entry: Entry) -> str:
 
 
 def _described_command(entry: Entry) -> str:
-    """A command in words; its options are its own help's."""
+    """Describe a command; its options are described by its own help."""
     load_command(entry)
     hint = f"`crossgrad {entry.name} --help` explains its options"
     return "\n\n".join([_heading(entry), indent(_prose(f"{summary(entry)}\n\n{hint}"), _MARGIN)])
 
 
 def _prose(docstring: str) -> str:
-    """The docstring in lines that fit; without sections for readers of the code."""
+    """Wrap a docstring; leave out sections for readers of the code."""
     blocks = [block for block in docstring.split("\n\n") if not block.startswith(_SECTIONS)]
     return "\n\n".join(_filled(block) for block in blocks)
 
 
 def _filled(block: str) -> str:
-    """A paragraph filled to the width; where lines are indented, each of them by itself."""
+    """Fill a paragraph to the width; if lines are indented, fill each line separately."""
     lines = block.splitlines() if "\n " in block else [" ".join(block.split())]
     width = _WIDTH - len(_MARGIN)
     return "\n".join(
@@ -118,12 +118,12 @@ def _option(name: str, field: FieldInfo) -> str:
 
 
 def _value(default: object) -> str:
-    """A value as one would write it after `--set KEY=`."""
+    """Format a value as it is written after `--set KEY=`."""
     return default if isinstance(default, str) else json.dumps(default, default=str)
 
 
 def _type_name(annotation: object) -> str:
-    """The type as a user would say it: choices and unions by a bar, constraints left out."""
+    """Return the type as text: choices and unions joined by a bar, without constraints."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _type_name(arguments[0])
@@ -139,7 +139,7 @@ def _type_name(annotation: object) -> str:
 
 
 def _bounds(constraints: list[Any]) -> list[str]:
-    """`>= 0` for each bound that pydantic holds."""
+    """Return a text such as `>= 0` for each bound of pydantic."""
     found = [
         f"{sign} {getattr(constraint, attribute)}"
         for constraint in constraints

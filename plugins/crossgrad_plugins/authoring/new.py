@@ -1,4 +1,4 @@
-"""`crossgrad plugins new`: a small package with one plugin, to begin with."""
+"""`crossgrad plugins new`: a small package with one plugin as a starting point."""
 
 import re
 import tomllib
@@ -20,7 +20,7 @@ from crossgrad_core.commands import (
     with_article,
 )
 
-#: The example package: in the wheel, else in the checkout.
+#: Folders of the example package: in the wheel, else in the checkout.
 _EXAMPLES: Final = (
     Path(__file__).with_name("example"),
     Path(__file__).parents[3] / "examples" / "plugin",
@@ -82,13 +82,13 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
     Args:
         name: Name of the plugin and of the package.
         slot: The slot, one of `OFFERED`.
-        folder: Where to; made here.
+        folder: Output folder; created here.
 
     Returns:
         The files.
 
     Raises:
-        UserError: The name cannot be one, or is taken; or there is something in the folder.
+        UserError: The name is invalid or already used, or the folder is not empty.
     """
     module = name.replace("-", "_")
     _check(name, module, slot)
@@ -102,7 +102,7 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
 
 
 def _contents(name: str, module: str, slot: str) -> dict[str, str]:
-    """Path below the folder -> text."""
+    """Return path below the folder -> text."""
     kind = "".join(part.capitalize() for part in name.split("-"))
     member = module if slot == COMMANDS else kind
     example, model = examples()[slot]

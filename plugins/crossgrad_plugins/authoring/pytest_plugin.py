@@ -1,7 +1,7 @@
 """`pytest --crossgrad-matrix PACKAGE`: the combinations of a package as tests.
 
-pytest imports this module in every run of an environment in which crossgrad is installed. Nothing
-else is imported unless the option is given.
+pytest imports this module in every run of an environment with crossgrad. No other module is
+imported unless the option is given.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,12 +14,12 @@ from typing_extensions import override
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunConfig
 
-#: What the tests are called: `crossgrad-matrix::sampler=... operator=...`.
+#: Prefix of the test names: `crossgrad-matrix::sampler=... operator=...`.
 NAME = "crossgrad-matrix"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds the options."""
+    """Add the options."""
     group = parser.getgroup("crossgrad")
     group.addoption(
         "--crossgrad-matrix",
@@ -34,7 +34,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(session: pytest.Session, items: list[pytest.Item]) -> None:
-    """Adds a test for each combination."""
+    """Add a test for each combination."""
     package = session.config.getoption("crossgrad_matrix")
     if package is not None:
         matrix = Matrix.from_parent(session, name=NAME, nodeid=NAME, package=package)
@@ -50,10 +50,10 @@ class Matrix(pytest.Collector):
 
     @override
     def collect(self) -> list[pytest.Item]:
-        """A test for each combination, also for those that are refused.
+        """Return a test for each combination, including refused combinations.
 
         Raises:
-            UsageError: There is no such package, or nothing of it can be combined.
+            UsageError: There is no such package, or none of its components can be combined.
         """
         from crossgrad_core.commands import UserError
 
@@ -82,7 +82,7 @@ class Matrix(pytest.Collector):
 
 
 class Combination(pytest.Item):
-    """One combination: trained, or skipped with the reasons for which it is refused."""
+    """A test of one combination: trained, or skipped with the reasons for its refusal."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class Combination(pytest.Item):
 
     @override
     def runtest(self) -> None:
-        """Trains it."""
+        """Train the combination."""
         from crossgrad_core.testing.support.short_runs import try_out
         from crossgrad_plugins.authoring.matrix.combinations import STEPS
 
@@ -106,5 +106,5 @@ class Combination(pytest.Item):
 
     @override
     def reportinfo(self) -> tuple[str, None, str]:
-        """Where it is: in no file."""
+        """Return the location of the test, which is not in a file."""
         return NAME, None, self.name

@@ -1,1 +1,1 @@
-"""`crossgrad compare`: runs against each other, over seeds, scenes, regimes and budgets."""
+"""`crossgrad compare`: comparison of runs over seeds, scenes, regimes and budgets."""

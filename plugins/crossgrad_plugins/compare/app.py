@@ -52,12 +52,12 @@ _MOST_SHOWN: Final = 3
 
 
 def differing_code(arms: Mapping[str, Runs]) -> list[str]:
-    """A note where arms, or the two runs of a pair, come from different code; else none.
+    """Return a note if arms, or the two runs of a pair, come from different code; else no note.
 
-    Runs that do not say where they come from agree with all.
+    A run without a recorded commit or version is ignored.
 
     Args:
-        arms: Arm -> scene and seed -> the run that stands for them.
+        arms: Arm -> scene and seed -> the run that represents them.
     """
     used = {arm: _all_code(runs) for arm, runs in arms.items()}
     groups: dict[str, list[str]] = {}
@@ -76,7 +76,7 @@ def differing_code(arms: Mapping[str, Runs]) -> list[str]:
 
 
 def code_of(run: Run) -> str:
-    """The commit of a run, or of an installed package its version; empty where it has neither."""
+    """Return the commit of a run, else the version of its package, else an empty text."""
     environment = run.summary.get("environment") or {}
     commit, version = environment.get("commit"), environment.get("crossgrad")
     if commit:
@@ -90,13 +90,13 @@ def _all_code(runs: Runs) -> str:
 
 def _named(arms: list[str]) -> str:
     more = len(arms) - _MOST_SHOWN
-    # Names have commas in them.
+    # Arm names contain commas, so each name is quoted.
     names = ", ".join(f"'{arm}'" for arm in arms[:_MOST_SHOWN])
     return names if more <= 0 else f"{names} and {more} more"
 
 
 def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
-    """Runs on one scene with one seed that come from different code."""
+    """Yield two runs on one scene with one seed that come from different code."""
     known: dict[tuple[str, int], Run] = {}
     for runs in arms.values():
         for problem, run in runs.items():
@@ -107,12 +107,12 @@ def _unlike_pairs(arms: Mapping[str, Runs]) -> Iterator[tuple[Run, Run]]:
 
 
 _TEMPLATE: Final = Path(__file__).with_name("page.html")
-#: Rows of a table that are open; more of them are behind a click.
+#: Number of table rows that are visible; a click shows further rows.
 _OPEN_ROWS: Final = 12
 #: Series colours on a dark page: the same hues, lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
 _WORST_NAMED: Final = 8
-#: What a run's environment says about its machine and code -> what is written before it.
+#: Field of a run's environment (machine, code) -> the text before its value.
 _MACHINE: Final = {
     "cpu": "",
     "cpu_cores": "cores: ",
@@ -132,14 +132,14 @@ def page_of(
     notes: Sequence[str],
     version: str,
 ) -> str:
-    """Return the page.
+    """Return the HTML page of a comparison.
 
     Args:
-        comparison: What was found.
+        comparison: The comparison.
         figures: All figures that could be drawn, in order.
-        pictured: The views that are shown.
+        pictured: The views that are shown with pictures.
         views: Scene -> all held-out views, the worst first.
-        notes: What is not compared or shown, and why.
+        notes: Which results are not compared or shown, and why.
         version: Version of crossgrad.
     """
     from jinja2 import Environment, StrictUndefined
@@ -177,14 +177,14 @@ def page_of(
 
 
 def _shown(value: object) -> object:
-    """Return a text with its control characters as escapes, and all else as it is."""
+    """Escape the control characters of a text; return any other value unchanged."""
     if not isinstance(value, str):
         return value
     return one_line(value) if type(value) is str else type(value)(showable(value))
 
 
 def machines(comparison: Comparison) -> list[str]:
-    """Return the machines and code of the runs, with the number of runs of each."""
+    """Return each combination of machine and code, with its number of runs."""
     runs = Counter(
         ", ".join(
             f"{before}{run.environment[key]}"
@@ -200,7 +200,7 @@ _MOST_ROWS = 20
 
 
 def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
-    """Return the lines."""
+    """Yield the lines that the command prints."""
     for sentence in narrative.headline(comparison):
         yield f"{sentence.claim}" + (f" ({sentence.support})" if sentence.support else "")
     standing, costs = standing_table(comparison), cost_table(comparison)
@@ -222,7 +222,7 @@ def lines_of(comparison: Comparison, notes: Sequence[str]) -> Iterator[str]:
 
 
 def _lines(table: Table) -> Iterator[str]:
-    """Return columns as wide as their widest cell, the first one to the left."""
+    """Yield the lines of a table with aligned columns; the first column is left-aligned."""
     if not table.rows:
         return
     shown = [index for index, column in enumerate(table.columns) if column.in_terminal]
@@ -235,14 +235,14 @@ def _lines(table: Table) -> Iterator[str]:
         yield "  ".join([first.ljust(widths[0]), *right]).rstrip()
 
 
-#: Where a comparison goes by default, beside the runs.
+#: Name of the default output folder, next to the runs.
 FOLDER: Final = "compare"
-#: All figures that there can be.
+#: Names of all figures that a comparison can draw.
 DRAWINGS: Final = (
     *(f"curves_{cost.name}" for cost in COSTS),
     *("differences", "frontier", "phases", "primitives", "profile", "regimes"),
 )
-#: What a comparison writes, besides its page.
+#: Files that a comparison can write, in addition to its page.
 OWNED: Final = (
     *TABLES,
     *(f"{FIGURES}/{name}.{form}" for name in DRAWINGS for form in ("pdf", "png")),
@@ -252,16 +252,16 @@ OWNED: Final = (
 def compare(
     places: Sequence[Path], options: Options, out: Path | None, *, skip_broken: bool
 ) -> None:
-    """Compares runs; writes page, figures and tables to a folder, and prints the verdicts.
+    """Compare runs, write the page, figures and tables to a folder, and print the verdicts.
 
     Args:
         places: Folders of runs, or folders with runs below.
         options: How to compare.
-        out: Where the results go; by default `compare` beside the runs.
+        out: Output folder; by default `compare` next to the runs.
         skip_broken: Leave out runs with damaged files.
 
     Raises:
-        UserError: There is nothing to compare, it does not compare, or the folder is in use.
+        UserError: No run can be compared, the runs are not comparable, or the folder is in use.
     """
     progress = Progress()
     _check_numbers(options)
@@ -320,7 +320,7 @@ def drawn_figures(comparison: Comparison) -> list[Drawn]:
 
 
 def _default_folder(places: Sequence[Path]) -> Path:
-    """In the only place, where that is no run itself; else beside what was named."""
+    """Return the default folder: inside a single folder of runs, else next to the given folders."""
     only = places[0]
     if len(places) == 1 and not (only / "config.yaml").is_file():
         return only / FOLDER

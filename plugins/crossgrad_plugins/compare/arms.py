@@ -1,4 +1,4 @@
-"""Arms: runs that differ in nothing but scene, seed and length, by scene and seed."""
+"""Arms: groups of runs that differ only in scene, seed and length."""
 
 import re
 from collections import Counter
@@ -9,13 +9,13 @@ from typing import Final, TypeAlias
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import ABSENT, Run, Settings, text_of
 
-#: What names an arm if it can, before anything else that differs.
+#: Settings that name an arm if they differ; other settings are used after these.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
     *("rate_factor", "densify_views", "schedule", "schedule_length", "schedule_unit"),
     *("exposure", "loss", "resolution", "recipe", "backward"),
 )
-#: Settings that people know by another name.
+#: Settings that have a shorter name in the names of arms.
 _SPOKEN: Final = {"views_per_step": "views"}
 _DIGITS: Final = re.compile(r"(\d+)")
 #: Scene and seed.
@@ -25,13 +25,13 @@ Length: TypeAlias = tuple[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """One of the things that are compared.
+    """A group of runs that is compared with other groups.
 
     Attributes:
-        name: Its name.
-        runs: Its runs that finished, of any length.
-        failed: Its runs that failed.
-        settings: Setting -> value, of those in which arms differ.
+        name: Name of the arm.
+        runs: The finished runs of the arm, of any length.
+        failed: The failed runs of the arm.
+        settings: Setting -> value, for the settings in which arms differ.
     """
 
     name: str
@@ -41,16 +41,17 @@ class Arm:
 
 
 def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
-    """The arms, in the order of their names.
+    """Group runs into arms; return the arms in the order of their names.
 
-    Runs belong together that agree in every setting which varies within a scene: what depends on
-    the scene alone, such as a degree that its data cannot support, makes no arm. Where each run
-    has a label of a sweep, those of one label belong together, unless it stands for several
-    configurations on one scene, as labels of two sweeps do: then their settings tell them apart.
+    An arm holds the runs that agree in every setting that varies within a scene. A setting that
+    differs only between scenes, such as a degree that the data of a scene cannot support, does
+    not separate arms. If every run has a label of a sweep, the runs of one label form an arm. If
+    a label covers several configurations on one scene, as after two sweeps, the settings of the
+    runs separate them.
 
     Args:
-        runs: The runs that finished; at least one.
-        failed: Those that failed.
+        runs: The finished runs; at least one.
+        failed: The failed runs.
     """
     everything = [*runs, *failed]
     keys = _varying(everything)
@@ -68,12 +69,12 @@ def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
 
 
 def _grouped(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
-    """The runs of each arm with its name; no two of these are the same."""
+    """Return the name and the runs of each arm; all names differ."""
     if all(run.label for run in runs):
         found = _by_labels(runs)
         if len({name for name, _ in found}) == len(found):
             return found
-    # A run with two labels is there twice.
+    # A run with two labels is listed twice.
     return _by_settings(list({run.name: run for run in runs}.values()))
 
 
@@ -103,14 +104,14 @@ def _by_settings(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
 
 
 def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
-    """The arms with names that the user gives.
+    """Rename arms as the user asks.
 
     Args:
         arms: The arms.
         names: `OLD:NEW` texts.
 
     Raises:
-        UserError: A text names no arm, or two arms would have one name.
+        UserError: A text names no existing arm, or two arms would have one name.
     """
     new = {arm.name: arm.name for arm in arms}
     for text in names:
@@ -136,10 +137,10 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 
 
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
-    """Settings that have two values or more within a scene, the telling ones first.
+    """Return the settings with several values within a scene, the most important settings first.
 
-    An option that only some runs have does not count: it belongs to a component that the others
-    lack, which differs itself, or to another version.
+    A setting that only some runs have does not count. Either it is an option of a component that
+    the other runs do not use, so that the component itself differs, or it is from another version.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -157,7 +158,7 @@ def _values(settings: Settings, keys: Sequence[str]) -> tuple[str, ...]:
 def _names(
     groups: Mapping[tuple[str, ...], Sequence[Run]], keys: Sequence[str]
 ) -> dict[tuple[str, ...], str]:
-    """The first settings that tell all groups apart; none that adds nothing to those before."""
+    """Name each group by the fewest settings, taken in order, that tell all groups apart."""
     if len(groups) == 1:
         return {key: _of_one(runs[0]) for key, runs in groups.items()}
     chosen: list[int] = []
@@ -168,7 +169,7 @@ def _names(
 
 
 def _name(keys: Sequence[str], values: tuple[str, ...], chosen: Sequence[int]) -> str:
-    """What is set of the chosen settings; an option of a component that is not there is not."""
+    """Return the chosen settings as a name; options of absent components are left out."""
     known = [index for index in chosen if values[index] != ABSENT]
     return ", ".join(_part(keys[index], values[index]) for index in known or chosen)
 
@@ -182,13 +183,13 @@ def _part(key: str, value: str) -> str:
 
 
 def _of_one(run: Run) -> str:
-    """What the only arm is called: the parts that make it."""
+    """Return the name of the only arm: its backbone, sampler, operator and views per step."""
     named = [run.settings.get(key, "") for key in ("backbone", "sampler", "operator")]
     return ", ".join([*filter(None, named), f"views={run.settings.get('views_per_step', '?')}"])
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers by their size."""
+    """Return a sort key that orders numbers in names by their value."""
     return [
         (int(part), "") if part.isdecimal() else (-1, part) for part in _DIGITS.split(name) if part
     ]
@@ -200,7 +201,7 @@ class Cells:
 
     Attributes:
         runs: Arm -> scene and seed -> length -> run.
-        repetitions: Folder -> the folder that it repeats, which stands for both.
+        repetitions: Folder of a repeated run -> folder of the run that is used instead.
     """
 
     runs: Mapping[str, Mapping[Problem, Mapping[Length, Run]]]
@@ -208,7 +209,7 @@ class Cells:
 
     @classmethod
     def of(cls, arms: Sequence[Arm]) -> "Cells":
-        """Sorts the runs in."""
+        """Sort the runs of the arms by scene, seed and length."""
         runs: dict[str, dict[Problem, dict[Length, Run]]] = {}
         repetitions: dict[str, str] = {}
         for arm in arms:
@@ -221,27 +222,28 @@ class Cells:
 
     @property
     def lengths(self) -> tuple[Length, ...]:
-        """All lengths, by unit and from short to long."""
+        """All lengths, ordered by unit, then from short to long."""
         return tuple(sorted({run.length for run in self._all()}))
 
     @property
     def several(self) -> bool:
-        """Whether an arm has a scene and seed at several lengths."""
+        """True if an arm has runs of several lengths for one scene and seed."""
         return any(len(by) > 1 for problems in self.runs.values() for by in problems.values())
 
     def at(self, length: Length) -> dict[str, dict[Problem, Run]]:
-        """Arm -> scene and seed -> run of that length."""
+        """Return arm -> scene and seed -> run of the given length."""
         return {
             arm: {problem: by[length] for problem, by in problems.items() if length in by}
             for arm, problems in self.runs.items()
         }
 
     def main(self) -> dict[str, dict[Problem, Run]]:
-        """Arm -> scene and seed -> the run that stands for them.
+        """Return arm -> scene and seed -> the run that represents them.
 
-        It has the length that most runs on the scene have, the longer one of two, or else the one
-        that the arm has more than twice as often there. An arm that has no run of the usual length
-        on a scene stands there with its own lengths, the longest of several.
+        The run has the length that is most frequent on its scene; of two equally frequent lengths,
+        the longer one is used. An arm uses another length if it has more than twice as many runs of
+        that length there. An arm without a run of the most frequent length uses its own lengths;
+        for each scene and seed, the longest run.
         """
         chosen = self._chosen()
         return {
@@ -255,7 +257,7 @@ class Cells:
 
     @property
     def unlike(self) -> dict[str, str]:
-        """Name of a run -> why it stands for nothing, though its arm has no other run there."""
+        """Name of a run -> why it is not used, although its arm has no other run in its place."""
         chosen = self._chosen()
         return {
             run.name: f"has {run.length_text}, other runs of {arm} on {scene} {text_of(length)}"
@@ -266,7 +268,7 @@ class Cells:
         }
 
     def _chosen(self) -> dict[tuple[str, str], Length]:
-        """Arm and scene -> the length of the runs that stand there; not where it has none."""
+        """Return arm and scene -> the length used there; no entry without the usual length."""
         usual: dict[str, Counter[Length]] = {}
         own: dict[tuple[str, str], Counter[Length]] = {}
         for arm, problems in self.runs.items():
@@ -294,6 +296,6 @@ def _amount(length: Length) -> float:
 
 
 def _preferred(counts: Mapping[Length, int], usual: Length) -> Length:
-    """The usual length, or one that there is more than twice as often."""
+    """Return the usual length, or a length that occurs more than twice as often."""
     own = max(counts, key=lambda length: (counts[length], _amount(length)))
     return own if counts[own] > 2 * counts[usual] else usual

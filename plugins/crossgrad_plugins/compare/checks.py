@@ -18,30 +18,30 @@ from crossgrad_plugins.compare.run import Run
 #: The note on the photos' sizes that every run writes.
 _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
-#: The definition that holds for every metric: how renders are compared at all.
+#: The definition that applies to every metric: how renders are compared.
 _RENDERS: Final = "renders"
-#: What makes a machine, and beyond it a way to use it.
+#: The environment fields that identify a machine; `_SHARE` says how the machine is used.
 _MACHINE: Final = {"cpu": "processor", "gpu": "GPU", "device": "device"}
 _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of threads"}
-#: Rate of the calibration -> how much it may differ: on the clock, and in CPU time, of which other
-#: processes on the same core and cache take some even where they do not take the core.
+#: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU
+#: time varies more, because other processes share the caches and cores.
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
-#: Load above the number of cores from which on a machine is busy with other things.
+#: A machine whose mean load exceeds its number of cores by this amount is busy.
 _BUSY: Final = 0.5
-#: Beside seconds of CPU, which may be compared all the same.
+#: Wall-clock seconds in notes; CPU seconds may still be compared.
 _CLOCK: Final = "seconds of the clock"
 _NEVER_RECORDED: Final = "no run recorded them"
 
 
 def check_scenes(runs: Sequence[Run]) -> list[str]:
-    """Refuses runs of one scene that differ in split, photos, sizes or resize filter.
+    """Refuse runs of one scene that differ in split, photos, sizes or resize filter.
 
     Returns:
-        Notes: of which runs photos cannot be compared, and of which scenes the regimes differ, so
-        that only overall figures are compared.
+        Notes on two limits: runs whose photos cannot be compared, and scenes whose regimes
+        differ, so that only overall figures are compared.
 
     Raises:
-        UserError: Figures of these runs do not compare, with the reason.
+        UserError: The figures of these runs are not comparable; the message gives the reason.
     """
     for scene in dict.fromkeys(run.scene for run in runs):
         own = [run for run in runs if run.scene == scene]
@@ -62,7 +62,7 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
 
 
 def differing_regimes(runs: Sequence[Run]) -> tuple[str, ...]:
-    """Scenes of which runs give the same held-out views different regimes."""
+    """Return the scenes whose runs assign different regimes to the same held-out views."""
     seen: dict[str, set[Hashable]] = {}
     for run in runs:
         labels = frozenset((view.name, view.regime) for view in run.results.views)
@@ -122,7 +122,7 @@ def _check_trained(scene: str, runs: Sequence[Run]) -> None:
 
 
 def _odd_one(runs: Sequence[Run], mark: Callable[[Run], Hashable]) -> tuple[Run, Run] | None:
-    """The first run, and the first one that has another mark."""
+    """Return the first run and the first run with a different mark, or None."""
     return next(((runs[0], run) for run in runs if mark(run) != mark(runs[0])), None)
 
 
@@ -145,12 +145,12 @@ def _photos(run: Run) -> str:
 
 
 def _mark(file: object) -> object:
-    """Return what a file is known by: its size and the digest of its ends."""
+    """Return the size and digest that identify a file; other values are returned unchanged."""
     return [file.get("bytes"), file.get("sha256")] if isinstance(file, dict) else file
 
 
 def _sizes(run: Run) -> str:
-    """Sizes and filter, as the run noted them; empty where it did not."""
+    """Return photo sizes and resize filter from a run's notes; empty if it has no such note."""
     for note in run.summary.get("notes") or ():
         if found := _SIZES.match(str(note)):
             return f"{found['sizes']}, {found['how']}"
@@ -169,16 +169,16 @@ def _difference(first: frozenset[str], second: frozenset[str]) -> str:
 def quantities_of(
     runs: Sequence[Run], name: str, margin: float | None
 ) -> tuple[tuple[Quantity, ...], list[str]]:
-    """The figures that can be compared, the main one first, and notes on those that cannot.
+    """Return the figures that can be compared, the main one first, and notes on the rest.
 
     Args:
         runs: The runs.
         name: Name of the main figure.
-        margin: Its margin; by default the usual one.
+        margin: Margin of the main figure; None for the default margin.
 
     Raises:
-        UserError: No run has the main figure, or runs define it, or how renders are compared,
-            differently.
+        UserError: No run has the main figure, or the runs differ in its definition or in the
+            rules by which renders are compared.
     """
     offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
     measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
@@ -233,7 +233,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
-    """Definition -> the first run that has it; runs that do not state one agree with all."""
+    """Return definition -> the first run that states it; runs that state none are ignored."""
     found: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)
@@ -247,15 +247,14 @@ def _overall(run: Run) -> dict[str, Any]:
 
 
 def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cost, ...], list[str]]:
-    """What runs spend that can be compared, and notes on what cannot.
+    """Return the costs that can be compared, and notes on the costs that cannot.
 
     Args:
         runs: The runs.
-        clock: The seconds that are wanted: by default those of the clock where they compare, else
-            those of the processor, else none.
+        clock: Which seconds to compare. `auto` uses every clock whose seconds are comparable.
 
     Raises:
-        UserError: The wanted seconds do not compare, with the reason.
+        UserError: The requested seconds are not comparable; the message gives the reason.
     """
     reasons = {SECONDS: _why_no_wall(runs), CPU_SECONDS: _why_no_cpu(runs)}
     wanted = {ClockChoice.WALL: SECONDS, ClockChoice.CPU: CPU_SECONDS}.get(clock)
@@ -279,7 +278,7 @@ def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cos
 
 
 def _why_no_wall(runs: Sequence[Run]) -> str:
-    """Why seconds of the clock do not compare; empty where they do."""
+    """Return why wall-clock seconds are not comparable; empty if they are."""
     return (
         _other_machine(runs, {**_MACHINE, **_SHARE})
         or _busy(runs)
@@ -308,7 +307,7 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
 
 
 def _other_speed(runs: Sequence[Run], name: str) -> str:
-    """Whether the machine itself ran at another speed, as its calibration tells."""
+    """Return how the calibrated speed of the machine differs between runs; empty if it does not."""
     known = [(run.number("environment", "calibration", name), run) for run in runs]
     rates = [(rate, run) for rate, run in known if rate is not None]
     if len(rates) < len(runs):
@@ -338,7 +337,10 @@ def _busy(runs: Sequence[Run]) -> str:
 
 
 def _threads(runs: Sequence[Run]) -> str:
-    """Threads that wait spin: their CPU seconds count, but nothing comes of them."""
+    """Return why threads make CPU seconds incomparable; empty if they do not.
+
+    Threads that wait spin: they use CPU seconds without doing work.
+    """
     for run in runs:
         threads = run.number("environment", "torch_threads")
         if threads is not None and threads > 1:

@@ -1,4 +1,4 @@
-"""`crossgrad compare`: runs against each other, over seeds, scenes, regimes and budgets."""
+"""`crossgrad compare`: compare runs over seeds, scenes, regimes and budgets."""
 
 from crossgrad_core.commands import announce, command_of
 from crossgrad_plugins.compare.options import Command

@@ -1,4 +1,4 @@
-"""Everything that is said about a set of runs: what is drawn, tabled and printed."""
+"""The results of a comparison, which figures, tables and texts show."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,27 +22,27 @@ from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
-#: Where a contrast of the main table is taken.
+#: The place at which the contrasts of the main table are taken.
 END = "at the end"
 OVERALL = "overall"
-#: Up to so many arms every pair of them has a row in every table.
+#: With at most this many arms, every table has a row for every pair of arms.
 _FEW_ARMS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Runs that compare, and what can be said about them; worked out when it is first asked for.
+    """Comparable runs and their results; each result is computed at first use.
 
     Attributes:
         arms: The arms in the order of their names.
-        baseline: The arm that the others are compared with, if one was named.
-        quantities: What is compared, the main figure first.
-        costs: What runs spend that can be compared.
+        baseline: The arm that all other arms are compared with; None for all with all.
+        quantities: The figures that are compared, the main figure first.
+        costs: The costs that can be compared.
         cells: All runs by arm, scene, seed and length.
-        unlike: Scenes whose runs give the same held-out views different regimes.
-        target: The quality to reach; None for what the weakest arm ends with, by scene.
+        unlike: Scenes whose runs assign different regimes to the same held-out views.
+        target: The quality to reach; None for the final quality of the weakest arm, by scene.
         checked: Notes of the checks on what is not compared, and why.
-        unused: Folder of a run that has not ended or cannot be read -> why it is left out.
+        unused: Folder of an unfinished or unreadable run -> why it is left out.
     """
 
     arms: tuple[Arm, ...]
@@ -62,7 +62,7 @@ class Comparison:
 
     @cached_property
     def main(self) -> Mapping[str, Runs]:
-        """Arm -> scene and seed -> the run that stands for them."""
+        """Arm -> scene and seed -> the run that represents them."""
         return self.cells.main()
 
     @cached_property
@@ -72,7 +72,7 @@ class Comparison:
 
     @cached_property
     def runs(self) -> tuple[Run, ...]:
-        """The runs that stand for an arm, a scene and a seed."""
+        """The runs that represent an arm, a scene and a seed."""
         return tuple(run for by in self.main.values() for run in by.values())
 
     @cached_property
@@ -92,7 +92,7 @@ class Comparison:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What is not compared, and why."""
+        """Notes on figures and costs that are not compared, with the reason."""
         return (*self.checked, *_without(self.main, self.quantity))
 
     @cached_property
@@ -103,13 +103,13 @@ class Comparison:
 
     @cached_property
     def ends(self) -> tuple[Contrast, ...]:
-        """Each couple of arms at the ends of its runs."""
+        """The contrast of each pair of arms at the ends of the runs."""
         couples = pairwise.couples(self.ranking, self.baseline)
         return pairwise.judged(self._at_end(couple, self.quantity) for couple in couples)
 
     @cached_property
     def others(self) -> tuple[Contrast, ...]:
-        """The telling couples by the other figures."""
+        """The contrasts of the main pairs of arms, for all figures except the main one."""
         return pairwise.judged(
             self._at_end(couple, quantity)
             for quantity in self.quantities[1:]
@@ -118,13 +118,13 @@ class Comparison:
 
     @cached_property
     def equal(self) -> tuple[Contrast, ...]:
-        """The telling couples at equal costs, if these differ at the ends of the runs."""
+        """The contrasts of the main pairs of arms at equal cost, if costs differ at the ends."""
         contrasts = [self._at_cost(couple, cost) for couple in self._telling for cost in self.costs]
         return pairwise.judged(each for each in contrasts if each.inside)
 
     @cached_property
     def amounts(self) -> Mapping[tuple[str, str], float]:
-        """Name of a cost and scene -> what the run that spent least there had spent at its end."""
+        """Cost name and scene -> the smallest final cost of all runs on that scene."""
         return {
             (cost.name, scene): amount
             for cost in self.costs
@@ -134,7 +134,7 @@ class Comparison:
 
     @cached_property
     def regimes(self) -> tuple[Contrast, ...]:
-        """The telling couples overall and by regime, on scenes whose runs agree on them."""
+        """The contrasts of the main pairs, overall and by regime, on scenes with agreed regimes."""
         known = (run.results.regimes for run in self.runs if run.scene not in self.unlike)
         names = sorted({regime for regimes in known for regime in regimes})
         if len(names) < 2:  # noqa: PLR2004 - a single one would repeat `overall`
@@ -147,7 +147,7 @@ class Comparison:
 
     @cached_property
     def reached(self) -> tuple[targets.Reached, ...]:
-        """How soon a quality is reached, for each cost."""
+        """The cost at which each arm reaches a quality, for each cost."""
         goals = targets.targets_of(self.main, self.quantity, self.target)
         return tuple(
             row
@@ -162,12 +162,12 @@ class Comparison:
 
     @cached_property
     def gains(self) -> tuple[Contrast, ...]:
-        """What longer runs gain within each arm; none with one length."""
+        """The gains of longer runs within each arm; empty if all runs have one length."""
         return frontier.gains(self.cells, self.quantity)
 
     @cached_property
     def _telling(self) -> list[tuple[str, str]]:
-        """The couples that have a row in every table: of many arms those of the best one."""
+        """The pairs of arms in every table; with many arms, only the pairs of the best arm."""
         couples = pairwise.couples(self.ranking, self.baseline)
         few = self.baseline is not None or len(self.arms) <= _FEW_ARMS
         return couples if few else couples[: len(self.arms) - 1]
@@ -209,10 +209,10 @@ class Comparison:
 
 
 def compared(found: RunRecord, options: Options) -> Comparison:
-    """Compare runs.
+    """Check runs and compare them.
 
     Raises:
-        UserError: There is nothing to compare, or it does not compare, with the reason.
+        UserError: No run has finished, or the runs are not comparable; the message says why.
     """
     if not found.runs:
         raise UserError(
@@ -252,7 +252,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
 
 
 def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
-    """Notes on runs that have no figure at their ends."""
+    """Return notes on runs without a figure at their ends."""
     notes = []
     for run in {run.name: run for by in main.values() for run in by.values()}.values():
         if run.final(quantity.name) is None:

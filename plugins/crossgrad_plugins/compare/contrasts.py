@@ -16,7 +16,7 @@ from crossgrad_plugins.compare.statistics import (
     verdicts,
 )
 
-#: A run -> its value; None where it has none.
+#: Maps a run to its value; None if the run has no value.
 Reading: TypeAlias = Callable[[Run], float | None]
 #: Scene and seed -> the run of an arm.
 Runs: TypeAlias = Mapping[Problem, Run]
@@ -39,17 +39,17 @@ class Pair:
 
 @dataclass(frozen=True)
 class Contrast:
-    """One arm against another one.
+    """The comparison of one arm with another.
 
     Attributes:
-        first: Name of an arm.
-        second: Name of another one.
-        where: Where they are compared, such as `at the end` or a regime.
-        quantity: What is compared.
-        pairs: The pairs.
+        first: Name of the first arm.
+        second: Name of the second arm.
+        where: The point or the views of the comparison, such as `at the end` or a regime.
+        quantity: The figure that is compared.
+        pairs: The pairs of runs.
         estimate: The first minus the second; None without a pair.
-        verdict: What can be said about it, beside the other contrasts of its table.
-        inside: Whether runs were read before their ends, where their schedules went on.
+        verdict: The verdict, which takes the other contrasts of its table into account.
+        inside: True if runs were read before their ends, while their schedules continued.
     """
 
     first: str
@@ -63,7 +63,7 @@ class Contrast:
 
     @property
     def ahead(self) -> int:
-        """Pairs in which the first arm is better."""
+        """Number of pairs in which the first arm is better."""
         return sum(self.quantity.better(pair.first, pair.second) for pair in self.pairs)
 
     @property
@@ -74,17 +74,17 @@ class Contrast:
 
     @property
     def is_small(self) -> bool:
-        """Whether the 90 % interval lies within the margin, whatever else it says."""
+        """True if the 90 % interval is inside the margin, whatever the verdict is."""
         return self.estimate is not None and self.estimate.is_small
 
     @property
     def differs(self) -> bool:
-        """Whether the 95 % interval excludes zero, whatever else is compared."""
+        """True if the 95 % interval excludes zero, whatever else is compared."""
         return self.estimate is not None and self.estimate.differs
 
     @property
     def opposed(self) -> tuple[SceneEstimate, ...]:
-        """The scenes that surely contradict the verdict."""
+        """The scenes whose own intervals contradict the verdict."""
         if self.estimate is None:
             return ()
         return opposed(self.estimate, self.verdict, self.quantity.margin)
@@ -97,7 +97,7 @@ def contrast(
     reading: Reading,
     where: str,
 ) -> Contrast:
-    """One arm against another one; pairs in which a run has no value are left out."""
+    """Compare one arm with another; leave out pairs in which a run has no value."""
     first, second = runs
     pairs = []
     for scene, seed in sorted(first.keys() & second.keys()):
@@ -112,14 +112,14 @@ def contrast(
 
 
 def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
-    """The contrasts of one table with their verdicts; those without a pair are left out."""
+    """Return the contrasts of one table with verdicts, without the contrasts that have no pair."""
     family = [each for each in contrasts if each.estimate is not None]
     found = verdicts([each.estimate for each in family if each.estimate is not None])
     return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, found, strict=True))
 
 
 def couples(ranking: Sequence[str], baseline: str | None) -> list[tuple[str, str]]:
-    """Which arms are compared: each with the baseline, or each with all that rank below it."""
+    """Return the pairs of arms to compare: all with the baseline, or each with all ranked below."""
     if baseline is not None:
         return [(name, baseline) for name in ranking if name != baseline]
     return [(a, b) for index, a in enumerate(ranking) for b in ranking[index + 1 :]]

@@ -1,4 +1,4 @@
-"""Final quality over the length of runs: what a longer run is worth."""
+"""Final quality over the length of runs, and the gain of longer runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class Point:
     Attributes:
         arm: The arm.
         scene: The scene.
-        length: Their budget as text.
-        spent: Cost -> what they spent in the mean.
-        mean: The figure at their ends in the mean.
-        spread: Its standard deviation over seeds; NaN for one.
+        length: Budget of the runs as text.
+        spent: Cost -> mean amount that the runs spent.
+        mean: Mean of the final figure.
+        spread: Standard deviation of the final figure over seeds; NaN for one run.
         seeds: Number of runs.
     """
 
@@ -36,7 +36,7 @@ class Point:
 
 
 def points(cells: Cells, quantity: Quantity, costs: Sequence[Cost]) -> tuple[Point, ...]:
-    """All points, from short to long."""
+    """Return all points, ordered from short to long runs."""
     found = []
     for length in cells.lengths:
         runs = cells.at(length)
@@ -57,7 +57,7 @@ def points(cells: Cells, quantity: Quantity, costs: Sequence[Cost]) -> tuple[Poi
 
 
 def gains(cells: Cells, quantity: Quantity) -> tuple[Contrast, ...]:
-    """Within each arm, runs of a length against those of the next shorter one."""
+    """Compare, within each arm, runs of one length with runs of the next shorter length."""
     found = []
     for arm in cells.runs:
         own = [length for length in cells.lengths if cells.at(length)[arm]]

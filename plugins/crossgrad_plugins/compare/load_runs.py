@@ -1,4 +1,4 @@
-"""From folders to runs: what is broken, unfinished or of another kind is sorted out."""
+"""Reading runs from folders; broken and unfinished runs are left out or refused."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,11 +22,11 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunResults
 
-#: The table of a sweep, beside the folder of its runs.
+#: The table of a sweep, next to the folder of its runs.
 _PLAN: Final = "runs.csv"
 _ID, _LABEL = "run", "configuration"
 _LENGTHS: Final = ("steps=", "max_views=", "seconds=")
-#: What a grid without arms calls its only one.
+#: Label of the only arm of a grid without arms.
 _ONLY: Final = "run"
 _REPEAT: Final = "restore the file, or repeat the run: crossgrad run --config config.yaml"
 _OVERSIZED: Final = "a whole number that is too large"
@@ -39,7 +39,7 @@ class _Seconds(BaseModel):
 
 
 class _Summary(BaseModel):
-    """The part of summary.json that a comparison takes for granted."""
+    """The part of summary.json that a comparison requires."""
 
     status: str
     scene: str
@@ -54,11 +54,11 @@ class _Summary(BaseModel):
 
 @dataclass
 class RunRecord:
-    """The runs in the folders.
+    """The runs that were found in folders.
 
     Attributes:
-        runs: The runs that finished.
-        failed: The runs that failed: they never reach a quality.
+        runs: The finished runs.
+        failed: The failed runs, which never reach a quality.
         left_out: Folder -> why it is not compared.
     """
 
@@ -68,11 +68,11 @@ class RunRecord:
 
 
 def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
-    """Reads every run at or below the places, each folder once.
+    """Read every run in or below the given folders, each run once.
 
     Args:
         places: Folders of runs, or folders with runs below.
-        skip_broken: Leave out a run with a damaged file, instead of refusing to go on.
+        skip_broken: Leave out a run with a damaged file instead of raising an error.
 
     Raises:
         UserError: A place holds no run, or a file of a run is damaged.
@@ -103,10 +103,10 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
 
 
 def check_places(places: Sequence[Path]) -> None:
-    """Refuses what is no folder, before anything is said of where results go.
+    """Refuse places that are not folders, before the output folder is checked.
 
     Raises:
-        UserError: One is a file, or is not there.
+        UserError: A place is a file, or does not exist.
     """
     for place in places:
         if not place.is_dir():
@@ -132,7 +132,7 @@ def _no_run(place: Path) -> UserError:
 
 
 def _headless(place: Path) -> Iterator[Path]:
-    """Folders with results of a run at or below a place whose config.yaml is gone."""
+    """Yield folders in or below a place that hold results of a run but not its config.yaml."""
     for path in sorted(place.rglob("summary.json")):
         folder = path.parent
         if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
@@ -168,13 +168,13 @@ def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | No
 
 
 def _check_whole(results: "RunResults") -> None:
-    """Refuses a finished run of which a file is cut off or gone: readings would be of elsewhere.
+    """Refuse a finished run with a truncated or missing file, because its figures would be wrong.
 
     Raises:
         UserError: metrics.csv ends before the run did or has a number that is too large, held-out
-            views have no figures, or the marks of the scene cannot be read.
+            views have no figures, or scene.json cannot be read.
     """
-    views = (results.scene_marks or {}).get("views") or {}  # Refuses what is no scene.json.
+    views = (results.scene_marks or {}).get("views") or {}  # Raises if scene.json is malformed.
     if not all(isinstance(view, Mapping) for view in views.values()):
         raise UserError(
             "unreadable scene.json",
@@ -226,7 +226,7 @@ def _check_summary(results: "RunResults") -> None:
 
 
 def _oversized(content: object) -> bool:
-    """Whether a whole number in lists and objects is beyond those that can be reckoned with."""
+    """Return True if lists and objects contain a whole number that no float can represent."""
     rest = [content]
     while rest:
         each = rest.pop()
@@ -259,9 +259,9 @@ def _config(results: "RunResults") -> dict[str, object]:
 
 
 def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
-    """Name of a run's folder -> what its sweep calls it; none where no sweep wrote the folder.
+    """Return name of a run's folder -> its labels in its sweep; empty without a sweep.
 
-    A run that two configurations come to stands for both.
+    A run that belongs to two configurations has both labels.
     """
     plan = folder.parent / _PLAN
     if not plan.is_file():
@@ -282,13 +282,13 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
 
 
 def without_length(label: str) -> str:
-    """A label without what makes no arm: the length, and the name of the only arm of a grid."""
+    """Remove the length, and the name of the only arm of a grid, from a label."""
     parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
     named = parts[1:] if parts[:1] == [_ONLY] else parts
     return ", ".join(named or parts)
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
-    """Return the paths below the last folder that they share."""
+    """Return each folder's path relative to the last folder that all of them share."""
     shared = os.path.commonpath([folder.parent for folder in folders])
     return {folder: folder.relative_to(shared).as_posix() for folder in folders}

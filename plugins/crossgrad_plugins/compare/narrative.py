@@ -1,4 +1,4 @@
-"""The results in plain words: the winner, by how much, how sure, at what cost."""
+"""The results as sentences: the best arm, the difference, its certainty and its cost."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from crossgrad_plugins.compare.quantity import COSTS
 from crossgrad_plugins.compare.statistics import Verdict
 
 _TITLES = {cost.name: cost.title for cost in COSTS}
-#: Of many arms, so many are named in one sentence.
+#: Maximum number of arms that one sentence names.
 _MOST_NAMED = 6
 _ONE_PAIR = "one pair says nothing about noise: run more seeds"
 _NONE_BEATEN = "but it is surely better than no other arm"
@@ -19,14 +19,14 @@ _NONE_BEATEN = "but it is surely better than no other arm"
 
 @dataclass(frozen=True)
 class Sentence:
-    """A statement and what supports it."""
+    """A statement and its evidence."""
 
     claim: str
     support: str
 
 
 def headline(comparison: Comparison) -> tuple[Sentence, ...]:
-    """Return the first things to know."""
+    """Return the main statements of a comparison."""
     if not comparison.ends:
         return (_alone(comparison),)
     if len(comparison.ends) == 1:
@@ -63,7 +63,7 @@ def _except(contrast: Contrast) -> str:
 
 
 def opposed_text(contrast: Contrast) -> str:
-    """Return the scenes that surely contradict the verdict, with their differences."""
+    """Return the scenes whose own intervals contradict the verdict, with their differences."""
     shown = [
         f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
     ]
@@ -71,20 +71,20 @@ def opposed_text(contrast: Contrast) -> str:
 
 
 def where_text(contrast: Contrast) -> str:
-    """Return where a contrast was taken; a star marks runs that were read before their ends."""
+    """Return the place of a contrast; a star marks runs that were read before their ends."""
     title = _TITLES.get(contrast.where)
     text = contrast.where if title is None else f"equal {title}"
     return f"{text} *" if contrast.inside else text
 
 
 def verdict_text(contrast: Contrast) -> str:
-    """Return the verdict, and the scenes that surely contradict it."""
+    """Return the verdict, and the scenes whose own intervals contradict it."""
     found = opposed_text(contrast)
     return f"{contrast.verdict}, {found}" if found else str(contrast.verdict)
 
 
 def support(contrast: Contrast) -> str:
-    """Return how sure the statement is."""
+    """Return the evidence for the statement: interval, pairs, scenes."""
     found = contrast.estimate
     if found is None:
         return ""
@@ -124,7 +124,7 @@ def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
 
 
 def noise_sentence(comparison: Comparison) -> str:
-    """Return the floor of noise by scene."""
+    """Return the noise floor of each scene."""
     quantity = comparison.quantity
     lacking = [scene for scene in comparison.scenes if scene not in comparison.noise]
     known = [
@@ -152,7 +152,7 @@ def _alone(comparison: Comparison) -> Sentence:
 
 
 def _unpaired(comparison: Comparison) -> Sentence:
-    """Return why several arms have no pair."""
+    """Return the reason why several arms have no pair."""
     failed = [arm.name for arm in comparison.arms if arm.failed and not arm.runs]
     if failed:
         return Sentence(
@@ -172,9 +172,9 @@ def _unpaired(comparison: Comparison) -> Sentence:
 
 
 def _of_the_best(comparison: Comparison) -> list[Sentence]:
-    """Return how the leading arm compares with the others.
+    """Compare the arm with the best mean with the other arms.
 
-    It leads by its mean over runs, from which the estimate of pairs can differ.
+    This arm leads by its mean over runs; the estimate from pairs can differ from this mean.
     """
     leader = comparison.ranking[0]
     own = [each for each in comparison.ends if leader in {each.first, each.second}]
@@ -216,7 +216,7 @@ def _named(texts: Iterable[str], separator: str = ", ") -> str:
 
 
 def _why(contrasts: Sequence[Contrast]) -> str:
-    """Return why arms are equivalent, or what the arm that is hardest to tell apart needs."""
+    """Return why arms are equivalent, or the pairs needed for the arm hardest to distinguish."""
     if contrasts[0].verdict is Verdict.EQUIVALENT:
         return f"within {_margin(contrasts[0])}"
     return needed_text(max(contrasts, key=lambda c: (c.estimate and c.estimate.needed) or inf))
@@ -239,7 +239,7 @@ def _lengths(comparison: Comparison) -> list[Sentence]:
 
 
 def _equal_costs(comparison: Comparison) -> list[Sentence]:
-    """Return what holds at equal costs for the two arms of the first sentence."""
+    """Return the claims at equal costs for the two arms of the first sentence."""
     if not comparison.ends:
         return []
     couple = comparison.ends[0].first, comparison.ends[0].second

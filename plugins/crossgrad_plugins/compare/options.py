@@ -48,7 +48,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Options):
-    """All options of the command: how, of which runs, and where the results go."""
+    """All options of the command: the comparison, its runs, and the output folder."""
 
     runs: list[Path] = argument(
         "RUN...|FOLDER", "Folders of runs, or folders with runs below, such as that of a sweep."

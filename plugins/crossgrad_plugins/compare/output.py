@@ -1,4 +1,4 @@
-"""The folder of a comparison: only its own files are ever replaced."""
+"""The output folder of a comparison; only files of a comparison are ever replaced."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,25 +13,25 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 
-#: The page; a folder that has it and the mark in it is a comparison.
+#: The page. A folder is a comparison if it contains a page with the mark.
 PAGE: Final = "index.html"
-#: Stands in the head of each page that compare wrote.
+#: Part of the head of each page that compare wrote.
 MARK: Final = '<meta name="generator" content="crossgrad compare">'
 FIGURES: Final = "figures"
 _BEGINNING: Final = 2000
 
 
 def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
-    """Refuses a folder with anything in it that is not an earlier comparison.
+    """Refuse a folder that contains anything except an earlier comparison.
 
-    One that was broken off has no page yet, and nothing but files of a comparison.
+    An interrupted comparison has no page yet, and contains only files of a comparison.
 
     Args:
         folder: The folder.
         owned: All files that a comparison may have besides its page, as paths below the folder.
 
     Raises:
-        UserError: What is in the way, and what to do.
+        UserError: The folder contains other files; the message names them and the remedy.
     """
     check_folder(folder)
     if not folder.is_dir() or is_comparison(folder):
@@ -55,7 +55,7 @@ def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
 
 
 def is_comparison(folder: Path) -> bool:
-    """Whether compare wrote this folder."""
+    """Return True if compare wrote this folder."""
     page = folder / PAGE
     if not page.is_file():
         return False
@@ -64,12 +64,12 @@ def is_comparison(folder: Path) -> bool:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes], owned: Iterable[str]) -> None:
-    """Writes the files, the page last, and removes those that an earlier comparison left.
+    """Write the files, the page last, and remove outdated files of an earlier comparison.
 
     Args:
-        folder: The folder, free or a comparison.
+        folder: The folder: free, or an earlier comparison.
         files: Path below the folder -> content.
-        owned: All files that a comparison may have, likewise.
+        owned: All files that a comparison may have besides its page, as paths below the folder.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.

@@ -15,7 +15,7 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Views of all scenes and of one, arms beside each other, bytes: the page stays small.
+#: Limits that keep the page small: views of all scenes, views of one scene, arms per view, bytes.
 MOST_VIEWS, MOST_OF_A_SCENE, MOST_ARMS = 8, 3, 6
 MOST_BYTES: Final = 1_400_000
 _WIDTHS: Final = (320, 260, 200, 150)
@@ -27,10 +27,10 @@ class Picture:
     """A picture of the page.
 
     Attributes:
-        arm: The arm that drew it; `photo` for the photo.
+        arm: The arm that rendered the picture; `photo` for the photo.
         figure: The main figure of the view as text; empty for the photo.
-        render: Its data, for the `src` of an image.
-        error: That of its error; empty for the photo.
+        render: The picture as data for the `src` of an image.
+        error: The error picture, in the same form; empty for the photo.
     """
 
     arm: str
@@ -44,12 +44,12 @@ class WorstView:
     """A held-out view.
 
     Attributes:
-        scene: Its scene.
-        name: Its name.
-        regime: Its regime.
-        mean: The main figure in the mean over arms and seeds.
-        by_arm: Arm -> the figure in the mean over seeds.
-        pictures: The photo and what the arms drew, with one seed; none where the view has none.
+        scene: Name of its scene.
+        name: Name of the view.
+        regime: Regime of the view.
+        mean: The main figure, averaged over arms and seeds.
+        by_arm: Arm -> the main figure, averaged over seeds.
+        pictures: The photo and the renders of the arms with one seed; empty without pictures.
     """
 
     scene: str
@@ -61,7 +61,7 @@ class WorstView:
 
 
 def worst_views(comparison: Comparison) -> dict[str, list[WorstView]]:
-    """Scene -> its held-out views, the worst first, without pictures."""
+    """Return scene -> its held-out views, the worst first, without pictures."""
     found: dict[str, list[WorstView]] = {}
     for scene in comparison.scenes:
         values: dict[tuple[str, str], dict[str, list[float]]] = {}
@@ -86,9 +86,10 @@ def _view(scene: str, name: str, regime: str, values: Mapping[str, Sequence[floa
 def with_pictures(
     comparison: Comparison, views: Mapping[str, Sequence[WorstView]]
 ) -> tuple[list[WorstView], list[str]]:
-    """The worst views of each scene of which runs keep pictures, and notes on unreadable ones.
+    """Return the worst views of each scene with pictures, and notes on unreadable pictures.
 
-    Pictures become smaller until all fit into the page.
+    A view is included only if all shown runs kept its pictures. Pictures are made smaller until all
+    of them fit into the page.
     """
     shown: list[tuple[WorstView, list[tuple[str, Run]]]] = []
     share = min(MOST_OF_A_SCENE, max(1, MOST_VIEWS // max(1, len(views))))
@@ -107,7 +108,7 @@ def with_pictures(
 
 
 def _runs_of(comparison: Comparison, scene: str) -> list[tuple[str, Run]]:
-    """The best arms on a scene, each with its run of the lowest seed that they share."""
+    """Return the best arms on a scene, each with its run of the lowest seed that all share."""
     arms = [
         arm for arm in comparison.ranking if any(at == scene for at, _ in comparison.main[arm])
     ][:MOST_ARMS]
@@ -150,7 +151,7 @@ def _pictured(
 
 
 def _data(image: "Image", width: int) -> str:
-    """A JPEG picture of at most that width as the source of an image element."""
+    """Return an image, at most `width` pixels wide, as JPEG data for an image element."""
     from PIL.Image import Resampling
 
     height = max(1, round(image.height * min(1.0, width / image.width)))

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-#: Amounts of seconds from here on are shown without decimals.
+#: From this many seconds on, amounts are shown without decimals.
 _WHOLE: Final = 10.0
 
 
 class _Kind(NamedTuple):
-    """A kind of figure, known by how its name begins; the margin counts as no difference."""
+    """A kind of figure, recognised by the start of its name; `margin` counts as no difference."""
 
     unit: str
     decimals: int
@@ -29,12 +29,12 @@ class Quantity:
     """A figure of held-out views.
 
     Attributes:
-        name: Its name in the results, such as `psnr`.
-        label: What people call it.
-        unit: Its unit; empty where it has none.
-        decimals: How many are shown.
-        margin: What counts as no difference.
-        falls: Whether less is better.
+        name: Name in the results, such as `psnr`.
+        label: Name in texts and figures.
+        unit: Unit of the figure; empty if it has no unit.
+        decimals: Number of decimals shown.
+        margin: Largest difference that counts as no difference.
+        falls: True if lower values are better.
     """
 
     name: str
@@ -46,12 +46,12 @@ class Quantity:
 
     @classmethod
     def of(cls, name: str, margin: float | None = None, *, falls: bool = False) -> "Quantity":
-        """The figure of that name, with its usual margin unless another one is given.
+        """Return the figure with the given name, with its default margin unless another is given.
 
         Args:
-            name: Its name.
-            margin: What counts as no difference.
-            falls: Whether less of it is better; of LPIPS it always is.
+            name: Name of the figure.
+            margin: Largest difference that counts as no difference; None for the default.
+            falls: True if lower values are better; always true for LPIPS.
         """
         start = next((start for start in _KINDS if name.startswith(start)), "")
         kind = _KINDS.get(start, _OTHER)
@@ -61,24 +61,24 @@ class Quantity:
 
     @property
     def with_unit(self) -> str:
-        """Its label for an axis or a table."""
+        """Label with unit, for an axis or a table."""
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
     def better(self, first: float, second: float) -> bool:
-        """Whether the first of two values is the better one."""
+        """Return True if the first of two values is better."""
         return first < second if self.falls else first > second
 
     def shown(self, value: float) -> str:
-        """A value without its unit."""
+        """Format a value without its unit."""
         return f"{value:.{self.decimals}f}"
 
     def difference(self, value: float) -> str:
-        """A difference with its sign and unit."""
+        """Format a difference with its sign and unit."""
         return f"{value:+.{self.decimals}f} {self.unit}".rstrip()
 
 
 class ClockChoice(StrEnum):
-    """Which seconds are compared."""
+    """The choice of the seconds to compare."""
 
     AUTO = "auto"
     WALL = "wall"
@@ -88,14 +88,14 @@ class ClockChoice(StrEnum):
 
 @dataclass(frozen=True)
 class Cost:
-    """One thing that runs spend.
+    """A resource that runs spend.
 
     Attributes:
-        name: Its name in tables and file names.
-        column: Its column in metrics.csv.
-        axis: What the axis of a figure is called.
-        unit: Its unit, such as `s`.
-        title: How it stands in a sentence: "at equal TITLE".
+        name: Name in tables and file names.
+        column: Column of metrics.csv.
+        axis: Label of the axis of a figure.
+        unit: Unit, such as `s`.
+        title: Name inside a sentence: "at equal TITLE".
     """
 
     name: str
@@ -105,7 +105,7 @@ class Cost:
     title: str
 
     def shown(self, amount: float) -> str:
-        """An amount with its unit."""
+        """Format an amount with its unit."""
         number = f"{amount:,.0f}" if amount >= _WHOLE or self.unit != "s" else f"{amount:.3g}"
         return f"{number} {self.unit}"
 

@@ -1,4 +1,4 @@
-"""Arms from the best to the worst, and how much a seed changes."""
+"""The ranking of arms, and the noise over seeds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ class Standing:
 
     Attributes:
         seeds: Number of runs that have the figure.
-        mean: Its mean.
-        spread: Its standard deviation over seeds; NaN for one.
+        mean: Mean of the figure.
+        spread: Standard deviation over seeds; NaN for one run.
     """
 
     seeds: int
@@ -28,7 +28,7 @@ class Standing:
 def standings(
     runs: Mapping[str, Runs], quantity: Quantity, regime: str | None = None
 ) -> dict[str, dict[str, Standing]]:
-    """Arm -> scene -> its figure; without scenes on which no run has it."""
+    """Return arm -> scene -> its figure; a scene is absent if no run has the figure there."""
     found: dict[str, dict[str, Standing]] = {}
     for arm, by in runs.items():
         own: dict[str, list[float]] = {}
@@ -46,9 +46,10 @@ def _standing(values: Sequence[float]) -> Standing:
 
 
 def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
-    """Arm -> how far it is above the mean of all arms, in the mean over its scenes.
+    """Return arm -> its mean difference from the mean of all arms, averaged over its scenes.
 
-    So an arm that was not run on a hard scene gains nothing by that. NaN without a figure.
+    The difference is taken per scene, so an arm gains nothing by skipping a hard scene. NaN
+    without a figure.
     """
     scenes = dict.fromkeys(scene for by in standing.values() for scene in by)
     level = {
@@ -62,7 +63,7 @@ def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
 
 
 def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -> tuple[str, ...]:
-    """The arms from the best to the worst; arms without a figure at the end."""
+    """Return the arms from the best to the worst; arms without a figure come last."""
     score = scores(standing)
     sign = 1.0 if quantity.falls else -1.0
     return tuple(sorted(score, key=lambda arm: (np.isnan(score[arm]), sign * score[arm])))
@@ -71,13 +72,13 @@ def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -
 def noise(
     standing: Mapping[str, Mapping[str, Standing]], runs: Mapping[str, Runs]
 ) -> dict[str, tuple[float, int]]:
-    """Scene -> standard deviation of a run over its seeds, pooled over arms, and its freedom.
+    """Return scene -> standard deviation over seeds, pooled over arms, and its degrees of freedom.
 
-    Scenes with one seed per arm are left out: there is no telling. Runs that stand for two arms
-    count once.
+    Scenes with one seed per arm are left out, because their noise is unknown. Runs that represent
+    two arms count once.
 
     Args:
-        standing: What `standings` finds.
+        standing: Result of `standings`.
         runs: The runs of each arm.
     """
     sums: dict[str, tuple[float, int]] = {}

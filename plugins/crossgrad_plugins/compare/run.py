@@ -1,4 +1,4 @@
-"""A finished run as the comparison sees it, and its settings that tell arms apart."""
+"""A run that has ended, and the settings that separate arms."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Array: TypeAlias = NDArray[np.float64]
 Settings: TypeAlias = dict[str, str]
 #: The value of a setting that is not set.
 ABSENT: Final = "-"
-#: Where a run lies, how long it is, and what only watches it.
+#: Settings that do not separate arms: location, length, and components that only observe.
 _NO_ARM: Final = frozenset(
     {
         *("crossgrad", "scene", "seed", "out"),
@@ -38,10 +38,10 @@ class Run:
 
     Attributes:
         name: Its folder as it is shown.
-        results: What it wrote.
-        summary: Its summary.json.
-        config: Its configuration as this version has it.
-        label: What its sweep calls its configuration; None where there is no sweep.
+        results: Its results.
+        summary: Content of its summary.json.
+        config: Its configuration in the format of this version.
+        label: Label of its configuration in a sweep; None without a sweep.
     """
 
     name: str
@@ -62,22 +62,22 @@ class Run:
 
     @property
     def status(self) -> str:
-        """How it ended: finished, stopped or failed."""
+        """Its status: finished, stopped or failed."""
         return str(self.summary.get("status"))
 
     @property
     def environment(self) -> Mapping[str, Any]:
-        """Its machine and code, as summary.json has them."""
+        """Its machine and code, from summary.json."""
         return self.summary.get("environment") or {}
 
     @cached_property
     def settings(self) -> Settings:
-        """Its configuration, flat, without what tells no arms apart."""
+        """Its configuration as flat settings, without settings that do not separate arms."""
         return settings_of(self.config)
 
     @cached_property
     def length(self) -> tuple[str, float]:
-        """The unit and the amount of the budget that it was given."""
+        """The unit and the amount of its budget."""
         if seconds := self.config.get("planned_seconds"):
             return ("s CPU" if self.config.get("clock") == "cpu" else "s"), float(seconds)
         views = self.config.get("max_views")
@@ -91,24 +91,24 @@ class Run:
         return text_of(self.length)
 
     def final(self, name: str, regime: str | None = None) -> float | None:
-        """A figure at its end, overall or of a regime; None where there is none or it is NaN."""
+        """Return the final figure, overall or of a regime; None if it is missing or not finite."""
         value = self.results.figure(name, regime)
         return value if value is not None and isfinite(value) else None
 
     def series(self, name: str, cost: Cost, regime: str | None = None) -> tuple[Array, Array]:
-        """What had been spent at each evaluation [n], rising, and the figure there [n]."""
+        """Return the cost at each evaluation [n], ascending, and the figure at each of them [n]."""
         points = self.results.curve(name, regime, over=cost.column)
         known = {x: y for x, y in points if isfinite(x) and isfinite(y)}
         x = np.array(sorted(known), dtype=np.float64)
         return x, np.array([known[each] for each in sorted(known)], dtype=np.float64)
 
     def spent(self, cost: Cost) -> float | None:
-        """What it spent in all; None where it was not recorded."""
+        """Return the total cost; None if it was not recorded."""
         value = self.summary.get(cost.column)
         return float(value) if isinstance(value, int | float) and isfinite(value) else None
 
     def number(self, *names: str) -> float | None:
-        """A number of summary.json by the names of the objects around it; None without one."""
+        """Return a number of summary.json by its path of keys; None if there is no such number."""
         value: Any = self.summary
         for name in names:
             value = value.get(name) if isinstance(value, Mapping) else None
@@ -117,16 +117,16 @@ class Run:
 
 
 def text_of(length: tuple[str, float]) -> str:
-    """A length as text, such as `70 s`."""
+    """Format a length, such as `70 s`."""
     return f"{length[1]:,g} {length[0]}"
 
 
 def settings_of(config: Mapping[str, Any]) -> Settings:
-    """Setting -> value, of those that can make an arm.
+    """Return setting -> value, for the settings that can separate arms.
 
-    A setting that is null is not set: its value is `-`. A component is `backbone` and its options
-    `backbone.sh_degree`; a chain of operators is `operator` with the names joined by `+`, and its
-    options `operator.1.c`.
+    A setting that is null is not set, and its value is `-`. A component becomes `backbone`, and its
+    options become `backbone.sh_degree`. A chain of operators becomes `operator` with the names
+    joined by `+`, and its options become `operator.1.c`.
     """
     return {
         name: _text(value)

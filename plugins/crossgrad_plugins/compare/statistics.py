@@ -1,4 +1,4 @@
-"""How sure a difference between arms is: estimates, intervals, p-values, verdicts."""
+"""The uncertainty of a difference between arms: estimates, intervals, p-values, verdicts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 DRAWS: Final = 2000
 _TWO: Final = 2
 _SEED: Final = 20_150_101
-#: From so many pairs on the interval comes from the bootstrap.
+#: From this number of pairs on, the interval comes from the bootstrap.
 BOOTSTRAP_FROM: Final = 10
-#: Levels of the interval that shows a difference and of the one that shows equivalence.
+#: Level of the interval for a difference, and level of the interval for equivalence.
 WIDE, NARROW = 0.95, 0.90
 MEAN, IQM = "mean, Student's t", "IQM, bootstrap"
 _UNKNOWN = (-inf, inf)
 Interval: TypeAlias = tuple[float, float]
-#: Nobody trains more pairs than this for one comparison.
+#: Upper limit of the number of pairs that is suggested for one comparison.
 MOST_PAIRS: Final = 1000
-#: Up to so many comparisons are judged one by one.
+#: Up to this number of comparisons, verdicts are not corrected for multiple tests.
 UNCORRECTED: Final = 5
 
 
 def iqm(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of the middle half along the last axis.
+    """Return the interquartile mean along the last axis.
 
-    A value on the border of the middle half counts with the share that is inside. Two values give
-    their mean; three give the middle value a weight of 2/3. (`scipy.stats.trim_mean` cuts whole
-    values.)
+    A value on the border of the middle half counts with the share that is inside. For two values
+    the result is their mean; for three, the middle value has a weight of 2/3.
+    (`scipy.stats.trim_mean` only removes whole values.)
 
     Args:
         values: [..., n] numbers, n >= 1.
@@ -64,7 +64,7 @@ class Bootstrap:
 
         Args:
             values: [n] differences, n >= 2.
-            scenes: The scene of each.
+            scenes: [n] scene of each difference.
         """
         rng = np.random.default_rng(_SEED)
         strata = _strata(scenes)
@@ -99,10 +99,10 @@ class Bootstrap:
         return self._tail(1.0 - _share(self.draws, border), border - float(np.median(self.draws)))
 
     def _tail(self, share: float, distance: float) -> float:
-        """Return the p-value of a share of the draws, given that the intervals are expanded.
+        """Return the p-value for a share of the draws, consistent with the expanded intervals.
 
-        If a border is beyond all draws, its distance from their median in standard deviations
-        counts, so that the number of draws limits no p-value.
+        If a border is beyond all draws, its distance from their median in standard deviations is
+        used instead. Otherwise the number of draws would limit the p-value.
         """
         from scipy.special import ndtri, stdtr
 
@@ -139,11 +139,11 @@ def _strata(scenes: Sequence[str]) -> list[NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The mean difference on one scene, from two pairs of it or more.
+    """The mean difference on one scene with at least two pairs.
 
     Attributes:
-        scene: Its name.
-        center: The mean.
+        scene: Name of the scene.
+        center: The mean difference.
         wide: The 95 % interval by Student's t.
     """
 
@@ -158,20 +158,20 @@ class Estimate:
 
     Attributes:
         pairs: Number of pairs.
-        scenes: Number of scenes that they come from.
-        margin: What counts as no difference in practice.
-        center: The estimate: the mean below 10 pairs, the interquartile mean from there on.
-        method: Which of the two, and where the interval comes from.
-        wide: The 95 % interval; it shows a difference where it excludes zero.
-        narrow: The 90 % interval; it shows equivalence where it lies within the margin.
+        scenes: Number of scenes of the pairs.
+        margin: Largest difference that counts as no difference in practice.
+        center: The estimate: the mean below 10 pairs, the interquartile mean from 10 pairs on.
+        method: The kind of mean, and the method of the interval.
+        wide: The 95 % interval; a difference is shown if the interval excludes zero.
+        narrow: The 90 % interval; equivalence is shown if the interval is within the margin.
         deviation: Standard deviation of the pairs' differences; NaN for a single pair.
         p_different: Two-sided p-value of no difference.
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
         p_above: p-value of a difference of at least the margin upwards (a one-sided test).
-        needed: Pairs after which the 90 % interval is as narrow as the margin, if it gets narrower
-            as usual; None where that cannot be told. More than there are where it is not so yet.
-        by_scene: The scenes by themselves; empty where all pairs are of one. The interquartile
-            mean leaves out a scene that is unlike the others.
+        needed: Number of pairs that would make the 90 % interval as narrow as the margin, if it
+            narrows as usual; None if this cannot be estimated.
+        by_scene: The estimate of each scene; empty if all pairs are from one scene. The
+            interquartile mean can hide a scene that differs from the rest.
     """
 
     pairs: int
@@ -190,17 +190,17 @@ class Estimate:
 
     @property
     def differs(self) -> bool:
-        """Whether the 95 % interval excludes zero."""
+        """True if the 95 % interval excludes zero."""
         return self.wide[0] > 0.0 or self.wide[1] < 0.0
 
     @property
     def is_small(self) -> bool:
-        """Whether the 90 % interval lies within the margin."""
+        """True if the 90 % interval is within the margin."""
         return -self.margin < self.narrow[0] and self.narrow[1] < self.margin
 
 
 class Law(Protocol):
-    """The law of an estimate: SciPy's Student's t, or a bootstrap."""
+    """The distribution of an estimate: SciPy's Student's t, or a bootstrap."""
 
     def interval(self, level: float) -> Interval:
         """Return the two-sided interval of a level such as 0.95."""
@@ -216,9 +216,9 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
     """Estimate a difference from pairs of runs.
 
     Args:
-        differences: One per pair, all finite; at least one.
+        differences: Difference of each pair, all finite; at least one.
         scenes: The scene of each pair.
-        margin: What counts as no difference in practice.
+        margin: Largest difference that counts as no difference in practice.
     """
     values = np.asarray(differences, dtype=np.float64)
     by_bootstrap = len(values) >= BOOTSTRAP_FROM
@@ -250,25 +250,25 @@ def estimate(differences: Sequence[float], scenes: Sequence[str], margin: float)
 
 
 def student(values: NDArray[np.float64]) -> Law:
-    """Return Student's law of the mean of two values or more."""
+    """Return Student's distribution of the mean of two or more values."""
     from scipy.stats import t
 
     error = float(values.std(ddof=1)) / sqrt(len(values))
     if error == 0.0:
-        return Bootstrap(values[:1], len(values) - 1)  # SciPy takes no scale of 0.
+        return Bootstrap(values[:1], len(values) - 1)  # SciPy does not accept a scale of 0.
     law: Law = t(len(values) - 1, loc=values.mean(), scale=error)
     return law
 
 
 def pairs_needed(deviation: float, margin: float) -> int | None:
-    """Return how many pairs make the 90 % interval of a mean at most as wide as the margins.
+    """Return the number of pairs that makes the 90 % interval of a mean fit into the margins.
 
     Args:
         deviation: Standard deviation of the pairs' differences.
         margin: The margin, above 0.
 
     Returns:
-        The number; None if it is above 1,000.
+        The number of pairs; None if it is above 1,000.
     """
     from scipy.special import stdtrit
 
@@ -278,7 +278,7 @@ def pairs_needed(deviation: float, margin: float) -> int | None:
 
 
 def _wider(narrow: Interval, pairs: int, margin: float) -> int | None:
-    """Return the same for an interquartile mean, from the interval that it has with these pairs."""
+    """Like `pairs_needed`, but for an interquartile mean, from its interval with these pairs."""
     needed = pairs * ((narrow[1] - narrow[0]) / (2.0 * margin)) ** 2
     return max(2, ceil(needed)) if needed <= MOST_PAIRS else None
 
@@ -306,11 +306,11 @@ class Verdict(StrEnum):
 
 
 def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
-    """The verdict on each of the comparisons that are shown together.
+    """Return the verdict on each comparison of a table.
 
-    Different where the 95 % interval excludes zero, else equivalent where the 90 % interval lies
-    within the margin. Of more than five comparisons it takes the p-values of either test, corrected
-    with Holm's method, too.
+    The verdict is `different` if the 95 % interval excludes zero, else `equivalent` if the 90 %
+    interval is within the margin. With more than five comparisons, the p-value of the test,
+    corrected with Holm's method, must also be below its level.
     """
     if len(family) <= UNCORRECTED:
         return [_verdict(each.differs, each.is_small) for each in family]
@@ -323,7 +323,7 @@ def verdicts(family: Sequence[Estimate]) -> list[Verdict]:
 
 
 def corrected(values: Sequence[float]) -> list[float]:
-    """The p-values of one test of comparisons that are shown together: Holm's above five."""
+    """Return the p-values of a table of comparisons, adjusted by Holm if there are more than 5."""
     return holm(values) if len(values) > UNCORRECTED else list(values)
 
 
@@ -341,9 +341,10 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
-    """The scenes that surely contradict a verdict on all of them, by their own 95 % intervals.
+    """Return the scenes whose own 95 % intervals contradict the verdict on all scenes.
 
-    Of a difference those that differ the other way, of equivalence those beyond the margin.
+    A scene contradicts a difference if it differs in the other direction, and equivalence if it is
+    beyond the margin.
     """
     if verdict is Verdict.INCONCLUSIVE:
         return ()

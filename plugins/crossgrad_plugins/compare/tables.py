@@ -1,4 +1,4 @@
-"""The tables of a comparison: rows of texts for page and terminal, rows of values for CSV files."""
+"""The tables of a comparison: text rows for page and terminal, value rows for CSV files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from crossgrad_plugins.compare.statistics import UNCORRECTED, Estimate, Verdict
 from crossgrad_plugins.compare.targets import Reached
 
 Row = dict[str, str | int | float]
-#: Files of all tables.
+#: File names of all tables.
 TABLES: Final = (
     *("runs.csv", "arms.csv", "comparisons.csv", "pairs.csv", "time_to_quality.csv"),
     *("curves.csv", "lengths.csv", "noise.csv", "phases.csv", "views.csv"),
@@ -34,9 +34,9 @@ class Column(NamedTuple):
     """A column of a table of the page and the terminal.
 
     Attributes:
-        title: Its heading.
-        kind: How the page sets it: `number`, `text`, `arm`, `verdict` or `note`.
-        in_terminal: Whether the terminal has room for it.
+        title: Heading of the column.
+        kind: Format on the page: `number`, `text`, `arm`, `verdict` or `note`.
+        in_terminal: True if the terminal shows the column.
     """
 
     title: str
@@ -49,10 +49,10 @@ class Table:
     """A table of the page and the terminal.
 
     Attributes:
-        columns: Its columns.
-        rows: A text for each column, in each row.
-        title: What it is called.
-        caption: What it shows.
+        columns: The columns.
+        rows: The rows, with a text for each column.
+        title: Title of the table.
+        caption: Description of the table.
     """
 
     columns: Sequence[Column]
@@ -92,7 +92,7 @@ def _standing(c: Comparison, arm: str, scene: str) -> str:
 
 
 def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
-    """Return the difference to the reference, from the arm's side, and the verdict."""
+    """Return the arm's difference from the reference, and the verdict."""
     for each in c.ends:
         if each.estimate is not None and {each.first, each.second} == {arm, reference}:
             sign = 1.0 if each.first == arm else -1.0
@@ -104,7 +104,7 @@ def _against(c: Comparison, arm: str, reference: str) -> tuple[str, str]:
 
 
 def cost_table(c: Comparison) -> Table:
-    """Return the mean costs of the arms, over the scenes and seeds that all arms have."""
+    """Return the mean costs of each arm over the scenes and seeds that all arms have."""
     problems = [by.keys() for by in c.main.values() if by]
     shared = set.intersection(*map(set, problems)) if problems else set()
     rows = []
@@ -135,7 +135,7 @@ def _mean(values: Sequence[float | None], cost: Cost | None = None) -> str:
 
 
 def contrast_tables(c: Comparison) -> tuple[Table, ...]:
-    """Return the tables of contrasts that have rows."""
+    """Return the tables of contrasts that are not empty."""
     tables = (
         contrast_table(c.ends, "At the ends of the runs", "The primary comparison."),
         contrast_table(
@@ -180,9 +180,9 @@ def contrast_table(
 
     Args:
         contrasts: The contrasts.
-        title: What the table is called.
-        caption: What it shows.
-        first: Heading -> text, of columns before all others.
+        title: Title of the table.
+        caption: Description of the table.
+        first: Heading -> text function, for columns before all other columns.
     """
     if len(contrasts) > UNCORRECTED:
         caption += (
@@ -222,7 +222,7 @@ def _contrast_texts(contrast: Contrast, estimate: Estimate) -> list[str]:
 
 
 def reached_table(c: Comparison) -> Table:
-    """Return how soon a quality is reached: a row for each scene and arm, a cell for each cost."""
+    """Return the cost to reach a quality: a row for each scene and arm, a cell for each cost."""
     groups: dict[tuple[str, str], list[Reached]] = {}
     for each in c.reached:
         groups.setdefault((each.scene, each.arm), []).append(each)
@@ -257,7 +257,7 @@ def settings_table(c: Comparison) -> Table:
 
 
 def runs_table(c: Comparison) -> Table:
-    """Return the runs that stand for an arm, a scene and a seed."""
+    """Return the runs that represent an arm, a scene and a seed."""
 
     def text(value: float | None, shown: Callable[[float], str]) -> str:
         return _NONE if value is None else shown(value)
@@ -279,7 +279,7 @@ def runs_table(c: Comparison) -> Table:
 
 
 def views_table(c: Comparison, scene: str, views: Sequence[WorstView]) -> Table:
-    """Return held-out views of a scene."""
+    """Return the given held-out views of a scene as a table."""
     return Table(
         [Column("view", "text"), Column("regime", "text"), *map(Column, c.ranking)],
         [

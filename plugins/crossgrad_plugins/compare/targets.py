@@ -1,4 +1,4 @@
-"""How soon a quality is reached, and the performance profile (Dolan and More 2002)."""
+"""The cost to reach a quality, and the performance profile (Dolan and More 2002)."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from crossgrad_plugins.compare.run import Run
 
 #: The profile is drawn up to this ratio.
 LARGEST_RATIO = 4.0
-#: A run may end so much earlier, relatively, and its last value still counts as the one there:
-#: the length of a run that follows the clock is a whole number of steps.
+#: A run may end earlier by this relative amount, and its last value is still used. The length of
+#: a run with a time limit is a whole number of steps.
 _SAME_END = 0.03
 
 
 @dataclass(frozen=True)
 class Reached:
-    """How soon an arm reaches the quality of a scene.
+    """The cost at which an arm reaches the quality of a scene.
 
     Attributes:
-        cost: What is counted.
+        cost: The cost that is counted.
         scene: The scene.
         target: The quality.
         arm: The arm.
-        amounts: Seed -> what was spent until then; infinite where it never was, or the run failed.
+        amounts: Seed -> amount spent until then; infinite if the run failed or never got there.
     """
 
     cost: Cost
@@ -39,12 +39,12 @@ class Reached:
 
     @property
     def reached(self) -> int:
-        """Number of runs that got there."""
+        """Number of runs that reached the quality."""
         return sum(isfinite(amount) for amount in self.amounts.values())
 
     @property
     def median(self) -> float:
-        """The median over all runs, infinite where half of them never got there."""
+        """The median over all runs; infinite if half of them never reached the quality."""
         ordered = sorted(self.amounts.values())
         low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
         return inf if high == inf else (low + high) / 2.0
@@ -53,10 +53,10 @@ class Reached:
 def targets_of(
     runs: Mapping[str, Runs], quantity: Quantity, given: float | None
 ) -> dict[str, float]:
-    """Scene -> the quality to reach: a given one, or where the weakest arm ends in its median.
+    """Return scene -> the quality to reach: the given one, or the median end of the weakest arm.
 
-    Of the two runs in the middle the worse one counts: where it ends, half of the runs and one
-    more have been, so that the median of what they spent is finite.
+    With an even number of runs, the worse of the two middle runs counts. More than half of the runs
+    reach its final quality, so the median of their costs is finite.
     """
     finals: dict[str, dict[str, list[float]]] = {}
     for arm, by in runs.items():
@@ -81,7 +81,7 @@ def reached(
     cost: Cost,
     targets: Mapping[str, float],
 ) -> tuple[Reached, ...]:
-    """How soon each arm reaches the quality of each scene; a failed run never does."""
+    """Return the cost at which each arm reaches each scene's quality; infinite for a failed run."""
     failed = {arm.name: {(run.scene, run.seed) for run in arm.failed} for arm in arms}
     rows = []
     for scene, target in targets.items():
@@ -98,10 +98,11 @@ def reached(
 
 
 def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
-    """Arm -> what it spent on each problem, over the least that any arm spent.
+    """Return arm -> its cost on each problem, divided by the smallest cost of all arms.
 
-    A problem is a scene with a seed that every arm was run on. A run that never gets there has an
-    infinite ratio and stays in the denominator; so do all runs of a problem that no arm solves.
+    A problem is a scene with a seed that every arm was run on. A run that never reaches the quality
+    has an infinite ratio and stays in the denominator. The same applies to all runs of a problem
+    that no arm solves.
     """
     amounts: dict[str, dict[Problem, float]] = {}
     for row in rows:
@@ -116,14 +117,14 @@ def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
 
 
 def _ratio(amount: float, least: float) -> float:
-    """An amount over the least one; 1 where both are nothing, as of a run that began there."""
+    """Return an amount divided by the least amount; 1 if both are equal, even if both are 0."""
     if isfinite(amount) and amount == least:
         return 1.0
     return amount / least if isfinite(amount) and least else inf
 
 
 def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float | None:
-    """The figure when so much was spent, between two evaluations by interpolation.
+    """Return the figure at a cost, interpolated between two evaluations.
 
     Returns:
         The value; None before the first evaluation, and after the end.
@@ -135,20 +136,20 @@ def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float |
 
 
 def shared_amount(runs: Iterable[Run], quantity: Quantity, cost: Cost) -> float | None:
-    """What the run that spent least had spent at its last evaluation; None where one has none."""
+    """Return the smallest final cost of all runs; None if a run was never evaluated."""
     ends = [x[-1] if len(x := run.series(quantity.name, cost)[0]) else None for run in runs]
     known = [float(end) for end in ends if end is not None]
     return min(known) if known and len(known) == len(ends) else None
 
 
 def is_inside(run: Run, quantity: Quantity, cost: Cost, amount: float) -> bool:
-    """Whether the run went on well after that, so that its schedule was not at its end."""
+    """Return True if the run continued well beyond the amount, before the end of its schedule."""
     x, _ = run.series(quantity.name, cost)
     return bool(len(x)) and amount < (1.0 - _SAME_END) * x[-1]
 
 
 def cost_to(run: Run, quantity: Quantity, cost: Cost, target: float) -> float:
-    """What had been spent when a figure was first reached; infinite where it never was."""
+    """Return the cost at which a figure first reached the target; infinite if it never did."""
     x, y = run.series(quantity.name, cost)
     reached = y <= target if quantity.falls else y >= target
     if not reached.any():

@@ -1,1 +1,1 @@
-"""Statistics of per-view gradients at frozen parameters, all from Gramians; and their report."""
+"""Statistics of per-view gradients at frozen parameters, from Gramians, and their report."""

@@ -54,7 +54,7 @@ class Options:
     """How a scene is diagnosed.
 
     Attributes:
-        grouping: The grouping; by default that of the run, or else the paper's.
+        grouping: The grouping; None for the run's grouping, or else the paper's.
         per_group: Probed views per group.
         probes: Probes during the vanilla run, evenly spaced; the last one at its end.
         seconds: Training seconds of the vanilla run.
@@ -78,22 +78,22 @@ def diagnose(
     out: Path | None,
     accept_scene: bool = False,
 ) -> int:
-    """Diagnoses a scene or a run; prints the report and writes it to a folder.
+    """Diagnose a scene or a run, print the report, and write it to a folder.
 
     Args:
-        scene: Scene folder; the bundled one where neither a scene nor a run is given.
+        scene: Scene folder; the bundled scene if neither a scene nor a run is given.
         run: Folder of a run to probe, or None.
-        settings: Settings of the vanilla run in the shape of `RunConfig` (reading, device ...); of
-            a run only `device` and `threads` can be set.
+        settings: Settings of the vanilla run in the format of `RunConfig` (data, device ...). For
+            a run, only `device` and `threads` can be set.
         options: How to probe.
-        out: Where the report goes.
-        accept_scene: Of a run, take its scene although parts of it have changed.
+        out: Output folder of the report.
+        accept_scene: For a run, accept its scene although parts of the scene have changed.
 
     Returns:
-        The exit code: 0, or 1 where training failed; the probes before that are reported.
+        The exit code: 0, or 1 if training failed; the probes before the failure are reported.
 
     Raises:
-        UserError: The input is bad.
+        UserError: The input is invalid.
     """
     if scene is not None and run is not None:
         raise UserError(
@@ -148,15 +148,15 @@ def _write(report: Report, folder: Path) -> None:
 
 
 def diagnose_scene(config: RunConfig, options: Options) -> Report:
-    """Trains a short vanilla run (one view per step, epoch order, plain sum) and probes it.
+    """Train a short vanilla run (one view per step, epoch order, plain sum) and probe it.
 
     Args:
-        config: Scene, reading options, device and threads; components are replaced.
+        config: Scene, data options, device and threads; components are replaced.
         options: How to probe.
 
     Returns:
-        The report. Where training failed after the first probe it holds the probes so far, and
-        `failure` says what happened.
+        The report. If training failed after the first probe, it holds the probes before the
+        failure, and `failure` describes the failure.
 
     Raises:
         UserError: The scene cannot be read, has too few training photos, or the grouping cannot
@@ -192,7 +192,7 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
 
 
 def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options) -> Report:
-    """Probes a run where it is.
+    """Probe a run at its current step.
 
     Raises:
         UserError: Its scene has too few training photos, or the grouping cannot group it.
@@ -210,7 +210,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
 
 
 def _plan(scene: Scene, options: Options, groups: tuple[str, ...] | None = None) -> ProbePlan:
-    """The views to probe; `groups` are the labels that the probed run was trained with."""
+    """Choose the views to probe; `groups` are the labels that the probed run was trained with."""
     require_views(scene)
     if options.grouping is None and groups is not None:
         return plan_probe(scene, OF_THE_RUN, groups, options.per_group, options.seed)
@@ -231,7 +231,7 @@ def _report(which: str, watch: Watch, model: Model, options: Options) -> Report:
 
 
 def _write_signature(model: Model, path: Path, seed: int) -> str:
-    """Writes the labels of `conflict-signature` for grouping `lists`."""
+    """Write the labels of `conflict-signature` to a file for grouping `lists`; return a note."""
     scene = model.scene
     grouping = build(Grouping, "conflict-signature", {})
     rng = np.random.default_rng(seed)

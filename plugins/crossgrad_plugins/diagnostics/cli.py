@@ -120,7 +120,7 @@ def diagnose(given: Given) -> None:
 
 
 def _refuse_idle(idle: list[str], run: Path | None) -> None:
-    """Refuses options that do nothing for what is diagnosed."""
+    """Refuse options that have no effect on the diagnosed scene or run."""
     if idle:
         why = "without --run" if run is None else "with --run: a run is probed once, as it is"
         raise UserError(f"{' and '.join(idle)} does nothing {why}", todo="leave it out")

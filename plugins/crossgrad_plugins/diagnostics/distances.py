@@ -1,4 +1,4 @@
-"""Conflict of views against how much their distances differ."""
+"""Gradient conflict of views against the difference of their distances."""
 
 from dataclasses import dataclass
 
@@ -6,23 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-#: Correlations that differ by less are equal.
+#: Correlations that differ by less than this count as equal.
 _ROUNDING = 1e-9
-#: Decimals of a difference of logarithms that are no rounding.
+#: Decimals kept of a difference of logarithms; further decimals are rounding errors.
 _DIGITS = 9
-#: Bins of pairs by how much their distances differ.
+#: Number of bins of pairs, by the difference of their distances.
 _BINS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceConflict:
-    """Conflict of pairs of views against how far apart their distances are.
+    """Gradient conflict of pairs of views against the difference of their distances.
 
     Attributes:
-        rates: [4] conflict rate of the pairs of each quarter by |log r_i - log r_j|; NaN in an
-            empty one.
+        rates: [4] conflict rate of the pairs in each quarter by |log r_i - log r_j|; NaN for an
+            empty quarter.
         correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j|, ranks among
-            all pairs; NaN where either is constant.
+            all pairs; NaN if either is constant.
         p_value: Share of relabelled cameras (Mantel's permutations) with as large a correlation.
     """
 
@@ -38,16 +38,16 @@ def conflict_by_distance(
     *,
     permutations: int = 499,
 ) -> DistanceConflict:
-    """The paper's Observation 1 within one scene, for one block.
+    """Measure the paper's Observation 1 within one scene, for one block.
 
     Every pair of views with a dot product other than zero counts. Pairs share cameras, so their
-    correlation is judged by permuting cameras, not pairs.
+    correlation is tested by permuting cameras, not pairs.
 
     Args:
-        gramian: [V, V].
+        gramian: [V, V] dot products of the views' gradients.
         distances: [V] camera distances, any unit.
-        rng: For the permutations.
-        permutations: How many.
+        rng: Generator of the permutations.
+        permutations: Number of permutations.
     """
     positive = np.flatnonzero(distances > 0.0)
     logs, products = np.log(distances[positive]), gramian[np.ix_(positive, positive)]
@@ -60,14 +60,14 @@ def conflict_by_distance(
     apart = _apart(logs, first, second)
     negative = products[first, second] < 0.0
     edges = np.quantile(apart, np.linspace(0.0, 1.0, _BINS + 1))
-    # The first order is the cameras' own.
+    # The first order is the original one.
     orders = [
         np.arange(len(positive)),
         *(rng.permutation(len(positive)) for _ in range(permutations)),
     ]
     order = np.stack(orders)
     correlations = _correlations(ranks[order[:, first], order[:, second]], negative)
-    # Equal ones are sums in another order.
+    # Equal correlations may differ by rounding, because their sums run in another order.
     above = int((correlations[1:] >= correlations[0] - _ROUNDING).sum())
     p_value = (1 + above) / (1 + permutations) if np.isfinite(correlations[0]) else np.nan
     rates = _rates(apart, negative, edges)
@@ -75,14 +75,14 @@ def conflict_by_distance(
 
 
 def relative_variance(distances: NDArray[np.float64]) -> float:
-    """Var(r) / mean(r)^2 of distances [V]; NaN where all are 0, or there are none."""
+    """Return Var(r) / mean(r)^2 of distances [V]; NaN if all are 0, or if there are none."""
     return float(distances.var() / distances.mean() ** 2) if distances.any() else float("nan")
 
 
 def _rates(
     apart: NDArray[np.float64], negative: NDArray[np.bool_], edges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[Q] share of negative pairs between neighbouring edges [Q + 1]; NaN in an empty bin."""
+    """Return the share [Q] of negative pairs between edges [Q + 1]; NaN for an empty bin."""
     bins = len(edges) - 1
     places = np.clip(np.searchsorted(edges, apart, side="right") - 1, 0, bins - 1)
     inside = [negative[places == place] for place in range(bins)]
@@ -90,7 +90,7 @@ def _rates(
 
 
 def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, V] rank of |log r_i - log r_j| among all pairs."""
+    """Return the rank [V, V] of |log r_i - log r_j| among all pairs."""
     first, second = np.triu_indices(len(logs), 1)
     ranks = np.zeros((len(logs), len(logs)))
     ranks[first, second] = rankdata(_apart(logs, first, second))
@@ -100,12 +100,12 @@ def _pair_ranks(logs: NDArray[np.float64]) -> NDArray[np.float64]:
 def _apart(
     logs: NDArray[np.float64], first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """|log r_i - log r_j| of pairs; equal ones are equal, whatever their logarithms round to."""
+    """Return |log r_i - log r_j| of pairs, rounded so that equal distances give equal values."""
     return np.asarray(np.abs(logs[first] - logs[second]).round(_DIGITS))
 
 
 def _correlations(ranks: NDArray[np.float64], negative: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """[R] correlation of each row of ranks [R, pairs] with conflict; NaN where one is constant."""
+    """Return the correlation [R] of each row of ranks [R, pairs] with conflict; NaN if constant."""
     about = ranks - ranks.mean(axis=1, keepdims=True)
     conflict = negative - negative.mean()
     lengths = np.sqrt((about**2).sum(axis=1) * (conflict @ conflict))

@@ -1,4 +1,4 @@
-"""How the photos of a scene differ in exposure, as rows and in words."""
+"""Differences in exposure between the photos of a scene, as rows and as text."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ class SceneExposure:
     """The exposure of all photos of a scene, by SfM tracks and EXIF headers.
 
     Attributes:
-        rows: A row for each photo, in the order of their names.
-        evidence: What `--exposure auto` decides by: the gains of the training photos.
-        differ: Whether it calls for a gain per photo.
+        rows: A row for each photo, in the order of the scene's views.
+        evidence: The evidence of `--exposure auto`: the gains of the training photos.
+        differ: True if the photos differ enough for a gain per photo.
         spread: Standard deviation of the gains, stops.
         before: Deviation of the observations, stops.
-        after: The same once the gains are taken out.
+        after: Deviation of the observations after the gains are removed, stops.
     """
 
     rows: Sequence[Row]
@@ -36,7 +36,7 @@ class SceneExposure:
     after: float
 
     def lines(self) -> list[str]:
-        """For a terminal."""
+        """Return the lines for a terminal."""
         verdict = (
             "the photos differ in exposure; a run models that by itself (--exposure auto)"
             if self.differ
@@ -46,7 +46,7 @@ class SceneExposure:
 
 
 def exposure_of(scene: Scene) -> SceneExposure:
-    """The exposure of all photos, held-out ones included.
+    """Return the exposure of all photos, including held-out photos.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -61,7 +61,7 @@ def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
     told = exposure_values(scene)
     known = zip(scene.views, gains.gains, gains.known, strict=True)
     of_tracks = {view.name: float(gain) for view, gain, is_known in known if is_known}
-    # EXIF tells differences only; it is set beside the tracks where there are both.
+    # EXIF only gives differences, so its values are shifted to the tracks if photos have both.
     both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
     shift = median(both) if both else -sum(told.values()) / max(1, len(told))
     trained = frozenset(scene.train)

@@ -21,17 +21,17 @@ _METRICS = {"plain": ("o", "#0072B2"), "adam": ("s", "#D55E00")}
 #: Okabe and Ito's colours, distinguishable with any colour vision.
 _EXPOSURE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _BLACK = "#000000"
-#: Names of more photos do not fit below the axis.
+#: Maximum number of photos whose names fit below the axis.
 _MOST_NAMES = 60
 
 
 def draw(title: str, probes: Sequence[Row], cameras: Sequence[Row]) -> bytes:
-    """The picture as PNG.
+    """Draw the picture of the probes as PNG.
 
     Args:
-        title: Its title.
-        probes: Rows of all probes; the last one fills the panels without a time axis.
-        cameras: Rows on the cameras.
+        title: Title of the picture.
+        probes: Rows of all probes; the last probe fills the panels without a time axis.
+        cameras: Rows of `camera_rows`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -68,7 +68,7 @@ def _blocks(rows: Sequence[Row]) -> list[str]:
 
 
 def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) -> None:
-    """One line per block over the steps, in the plain metric."""
+    """Draw one line per block over the steps, in the plain metric."""
     rows = rows_of(probes, "plain")
     singles = [b for b in _blocks(rows) if b not in {ALL, "+".join(AMPLITUDES)}]
     for number, block in enumerate(singles):
@@ -83,7 +83,7 @@ def _trajectory(axes: "Axes", probes: Sequence[Row], column: str, label: str) ->
 
 
 def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> None:
-    """A point with its interval per block, side by side for the metrics."""
+    """Draw a point with its interval for each block, side by side for the metrics."""
     blocks = _blocks(rows)
     for shift, (metric, (marker, color)) in zip((-0.12, 0.12), _METRICS.items(), strict=True):
         own = {str(row["block"]): row for row in rows_of(rows, metric)}
@@ -102,14 +102,14 @@ def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> No
 
 
 def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Upper ends with the infinite ones cut off a little above the largest finite one."""
+    """Replace infinite upper ends by a value a little above the largest finite one."""
     finite = high[np.isfinite(high)]
     top = 1.2 * float(finite.max()) if len(finite) else float(np.nanmax(np.append(low, 1.0)))
     return np.where(np.isinf(high), top, high)
 
 
 def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
-    """Conflict of all pairs of views by how much their distances differ, one line per block."""
+    """Draw the conflict of all pairs of views by their difference in distance, a line per block."""
     plain = rows_of(rows, "plain")
     singles = [row for row in plain if row["block"] not in {ALL, "+".join(AMPLITUDES)}]
     for number, row in enumerate(singles):
@@ -125,7 +125,7 @@ def _by_distance(axes: "Axes", rows: Sequence[Row]) -> None:
 
 
 def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
-    """Sarle's coefficient in both forms."""
+    """Draw Sarle's coefficient in both forms."""
     names = [str(row["quantity"]).split(" (")[0] for row in cameras]
     places = np.arange(len(names))
     for shift, column, color in ((-0.2, "sample", _COLORS[0]), (0.2, "population", _COLORS[1])):
@@ -142,7 +142,7 @@ def _bimodality(axes: "Axes", cameras: Sequence[Row]) -> None:
 
 
 def draw_exposure(title: str, exposure: SceneExposure) -> bytes:
-    """The picture as PNG."""
+    """Draw the picture of the exposure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -158,7 +158,7 @@ def draw_exposure(title: str, exposure: SceneExposure) -> bytes:
 
 
 def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
-    """A bar for each photo, held-out ones hatched, and EXIF as marks."""
+    """Draw a bar for each photo, held-out photos hatched, and EXIF values as markers."""
     rows = exposure.rows
     places = np.arange(len(rows))
     gains, told = (np.array([float(r[k]) for r in rows]) for k in ("gain_stops", "exif_stops"))
@@ -183,7 +183,7 @@ def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
 
 
 def _draw_rule(axes: "Axes", exposure: SceneExposure) -> None:
-    """What the rule compares with what, each beside its threshold."""
+    """Draw the figures that the exposure rule compares, each with its threshold."""
     values = (exposure.spread, exposure.before, exposure.after)
     limits = (LEAST_SPREAD, np.nan, (1.0 - LEAST_REDUCTION) * exposure.before)
     axes.bar(range(3), values, 0.6, color=(_EXPOSURE_COLORS[0], "0.6", _EXPOSURE_COLORS[2]))

@@ -1,4 +1,4 @@
-"""Two groups of cameras: Gramian, variance within and between, ratio of gradients."""
+"""Two groups of cameras: Gramian, variance within and between groups, ratio of gradients."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import UserError
 
-#: Views per group that an unbiased estimate of a variance needs.
+#: Minimum number of views per group for an unbiased estimate of a variance.
 SMALLEST_GROUP = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """Which views of a probe belong to which group, and what they stand for.
+    """The group of each view of a probe, and the population that the views represent.
 
     Attributes:
-        near: [V] bool, the views of the near group; the others are far.
+        near: [V] bool, the views of the near group; all other views are far.
         cameras: Sizes (near, far) of the population that the views were drawn from without
-            replacement; None where they stand for cameras in general (independent draws).
-        shares: Weights (near, far) of the groups, summing to 1. Equal ones describe the objective
-            of a balanced pair; the sizes' shares describe the mean over cameras.
+            replacement; None if the views represent cameras in general (independent draws).
+        shares: Weights (near, far) of the groups, summing to 1. Equal weights describe the
+            objective of a balanced pair; weights by size describe the mean over cameras.
     """
 
     near: NDArray[np.bool_]
@@ -46,7 +46,7 @@ class Groups:
 
     @cached_property
     def unseen(self) -> tuple[float, float]:
-        """1 - n/N of either group, the share of its cameras that was not probed; 1 if endless."""
+        """1 - n/N of either group, the share of its cameras not probed; 1 if N is unknown."""
         if self.cameras is None:
             return 1.0, 1.0
         near, far = (
@@ -56,7 +56,7 @@ class Groups:
 
     @cached_property
     def divisors(self) -> tuple[float, float]:
-        """(N-1)/N of either group: from sample variances to the population's own; 1 if endless."""
+        """(N-1)/N of either group, from sample to population variance; 1 if N is unknown."""
         if self.cameras is None:
             return 1.0, 1.0
         near, far = self.cameras
@@ -67,17 +67,17 @@ class Groups:
 class GroupedGramian:
     """The Gramian of one block, near views first, split into means and deviations.
 
-    All figures are relative to `scale`, the mean squared norm, so that none can overflow.
+    All figures are relative to `scale`, the mean squared norm, so that no figure can overflow.
 
     Attributes:
         scale: Mean of the Gramian's diagonal.
         near: [n, n] dot products of deviations from the near mean.
-        far: [m, m] likewise for the far group.
+        far: [m, m] dot products of deviations from the far mean.
         cross: [n, m] dot products of near with far deviations.
         gap: Squared distance of the two sample means.
         near_along: [n] dot products of near deviations with (near mean - far mean), each without
-            the view's own part in its group's mean; centred.
-        far_along: [m] likewise for the far group.
+            the view's own contribution to its group's mean; centred.
+        far_along: [m] the same dot products for the far group.
     """
 
     scale: float
@@ -90,7 +90,7 @@ class GroupedGramian:
 
     @classmethod
     def of(cls, gramian: NDArray[np.float64], groups: Groups) -> Self:
-        """From the Gramian [V, V] of one block."""
+        """Split the Gramian [V, V] of one block."""
         n, m = groups.sizes
         order = np.argsort(~groups.near, kind="stable")
         scale = float(np.trace(gramian)) / len(gramian)
@@ -100,7 +100,7 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        # A view's own part in the mean would correlate its length with its place along the gap.
+        # A view's part in the mean would correlate its length with its position along the gap.
         own = np.diag(deviations) / np.concatenate([np.full(n, n - 1.0), np.full(m, 1.0 - m)])
         along = centring @ (ordered @ difference - own)
         return cls(
@@ -116,12 +116,12 @@ class GroupedGramian:
 
 @dataclass(frozen=True)
 class GradientRatio:
-    """Ratio of gradient lengths, near over far; NaN where the far gradients are zero.
+    """Ratio of gradient lengths, near over far; NaN if the far gradients are zero.
 
     Attributes:
         of_means: Mean length over near views / mean length over far views (the paper's R).
-        median: Median over pairs of one near and one far view of the ratio of their lengths, pairs
-            with a zero gradient left out.
+        median: Median ratio of lengths over pairs of one near and one far view; pairs with a zero
+            gradient are left out.
     """
 
     of_means: float
@@ -129,12 +129,12 @@ class GradientRatio:
 
 
 def gradient_ratio(squared: NDArray[np.float64], near: NDArray[np.bool_]) -> GradientRatio:
-    """The ratio of one block.
+    """Return the ratio of gradient lengths for one block.
 
     Args:
         squared: [V] squared gradient lengths: the diagonal of the block's Gramian, or the sum of
             the diagonals of several blocks for their concatenation.
-        near: [V], the views of the near group; the others are far.
+        near: [V], the views of the near group; all other views are far.
     """
     lengths = np.sqrt(np.maximum(squared, 0.0))
     far_mean = float(lengths[~near].mean())
@@ -147,7 +147,7 @@ def gradient_ratio(squared: NDArray[np.float64], near: NDArray[np.bool_]) -> Gra
 
 
 def geometric_mean(ratios: tuple[float, ...]) -> float:
-    """Geometric mean of positive ratios, for blocks whose units differ; NaN where one is not."""
+    """Return the geometric mean of ratios of blocks with different units; NaN if one is not > 0."""
     if not all(ratio > 0.0 for ratio in ratios):
         return float("nan")
     return float(np.exp(np.mean(np.log(ratios))))
@@ -155,7 +155,7 @@ def geometric_mean(ratios: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class VarianceSplit:
-    """Unbiased estimates of the paper's variances; `between` may come out negative.
+    """Unbiased estimates of the paper's variances; `between` may be negative.
 
     Attributes:
         within: sigma_w^2, weighted mean over groups of E||g - group mean||^2.
@@ -167,19 +167,19 @@ class VarianceSplit:
 
     @property
     def ratio(self) -> float:
-        """sigma_b^2 / sigma_w^2; NaN where there is no variance within groups."""
+        """sigma_b^2 / sigma_w^2; NaN without variance within groups."""
         return self.between / self.within if self.within > 0.0 else float("nan")
 
 
 def variance_split(gramian: NDArray[np.float64], groups: Groups) -> VarianceSplit:
-    """sigma_w^2 and sigma_b^2 from the Gramian [V, V] of one block.
+    """Estimate sigma_w^2 and sigma_b^2 from the Gramian [V, V] of one block.
 
-    The plain ||difference of means||^2 overestimates sigma_b^2 by the means' own noise, which is
-    taken off here; with one view per group nothing would be left but noise. Both figures are linear
-    in the Gramian: those of a sum over probes of the same views are the sums.
+    The plain ||difference of means||^2 overestimates sigma_b^2 by the noise of the means, so this
+    noise is subtracted. With one view per group, only noise would remain. Both figures are linear
+    in the Gramian: the figures of a sum over probes of the same views are the sums.
 
     Source: the paper, Proposition 2; unbiased estimators of the variance of a mean, with the finite
-    population's correction where the views were drawn without replacement.
+    population's correction if the views were drawn without replacement.
     """
     parts = GroupedGramian.of(gramian, groups)
     within, between = split_of(parts, groups)
@@ -187,7 +187,7 @@ def variance_split(gramian: NDArray[np.float64], groups: Groups) -> VarianceSpli
 
 
 def split_of(parts: GroupedGramian, groups: Groups) -> tuple[float, float]:
-    """(sigma_w^2, sigma_b^2) in units of `parts.scale`."""
+    """Return (sigma_w^2, sigma_b^2) in units of `parts.scale`."""
     (n, m), (p, q) = groups.sizes, groups.shares
     spread_near = float(np.trace(parts.near)) / (n - 1)
     spread_far = float(np.trace(parts.far)) / (m - 1)

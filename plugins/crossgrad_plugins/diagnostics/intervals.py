@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of
 from crossgrad_plugins.diagnostics.resampling import Resamples
 
-#: How much of the error of the ratio's interval is moved from its lower to its upper end at most,
-#: and the share of sigma_w^2 in the variance from which on all of that is moved. Too few long
-#: gradients in the sample make sigma_w^2 too small and the ratio too large.
+#: Maximum share of the error of the ratio's interval that is moved from its lower to its upper
+#: end, and the share of sigma_w^2 in the variance from which on this maximum applies. A sample
+#: with too few long gradients makes sigma_w^2 too small and the ratio too large.
 _MOVED = 0.4
 _WITHIN_RULES = 1.0 / 3.0
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
-#: A variance of this size, relative to the squared lengths, is rounding.
+#: A variance below this size, relative to the squared lengths, is rounding error.
 _NEGLIGIBLE = 1e-13
-#: Share of the error of sigma_w^2's interval that falls on its upper end. A few views miss rare
-#: long gradients more often than they hold too many, so the error is not split evenly.
+#: Share of the error of sigma_w^2's interval that is put on its upper end. A few views miss rare
+#: long gradients more often than they contain too many, so the error is not split evenly.
 _UPPER_SHARE = 0.2
 _DOUBLINGS = 60
 _BISECTIONS = 24
@@ -28,31 +28,31 @@ _BISECTIONS = 24
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval; infinite where there is no upper end.
+    """A confidence interval; the upper end is infinite if there is no upper bound.
 
-    Both ends are NaN where it cannot be told, or where no value that there can be is credible.
+    Both ends are NaN if the interval is unknown, or if every possible value is rejected.
     """
 
     low: float
     high: float
 
     def holds(self, value: float) -> bool:
-        """Whether the value lies inside, ends included."""
+        """Return True if the value is inside the interval, ends included."""
         return self.low <= value <= self.high
 
     def times(self, factor: float) -> "Interval":
-        """The interval of the quantity times a factor >= 0."""
+        """Return the interval of the quantity times a factor >= 0."""
         return Interval(self.low * factor, self.high * factor)
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """The studentised estimate if a value is the true one.
+    """The studentised estimate under the assumption of a true value.
 
     Attributes:
-        observed: Of the sample.
-        resampled: [R] of the resamples.
-        lower_share: Share of the interval's error that falls on its lower end.
+        observed: The estimate of the sample.
+        resampled: [R] estimates of the resamples.
+        lower_share: Share of the interval's error that is put on its lower end.
     """
 
     observed: float
@@ -60,7 +60,7 @@ class Pivot:
     lower_share: float = 0.5
 
     def above(self, level: float, *, lower_end: bool) -> bool:
-        """Whether the true value must be larger than this for the estimate to be credible."""
+        """Return True if only a larger true value makes the estimate credible."""
         error = 1.0 - level
         tail = 1.0 - error * self.lower_share if lower_end else error * (1.0 - self.lower_share)
         return self.observed > float(np.quantile(self.resampled, tail))
@@ -68,14 +68,14 @@ class Pivot:
 
 @dataclass(frozen=True, eq=False)
 class StudentisedGap:
-    """One block's resamples with what is known of the noise.
+    """The resamples of one block and the variance of its noise.
 
     Attributes:
-        draws: The resamples, row 0 the sample itself; shifts as along the true gap.
+        draws: The resamples, row 0 the sample itself; shifts are scaled as along the true gap.
         estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
         floor: Variance of the estimate at theta = 0.
-        floors: [R] the same in each resample.
+        floors: [R] `floor` of each resample.
     """
 
     draws: Resamples
@@ -86,9 +86,9 @@ class StudentisedGap:
 
     @classmethod
     def of(cls, parts: GroupedGramian, groups: Groups, draws: Resamples) -> "StudentisedGap":
-        """From the split Gramian and its resamples."""
+        """Combine the split Gramian with its resamples."""
         noise = draws.noise[1:]
-        # The scale of a resample's noise goes with the square of its spread.
+        # The noise of a resample scales with the square of its spread.
         relative = (draws.spread[1:] / draws.spread[0]) ** 2
         floors = relative * (float(noise.var()) / float(relative.mean()))
         floor = _variance_without_gap(parts, groups)
@@ -101,7 +101,7 @@ class StudentisedGap:
         )
 
     def within(self, tails: tuple[float, float]) -> Interval:
-        """sigma_w^2 by bootstrap-t of its logarithm."""
+        """Return the interval of sigma_w^2, by bootstrap-t of its logarithm."""
         values = self.draws.within
         errors = np.sqrt(self.draws.within_variance) / values
         if errors[0] == 0.0:
@@ -114,7 +114,7 @@ class StudentisedGap:
         )
 
     def gap_pivot(self, gap: float) -> Pivot:
-        """The studentised estimate if `gap` is the true one, and its resamples."""
+        """Return the studentised estimate and its resamples, if `gap` is the true gap."""
         draws, root = self.draws, sqrt(gap)
         variance = 4.0 * gap * draws.shift_variance
         numerators = 2.0 * root * draws.shift[1:] + (draws.noise[1:] - draws.noise[0])
@@ -122,7 +122,7 @@ class StudentisedGap:
         return Pivot(observed, numerators / np.sqrt(_positive(variance[1:] + self.floors)))
 
     def ratio_pivot(self, ratio: float) -> Pivot:
-        """The studentised estimate of gap - ratio * sigma_w^2 if the true ratio is `ratio`."""
+        """Return the studentised gap - ratio * sigma_w^2 and resamples, if `ratio` is true."""
         draws = self.draws
         gap = ratio * float(draws.within[0])
         root = sqrt(gap)
@@ -145,19 +145,21 @@ class StudentisedGap:
 
     @property
     def start(self) -> float:
-        """Where to start looking for the upper end of an interval; positive."""
+        """Positive start of the search for the upper end of an interval."""
         return max(self.estimate, self.plain_gap, sqrt(self.floor))
 
 
 def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
-    """Return the variance of the shift along the true gap, divided by the one along the sample gap.
+    """Return the ratio of two variances of the shift: along the true gap over along the sample gap.
 
     The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
     gradients vary most. With the covariance Sigma of the difference of the means, noise adds
     tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of both is
     subtracted, and less if the whole gap could be noise, because the remainder is itself uncertain
-    with a dozen views. If few directions dominate, 95 % intervals of sigma_b^2 contain the truth in
-    up to 99.5 % of the cases without the subtraction, and in 84 to 97 % if all is subtracted.
+    with a dozen views.
+
+    If few directions dominate, 95 % intervals of sigma_b^2 contain the true value in up to 99.5 %
+    of the cases without the subtraction, and in 84 to 97 % if the full noise is subtracted.
     """
     noise, along = float(draws.spread[0]), float(draws.shift_variance[0]) * gap
     if noise <= 0.0 or along <= 0.0:
@@ -167,7 +169,7 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
 
 
 def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
-    """Variance of the estimated gap where the true gap is zero, in units of the scale squared."""
+    """Return the variance of the estimated gap if the true gap is zero, in squared scale units."""
     (n, m), (f, g) = groups.sizes, groups.unseen
     near = max(_squared_covariance(parts.near), 0.0)
     far = max(_squared_covariance(parts.far), 0.0)
@@ -177,7 +179,7 @@ def _variance_without_gap(parts: GroupedGramian, groups: Groups) -> float:
 
 
 def _squared_covariance(deviations: NDArray[np.float64]) -> float:
-    """Unbiased estimate of tr(Sigma^2) from dot products of deviations [n, n], any distribution.
+    """Estimate tr(Sigma^2) without bias from dot products of deviations [n, n], any distribution.
 
     Source: Himeno and Yamada 2014.
     """
@@ -215,19 +217,22 @@ def split_intervals(
     resamples: int = 999,
     level: float = 0.95,
 ) -> SplitIntervals:
-    """Intervals from the Gramian [V, V] of one block.
+    """Estimate confidence intervals from the Gramian [V, V] of one block.
 
-    Cameras are resampled within their groups; pairs of a camera with its own copy are left out, for
-    they would add the camera's squared norm to every dot product between cameras. sigma_w^2 is
-    studentised on the logarithmic scale. sigma_b^2 is quadratic in the distance theta of the group
-    means, so its noise depends on theta: the interval holds every theta that the estimate, with the
-    standard error that belongs to *that* theta, does not reject; the bootstrap is moved to theta
-    for the critical values. The ratio's interval is made the same way from theta - ratio sigma_w^2;
-    the more of its noise comes from sigma_w^2, the more of its error falls on its upper end. The
-    ends are never negative, whereas the estimate may be.
+    Cameras are resampled within their groups. Pairs of a camera with its own copy are left out,
+    because they would add the camera's squared norm to dot products between cameras. sigma_w^2 is
+    studentised on the logarithmic scale.
 
-    Unknown (NaN) with fewer than four views in a group, or without any variance, and of sigma_b^2
-    and the ratio where the estimate lies so far below 0 that even 0 is rejected.
+    sigma_b^2 is quadratic in the distance theta of the group means, so its noise depends on theta.
+    Its interval holds every theta that the estimate does not reject with the standard error of
+    *that* theta; the bootstrap is moved to theta for the critical values. The ratio's interval is
+    made in the same way from theta - ratio sigma_w^2. The larger the part of sigma_w^2 in its
+    noise, the larger the share of its error on the upper end. The ends are never negative, although
+    the estimate may be.
+
+    All intervals are unknown (NaN) with fewer than four views in a group, or without variance. The
+    intervals of sigma_b^2 and of the ratio are also unknown if the estimate is so far below 0 that
+    even 0 is rejected.
 
     Source: bootstrap-t and intervals by test inversion, Efron and Tibshirani 1993; variance of the
     statistic, Chen and Qin 2010. Coverage: `benchmarks/interval_coverage.py`.
@@ -250,13 +255,13 @@ def split_intervals(
 
 
 def _points(within: float, between: float) -> SplitIntervals:
-    """Intervals without extent, for figures that are exact because every camera was probed."""
+    """Return intervals without extent: the figures are exact, because every camera was probed."""
     figures = (within, between, between / within)
     return SplitIntervals(*(Interval(figure, figure) for figure in figures))
 
 
 def _leaning_tails(level: float) -> tuple[float, float]:
-    """Quantiles of the pivot that give the (upper, lower) end of sigma_w^2's interval."""
+    """Return the quantiles of the pivot for the (upper, lower) end of sigma_w^2's interval."""
     upper = (1.0 - level) * _UPPER_SHARE
     return upper, upper + level
 
@@ -265,14 +270,14 @@ UNKNOWN = Interval(float("nan"), float("nan"))
 
 
 def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Interval:
-    """The values >= 0 that are not rejected; unknown (NaN) where there are none.
+    """Return the interval of the values >= 0 that are not rejected; unknown (NaN) if all are.
 
     Args:
         pivot: Value -> studentised estimate if that value is the true one.
-        start: Positive; about as large as the upper end.
-        level: Of the interval.
+        start: Positive value of about the size of the upper end.
+        level: Confidence level of the interval.
     """
-    # An estimate too low for 0 is so for all larger values: [0, 0] would say that it is exactly 0.
+    # If 0 is rejected from above, so are all larger values; [0, 0] would wrongly claim exactly 0.
     if not pivot(0.0).above(level, lower_end=False):
         return UNKNOWN
     return Interval(
@@ -282,7 +287,7 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
 
 
 def _crossing(above: Callable[[float], bool], start: float) -> float:
-    """Where `above` turns from true to false on [0, inf); infinite where it does not."""
+    """Return the value at which `above` turns false on [0, inf); infinite if it never does."""
     if not above(0.0):
         return 0.0
     low, high = 0.0, start

@@ -10,17 +10,17 @@ from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
 
-#: Probes of a run whose interval the user does not set.
+#: Number of probes of a run, if the user does not set an interval.
 _PROBES = 8
 
 
 class Diagnostics(Observer):
-    """Measures the gradients of chosen views at an interval, parameters frozen.
+    """Measures the gradients of chosen views at an interval, at frozen parameters.
 
     Writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's folder. The
-    views are drawn by the observer's own generator; training is not changed by a bit. A probe
-    costs a forward and a backward pass of each probed view, off the training clock; the column
-    `probe_seconds` tells how long it took.
+    views are drawn by the observer's own generator, so the result of training does not change. A
+    probe costs a forward and a backward pass of each probed view. This time does not count as
+    training time; the column `probe_seconds` contains it.
     """
 
     every: int | None = Field(
@@ -32,18 +32,18 @@ class Diagnostics(Observer):
     )
     seed: int = Field(0, ge=0, description="seed of the choice of views and of the bootstrap")
 
-    # What was found so far; no part of the run's state.
+    # The results so far; they are not part of the run's state.
     _run: RunInfo | None = PrivateAttr(default=None)
     _watch: "Watch | None" = PrivateAttr(default=None)
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Remembers where results go."""
+        """Remember the run and its output folder."""
         self._run, self._watch = run, None
 
     @hookimpl
     def crossgrad_model_ready(self, model: Model) -> None:
-        """Probes where it is time, and writes the table."""
+        """Probe the model when a probe is due, and write the table."""
         if self._watch is None:
             self._watch = self._start(model)
         watch = self._watch
@@ -58,7 +58,7 @@ class Diagnostics(Observer):
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Writes the picture and what does not change over the run."""
+        """Write the picture and the tables that do not change during the run."""
         folder, watch, run = self._folder(), self._watch, self._run
         if folder is None or watch is None or run is None or watch.last is None:
             return
@@ -68,7 +68,7 @@ class Diagnostics(Observer):
         return None if self._run is None else self._run.folder
 
     def _start(self, model: Model) -> "Watch":
-        """The views to look at, and the rows of a run that is being continued."""
+        """Choose the views to probe, and read the rows of a resumed run."""
         from crossgrad_plugins.diagnostics.plan import (
             DEFAULT_GROUPING,
             OF_THE_RUN,

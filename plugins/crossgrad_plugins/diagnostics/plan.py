@@ -1,4 +1,4 @@
-"""Which views a probe looks at: as many near as far ones, the same in every probe."""
+"""The views of a probe: as many near as far views, the same in every probe."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from crossgrad_core.commands import build
 from crossgrad_core.plugin import Grouping, Json, Scene, UserError, footprint_of, radial_distances
 from crossgrad_plugins.diagnostics.grouped import SMALLEST_GROUP
 
-#: The grouping of a probe where the run has none: the paper's.
+#: The default grouping of a probe, as in the paper.
 DEFAULT_GROUPING = "radial"
-#: What the groups that a run was trained with are called.
+#: The name of the grouping that a run was trained with.
 OF_THE_RUN = "of the run"
 
 
@@ -21,12 +21,12 @@ class ProbePlan:
     """The views of a probe.
 
     Attributes:
-        grouping: Name of the grouping, or how the labels came about.
+        grouping: Name of the grouping, or the origin of the labels.
         near_label: Label of the near group.
         far_label: Label of the far group.
         labels: Label of every training view.
         views: Positions in `scene.train_views`, in ascending order.
-        notes: What the grouping had to say.
+        notes: Notes of the grouping.
     """
 
     grouping: str
@@ -37,7 +37,7 @@ class ProbePlan:
     notes: tuple[str, ...] = ()
 
     def near(self, views: Sequence[int]) -> NDArray[np.bool_]:
-        """Which of these views [V] are near."""
+        """Return which of these views [V] are near."""
         return np.array([self.labels[view] == self.near_label for view in views])
 
     @property
@@ -47,7 +47,7 @@ class ProbePlan:
 
 
 def require_views(scene: Scene) -> None:
-    """Refuses a scene that no grouping could make two groups of.
+    """Refuse a scene that is too small for two groups.
 
     Raises:
         UserError: It has too few training photos.
@@ -66,7 +66,7 @@ def require_views(scene: Scene) -> None:
 def labelled(
     scene: Scene, grouping: str, seed: int, options: Mapping[str, Json] | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Labels of the training views by the grouping of that name with its options, and its notes.
+    """Label the training views with a grouping and its options; return the labels and its notes.
 
     Raises:
         UserError: There is no such grouping, or it cannot group this scene.
@@ -79,17 +79,18 @@ def labelled(
 def plan_probe(
     scene: Scene, grouping: str, labels: tuple[str, ...], per_group: int, seed: int
 ) -> ProbePlan:
-    """Draws up to `per_group` views of the nearest and of the farthest group.
+    """Draw up to `per_group` views from the nearest and from the farthest group.
 
     Args:
         scene: The scene.
         grouping: Name of the grouping.
-        labels: Its label of every training view; with three or more, the middle is left out.
+        labels: Its label of every training view; of three or more groups, only the nearest and
+            the farthest one are probed.
         per_group: Views per group.
         seed: Seed of the probe's own generator.
 
     Raises:
-        UserError: There is one group only, or one with a single view.
+        UserError: There is only one group, or a group has a single view.
     """
     near_label, far_label = _outermost(scene, labels)
     rng = np.random.default_rng(seed)
@@ -109,7 +110,7 @@ def plan_probe(
 
 
 def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
-    """The labels of the nearest and of the farthest group."""
+    """Return the labels of the nearest and of the farthest group."""
     names = sorted(set(labels))
     if len(names) == 1:
         raise UserError(
@@ -129,7 +130,7 @@ def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
 
 
 def _closeness(scene: Scene) -> NDArray[np.float64]:
-    """[N] a number that is larger for nearer training views."""
+    """Return a number [N] per training view that is larger for nearer views."""
     footprints = np.array([footprint_of(scene, view) for view in scene.train_views])
     if np.isnan(footprints).any():
         return -radial_distances(scene, scene.train_views)

@@ -12,7 +12,7 @@ from torch import Tensor
 from crossgrad_core.commands import gathered, view_gradients
 from crossgrad_core.plugin import BlockKind, Model
 
-#: Bytes that the gradients of all probed views may take together.
+#: Maximum memory of the gradients of all probed views, in bytes.
 MEMORY = 512 * 2**20
 
 _Gradients = dict[str, Tensor]
@@ -20,20 +20,20 @@ _Gradients = dict[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The Gramians of V views at one moment.
+    """The Gramians of V views at one step.
 
     Attributes:
         step: The last complete step.
-        views: [V] positions in `scene.train_views`; views with a gradient that is not finite are
-            left out.
-        blocks: [B] names of the blocks, frozen ones left out.
-        kinds: [B] their kinds.
+        views: [V] positions in `scene.train_views`; views with a non-finite gradient are left
+            out.
+        blocks: [B] names of the blocks, without frozen blocks.
+        kinds: [B] kinds of the blocks.
         plain: [B, V, V] dot products of gradients.
         adam: [B, V, V] dot products of gradients over the root of Adam's second moment; None before
             the first step.
-        overlap: [B, V, V] whether two views' gradients share a non-zero element.
+        overlap: [B, V, V] True if the gradients of two views share a non-zero element.
         dropped: Names of the views that were left out.
-        share: Share of the primitives whose gradients were looked at.
+        share: Share of the primitives whose gradients were measured.
     """
 
     step: int
@@ -48,11 +48,11 @@ class Measurement:
 
 
 def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Measurement:
-    """The Gramians of the gradients of the given training views.
+    """Measure the Gramians of the gradients of the given training views.
 
-    Each view's own photometric loss is differentiated; the model is left as it is. Where the
-    gradients of all views would not fit into `MEMORY`, a uniform random subset of the primitives is
-    looked at: dot products of the per-primitive blocks are then unbiased estimates.
+    Each view's own photometric loss is differentiated; the model is not changed. If the gradients
+    of all views do not fit into `MEMORY`, a uniform random subset of the primitives is measured.
+    The dot products of the per-primitive blocks are then unbiased estimates.
 
     Args:
         model: The model.
@@ -90,7 +90,7 @@ def measure(model: Model, views: Sequence[int], rng: np.random.Generator) -> Mea
 
 @dataclass(frozen=True, eq=False)
 class ModelProbe:
-    """The gradients of a model, as groupings ask for them (`GradientProbe`)."""
+    """The gradients of a model, in the form that groupings require (`GradientProbe`)."""
 
     model: Model
     rng: np.random.Generator
@@ -101,7 +101,7 @@ class ModelProbe:
         return tuple(block.name for block in self.model.backbone.trained_blocks())
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """[B, V, V] Gramians; a view whose gradient is not finite counts as zero."""
+        """Return Gramians [B, V, V]; a view with a non-finite gradient counts as zero."""
         measurement = measure(self.model, views, self.rng)
         places = [list(views).index(view) for view in measurement.views]
         full = np.zeros((len(self.blocks), len(views), len(views)))
@@ -111,12 +111,12 @@ class ModelProbe:
 
 @dataclass(frozen=True, eq=False)
 class _Subset:
-    """Which rows of per-primitive tensors are looked at.
+    """The rows of per-primitive tensors that are measured.
 
     Attributes:
-        rows: Their numbers, None for all.
+        rows: Row numbers; None for all rows.
         tensors: Names of the per-primitive tensors.
-        share: Their share of all rows.
+        share: Share of the rows that is measured.
     """
 
     rows: Tensor | None
@@ -124,7 +124,7 @@ class _Subset:
     share: float
 
     def of(self, gradients: Mapping[str, Tensor]) -> _Gradients:
-        """The gradients of the subset, lengthened so that dot products keep their expectation."""
+        """Return the gradients of the subset, scaled to keep the expectation of dot products."""
         if self.rows is None:
             return dict(gradients)
         length = 1.0 / sqrt(self.share)
@@ -134,12 +134,12 @@ class _Subset:
         }
 
     def plain(self, name: str, tensor: Tensor) -> Tensor:
-        """The rows of a tensor as they are."""
+        """Return the chosen rows of a tensor, without scaling."""
         return tensor if self.rows is None or name not in self.tensors else tensor[self.rows]
 
 
 def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | None, float]:
-    """The rows to look at and their share of all."""
+    """Choose the rows to measure; return them with their share of all rows."""
     per_primitive = [
         t for b in model.backbone.trained_blocks() if b.per_primitive for t in b.tensors
     ]
@@ -156,10 +156,11 @@ def _rows(model: Model, views: int, rng: np.random.Generator) -> tuple[Tensor | 
 
 
 def _divide_by_adam(model: Model, subset: _Subset, gradients: Sequence[_Gradients]) -> None:
-    """Divides all gradients by the root of Adam's second moment as the next step will have it.
+    """Divide all gradients by the root of Adam's second moment after the next step.
 
-    The next step adds squared gradients to the moment first; here their mean over the probed views,
-    so that all views share one metric. Elements that training never touched stay bounded by it.
+    The next step first adds squared gradients to the moment. Here their mean over the probed views
+    is added, so that all views share one metric. This addition also bounds elements that training
+    never touched.
     """
     beta2 = model.rule.betas[1]
     for name, moment in model.adam.exp_avg_sq.items():

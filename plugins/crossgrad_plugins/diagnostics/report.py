@@ -27,17 +27,17 @@ FILES = (PROBES, CAMERAS, GROUPINGS, PICTURE, EXPOSURE, EXPOSURE_PICTURE)
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that was found out.
+    """The complete results of a diagnosis.
 
     Attributes:
         scene: Name of the scene.
         title: Scene and model.
-        probes: Rows of `table`, all probes one after the other.
+        probes: Rows of `table`, of all probes in sequence.
         cameras: Rows of `camera_rows`.
         groupings: Rows of `grouping_rows`, for the last probe.
-        notes: What the reader should know.
-        failure: Why training ended before its time; None where it did not.
-        exposure: How the photos differ in exposure; None where nobody looked.
+        notes: Notes for the reader.
+        failure: The reason if training failed; None if it did not.
+        exposure: The exposure of the photos; None if it was not measured.
     """
 
     scene: str
@@ -50,7 +50,7 @@ class Report:
     exposure: SceneExposure | None = None
 
     def write(self, folder: Path) -> None:
-        """Writes the CSV files and the picture.
+        """Write the CSV files and the pictures.
 
         Raises:
             UserError: The disk is full, or the folder is read-only.
@@ -71,7 +71,7 @@ class Report:
         write_atomically(folder / EXPOSURE_PICTURE, draw_exposure(self.scene, exposure))
 
     def lines(self) -> list[str]:
-        """The report for a terminal."""
+        """Return the lines of the report for a terminal."""
         parts = (
             [f"scene: {self.scene}", *self.notes],
             _camera_lines(self.cameras),
@@ -134,7 +134,7 @@ def _camera_lines(rows: Sequence[Row]) -> list[str]:
 
 
 def _grouping_lines(rows: Sequence[Row]) -> list[str]:
-    """The first block as other groupings see it: the choice of near and far matters."""
+    """Return the first block's figures by each grouping; the choice of near and far matters."""
     lines = ["the same probe by grouping, plain metric"]
     for name in dict.fromkeys(str(row["grouping"]) for row in rows):
         first = next(row for row in rows if row["grouping"] == name)
@@ -156,7 +156,9 @@ def _figure(value: float, form: str) -> str:
 
 
 def read_probes(path: Path) -> list[Row]:
-    """Rows that `write_table` wrote of probes, empty cells as NaN; none where there is no file.
+    """Read rows of probes from a file of `write_table`; empty cells are NaN.
+
+    Without a file, there are no rows.
 
     Raises:
         UserError: The file cannot be read, or a row lacks cells or a step.

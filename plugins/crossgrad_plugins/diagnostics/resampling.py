@@ -1,4 +1,4 @@
-"""Resampled figures of a grouped Gramian: cameras drawn anew, no camera paired with itself."""
+"""Resampled figures of a grouped Gramian: cameras are redrawn and never paired with copies."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 
-#: Resamples with fewer different cameras in a group are drawn again: they have no variance.
+#: Minimum number of different cameras of a group in a resample; with fewer it is drawn again,
+#: because it would have no variance.
 _FEWEST_CAMERAS = 3
 
 _Array = NDArray[np.float64]
 
 
 def multiplicities(size: int, resamples: int, rng: np.random.Generator) -> _Array:
-    """[R + 1, size] how often each camera is drawn; the first row is the sample itself."""
+    """Draw how often each camera occurs, [R + 1, size]; the first row is the sample itself."""
     share = np.full(size, 1.0 / size)
     drawn = rng.multinomial(size, share, size=resamples)
     fewest = min(_FEWEST_CAMERAS, size)
@@ -50,13 +51,13 @@ class GroupResamples:
 
     @classmethod
     def of(cls, deviations: _Array, along: _Array, counts: _Array) -> Self:
-        """From dot products of deviations [n, n], their products with the gap [n], and counts."""
+        """Resample dot products of deviations [n, n] and their products with the gap [n]."""
         n = len(along)
         squared = np.diag(deviations)
         halves = (squared[:, None] + squared[None, :] - 2.0 * deviations) / 2.0
         to_others = counts @ halves
         self_share = (counts * counts).sum(axis=1) / n**2
-        # Conditional means of the pair kernel, one per camera, without the camera's own copies.
+        # Conditional means of the pair kernel, one per camera, without pairs of a camera's copies.
         conditional = 2.0 * to_others / (n - counts)
         mean_along = counts @ along / n
         about_along = along[None, :] - mean_along[:, None]
@@ -76,17 +77,18 @@ class GroupResamples:
 
 @dataclass(frozen=True, eq=False)
 class Resamples:
-    """Everything that the intervals need; row 0 is the sample itself, in units of the scale.
+    """All figures that the intervals need; row 0 is the sample itself, in units of the scale.
 
     If theta is the true ||near mean - far mean||^2, a resample's estimate of it is theta +
-    2 sqrt(theta) `shift` + `noise`, less the mean of the noise.
+    2 sqrt(theta) `shift` + `noise`, minus the mean of the noise.
 
     Attributes:
         within: [R + 1] sigma_w^2.
-        within_variance: [R + 1] its variance.
-        shift: [R + 1] mean deviation along the unit vector of the gap, each view's own part in the
-            gap left out.
-        noise: [R + 1] squared mean deviation, less what single cameras' deviations make of it.
+        within_variance: [R + 1] variance of `within`.
+        shift: [R + 1] mean deviation along the unit vector of the gap, without each view's own
+            contribution to the gap.
+        noise: [R + 1] squared mean deviation, minus the contribution of single cameras'
+            deviations.
         shift_variance: [R + 1] variance of `shift`.
         covariance: [R + 1] covariance of `within` with `shift`.
         spread: [R + 1] variance of the difference of the means, summed over dimensions.
@@ -101,7 +103,7 @@ class Resamples:
     spread: _Array
 
     def along_gap(self, factor: float) -> "Resamples":
-        """The same with the variance of the shift times a factor."""
+        """Return a copy with the variance of the shift multiplied by a factor."""
         return replace(
             self,
             shift=self.shift * factor**0.5,
@@ -113,13 +115,13 @@ class Resamples:
     def of(
         cls, parts: GroupedGramian, groups: Groups, resamples: int, rng: np.random.Generator
     ) -> Self:
-        """Draws the resamples."""
+        """Draw the resamples."""
         n, m = groups.sizes
         near = GroupResamples.of(parts.near, parts.near_along, multiplicities(n, resamples, rng))
         far = GroupResamples.of(parts.far, parts.far_along, multiplicities(m, resamples, rng))
         (f, g), (p, q) = groups.unseen, groups.shares
         p, q = p * groups.divisors[0], q * groups.divisors[1]
-        # Probing part of a finite population leaves only the unseen share of the noise's variance.
+        # In a finite population, only the unprobed share of the noise's variance remains.
         root_f, root_g = f**0.5, g**0.5
         near_spread = near.spread[0] + root_f * (near.spread - near.spread[0])
         far_spread = far.spread[0] + root_g * (far.spread - far.spread[0])

@@ -47,11 +47,11 @@ def conflict(
     near: NDArray[np.bool_],
     overlap: NDArray[np.bool_] | None = None,
 ) -> Conflict:
-    """Both readings of the paper's "33-83 %" conflict rate.
+    """Compute both definitions of the paper's "33-83 %" conflict rate.
 
     Args:
-        gramians: [B, V, V].
-        near: [V], the views of the near group; the others are far.
+        gramians: [B, V, V] dot products of gradients.
+        near: [V], the views of the near group; all other views are far.
         overlap: [B, V, V], pairs whose gradients share a non-zero element; by default every pair
             whose dot product is not exactly zero.
     """
@@ -71,26 +71,26 @@ def conflict(
 
 
 def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The quotient, NaN where the whole is empty."""
+    """Return the quotient; NaN if the whole is empty."""
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Mean of the values that are not NaN; NaN without any."""
+    """Return the mean of the values that are not NaN; NaN if all are."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else float("nan")
 
 
-#: A line and the scatter around it.
+#: Minimum number of views to fit a line and the scatter around it.
 _SMALLEST = 4
 
 
 @dataclass(frozen=True)
 class Exponent:
-    """d_theta of ||gradient|| ~ r^-d_theta; positive where near views have longer gradients.
+    """d_theta of ||gradient|| ~ r^-d_theta; positive if near views have longer gradients.
 
     Attributes:
-        value: The fitted exponent; NaN where it is undefined.
+        value: The fitted exponent; NaN if it is undefined.
         interval: Its confidence interval.
         views: Number of views with a non-zero gradient and distance.
     """
@@ -103,15 +103,17 @@ class Exponent:
 def distance_exponent(
     squared: NDArray[np.float64], distances: NDArray[np.float64], level: float = 0.95
 ) -> Exponent:
-    """Least-squares line of log length over log distance; the interval allows for unequal scatter.
+    """Fit a least-squares line of log length over log distance, with an interval for its slope.
+
+    The interval is valid for unequal scatter.
 
     Args:
         squared: [V] squared gradient lengths of one block.
         distances: [V] camera distances, any unit.
         level: Confidence level.
 
-    Source: the paper, Proposition 1 (P1: larger for geometry than for amplitudes; P4: only where
-    the distance matches the visual scale); HC3 standard error, MacKinnon and White 1985.
+    Source: the paper, Proposition 1 (P1: larger for geometry than for amplitudes; P4: only if the
+    distance matches the visual scale); HC3 standard error, MacKinnon and White 1985.
     """
     kept = (squared > 0.0) & (distances > 0.0)
     views = int(kept.sum())
@@ -129,15 +131,16 @@ def distance_exponent(
 
 
 def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
-    """tr(Sigma) / ||mean gradient||^2 of one block, both estimated without bias.
+    """Estimate tr(Sigma) / ||mean gradient||^2 of one block, both parts without bias.
 
-    Well below the noise scale, K views per step are worth about as much as K steps; well above it
-    further views are wasted. The mean and the variance are those of the mixture of the groups with
-    their shares. Infinite where the mean gradient cannot be told from zero; NaN without variance.
+    Well below the noise scale, K views per step are worth about as much as K steps; well above it,
+    further views are wasted. The mean and the variance are of the mixture of the groups with
+    their shares. The result is infinite if the mean gradient cannot be distinguished from zero, and
+    NaN without variance.
 
     Args:
-        gramian: [V, V].
-        groups: Which views are near, and the groups' shares.
+        gramian: [V, V] dot products of gradients.
+        groups: The near views, and the groups' shares.
 
     Source: McCandlish et al. 2018, the simple noise scale.
     """
@@ -150,7 +153,7 @@ def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
 
 
 def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
-    """Unbiased estimate of ||p near mean + q far mean||^2."""
+    """Estimate ||p near mean + q far mean||^2 without bias."""
     near, (n, m), (p, q) = groups.near, groups.sizes, groups.shares
     weights = np.where(near, p / n, q / m)
     plain = float(weights @ gramian @ weights)
@@ -166,20 +169,20 @@ def _squared_mean(gramian: NDArray[np.float64], groups: Groups) -> float:
 
 
 Row: TypeAlias = Mapping[str, str | int | float]
-#: All blocks taken as one vector.
+#: Name of the part that concatenates all blocks into one vector.
 ALL = "all"
-#: The paper's R_op+DC is taken on these two together.
+#: The paper's R_op+DC concatenates these two blocks.
 AMPLITUDES = ("opacities", "f_dc")
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A block, or several taken as one vector.
+    """A block, or several blocks concatenated into one vector.
 
     Attributes:
-        name: Its name.
-        kind: Its kind.
-        members: Places of its blocks in the measurement.
+        name: Name of the part.
+        kind: Kind of the part.
+        members: Indices of its blocks in the measurement.
     """
 
     name: str
@@ -193,7 +196,7 @@ def table(
     distances: Mapping[str, NDArray[np.float64]],
     seed: int,
 ) -> list[Row]:
-    """The rows of one probe.
+    """Return the rows of one probe.
 
     Args:
         measurement: The Gramians.
@@ -224,7 +227,7 @@ def table(
 
 
 def _parts(measurement: Measurement) -> Iterator[_Part]:
-    """Every block, the amplitudes together, and everything together."""
+    """Yield every block, the amplitudes concatenated, and all blocks concatenated."""
     blocks = measurement.blocks
     for place, (name, kind) in enumerate(zip(blocks, measurement.kinds, strict=True)):
         yield _Part(name, kind, (place,))
@@ -242,7 +245,7 @@ def _block(
     plan: ProbePlan,
     rng: np.random.Generator,
 ) -> Row:
-    """Conflict, ratios and variances of a part from its blocks' Gramians [M, V, V]."""
+    """Return conflict, ratios and variances of a part from its blocks' Gramians [M, V, V]."""
     total = gramians.sum(axis=0)
     overlap: NDArray[np.bool_] = np.any(measurement.overlap[list(part.members)], axis=0)
     clashes = conflict(total[None], near, overlap[None])
@@ -279,7 +282,7 @@ def _distances(
     distances: Mapping[str, NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> Row:
-    """Exponents and conflict against distance."""
+    """Return the exponents, and the conflict against distance."""
     row: dict[str, str | int | float] = {}
     for name, values in distances.items():
         fit = distance_exponent(np.diag(gramian), values)
@@ -297,15 +300,15 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
 
 
 def per_pair_conflict(measurement: Measurement, near: NDArray[np.bool_]) -> float:
-    """The other reading of the conflict rate: share of a pair's blocks, averaged over pairs."""
+    """Return the share of a pair's blocks that conflict, averaged over pairs."""
     return conflict(measurement.plain, near, measurement.overlap).per_pair
 
 
 def touched(rows: Sequence[Row]) -> list[Row]:
-    """The rows of blocks that any view touched; the others (inactive SH bands) have no figures."""
+    """Return the rows of blocks with variance; other blocks (inactive SH bands) have no figures."""
     return [row for row in rows if float(row["sigma_w2"]) != 0.0]
 
 
 def rows_of(rows: Sequence[Row], metric: str) -> list[Row]:
-    """The rows of one metric."""
+    """Return the rows of one metric."""
     return [row for row in rows if row["metric"] == metric]

@@ -1,4 +1,4 @@
-"""Probing a run at an interval."""
+"""Probes of a run at an interval."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,15 +30,15 @@ from crossgrad_plugins.diagnostics.report import Report
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
 from crossgrad_plugins.groupings.heights import altitudes, upward
 
-#: Groupings that the one probe is also read by (the paper's prediction P4).
+#: Groupings by which the same probe is also evaluated (the paper's prediction P4).
 GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
 def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
-    """Name -> [N] distances of the training views.
+    """Return name -> [N] distances of the training views.
 
     `radial`: from the mean camera, as in the paper. `depth`: median depth of the SfM points over
-    the focal length relative to the median one, where every view sees some.
+    the focal length, relative to the median view; only if every view sees points.
     """
     views = scene.train_views
     found = {"radial": radial_distances(scene, views)}
@@ -49,7 +49,7 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
 
 
 def camera_rows(scene: Scene) -> list[Row]:
-    """Bimodality of heights and log-distances, and the variance of the distances."""
+    """Return the bimodality of heights and log-distances, and the variance of the distances."""
     axis, source = upward(scene)
     # Name -> values, and Var(r) / mean(r)^2 of a distance; heights have an arbitrary origin.
     heights = altitudes(scene, scene.train_views, axis)
@@ -74,7 +74,7 @@ def camera_rows(scene: Scene) -> list[Row]:
 
 
 def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row]:
-    """The same probe read by several groupings; those that cannot group the scene say why."""
+    """Return the same probe by several groupings; give the reason if one cannot group the scene."""
     rows: list[Row] = []
     for name, labels, reason in _groupings(scene, seed):
         if reason:
@@ -96,7 +96,7 @@ def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row
 
 
 def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """(name, labels, why there are none) of every grouping, and of the reported regimes."""
+    """Yield (name, labels, reason if none) of every grouping and of the scene's regimes."""
     regimes = tuple(view.regime for view in scene.train_views)
     if len(set(regimes)) > 1:
         yield "regime", regimes, ""
@@ -110,7 +110,7 @@ def _groupings(scene: Scene, seed: int) -> Iterator[tuple[str, tuple[str, ...], 
 
 
 def _part(measurement: Measurement, places: list[int]) -> Measurement:
-    """The measurement of some of its views."""
+    """Restrict a measurement to some of its views."""
     square = np.ix_(range(len(measurement.blocks)), places, places)
     return Measurement(
         step=measurement.step,
@@ -149,7 +149,7 @@ def _read_by(
 
 @dataclass
 class Watch:
-    """Probes the model every so many steps, and at the end; all probes look at the same views.
+    """An observer that probes the same views of the model at an interval, and at the end.
 
     Attributes:
         plan: The views and their groups.
@@ -168,13 +168,13 @@ class Watch:
     last: Measurement | None = None
 
     def due(self, step: int) -> bool:
-        """Whether a probe belongs after this step."""
-        # The probe at the end replaces the one shortly before it.
+        """Return True if a probe is due after this step."""
+        # The probe at the end replaces a probe shortly before it.
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl
     def crossgrad_model_ready(self, model: Model) -> None:
-        """Probes where it is time."""
+        """Probe the model if a probe is due."""
         if not self.due(model.phase.step):
             return
         start = perf_counter()
@@ -184,11 +184,11 @@ class Watch:
         self.rows += [{**row, "probe_seconds": seconds} for row in found]
 
     def report(self, scene: Scene, which: str) -> Report:
-        """Everything that was found out.
+        """Return the complete report.
 
         Args:
             scene: The scene.
-            which: The model that was probed, in words.
+            which: Description of the probed model.
 
         Raises:
             UserError: There was no probe.

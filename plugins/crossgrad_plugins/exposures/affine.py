@@ -11,17 +11,18 @@ from crossgrad_plugins.exposures.light import mapped
 from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 from crossgrad_plugins.exposures.srgb import EXPONENT, OFFSET, STRETCH
 
-#: Maps that (nearly) lose a colour cannot be undone; only files and very large rates bring them.
+#: Larger inverses belong to maps that (nearly) lose a colour and cannot be undone. Only values from
+#: files and very high learning rates lead to such maps.
 _LARGEST_INVERSE = 1e3
-#: What makes black of white is taken for so small a scale: 48 stops.
+#: A map that turns white into black counts as this scale: 48 stops.
 _DARKEST = 2.0**-20
 
 
 class Affine(ExposurePerPhoto):
-    """Each photo has A x + b for the render's sRGB value x; the mean of all maps is the identity.
+    """Each photo shows A x + b for the render's sRGB value x; the mean of all maps is the identity.
 
-    Twelve numbers a photo can also take in what is no exposure: they suit many photos with much
-    overlap.
+    The twelve numbers per photo can also model effects other than exposure. They suit many photos
+    with much overlap.
 
     Source: the exposure compensation of 3D Gaussian Splatting (2024).
     """
@@ -34,7 +35,7 @@ class Affine(ExposurePerPhoto):
 
     @override
     def of_stops(self, stops: Tensor) -> Tensor:
-        # What a gain in linear light is for all but dark values: s (x + o) - o.
+        # A gain in linear light equals this map for all but dark values: s (x + o) - o.
         scale = torch.exp2(stops / EXPONENT)[..., None, None]
         ones = torch.ones(3, 1, dtype=stops.dtype, device=stops.device)
         diagonal = torch.eye(3, dtype=stops.dtype, device=stops.device)
@@ -47,8 +48,8 @@ class Affine(ExposurePerPhoto):
 
     @override
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        # A sum would change what photos differ by, and make negatives of dark ones. So each map
-        # comes after `end` and the inverse of `start`.
+        # Adding the difference would change the relative exposure of photos, and could make dark
+        # values negative. So a photo's map is applied after `end` and then the inverse of `start`.
         inverse, failed = torch.linalg.inv_ex(start[:, :3])
         if failed or not inverse.abs().max() < _LARGEST_INVERSE:
             return super().shift(name, values, start, end)

@@ -1,4 +1,4 @@
-"""A gain per photo where SfM tracks say that photos differ in exposure, and no exposure."""
+"""A gain per photo if SfM tracks show that photos differ in exposure, else no exposure."""
 
 from collections.abc import Mapping
 
@@ -15,21 +15,21 @@ from crossgrad_plugins.exposures.tracks.gains import (
 
 
 class Auto(Exposure):
-    """Takes `gain` where the brightness of SfM tracks calls for it, and `none` elsewhere.
+    """Uses `gain` if the brightness of SfM tracks requires it, else `none`.
 
-    The gains are those that explain the brightness of the training photos at SfM points. `gain` is
-    taken if their standard deviation is at least 0.2 stops and at least four times its standard
-    error, and if they take at least 15 % off the deviation of points that join different photos.
+    The gains are fitted to the brightness of the training photos at SfM points. `gain` is used if
+    their standard deviation is at least 0.2 stops and at least four times its standard error, and
+    if they reduce the deviation of points that join different photos by at least 15 %.
     """
 
     @override
     def fitted_to(self, scene: Scene) -> Fitted:
         gains = deciding_gains(scene)
         if gains.differ:
-            # Not before: a run without exposure does not import it.
+            # Imported late, because a run without exposure does not need it.
             from crossgrad_plugins.exposures.gain import Gain
 
-            # Its remarks have the evidence.
+            # The messages of `Gain` contain the evidence.
             return Fitted(Gain(), "gain", ("exposure auto: gain",))
         rule = (
             f"less than {LEAST_SPREAD} stops, {LEAST_RATIO:.0f} standard errors or "
@@ -44,7 +44,7 @@ class Auto(Exposure):
 
 
 class NoExposure(Exposure):
-    """Compares renders with photos as they are: all are taken to have the same exposure."""
+    """Compares renders with photos directly; all photos are assumed to have the same exposure."""
 
     @override
     def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
@@ -52,7 +52,7 @@ class NoExposure(Exposure):
 
     @override
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """Names the option that helps where SfM tracks say that photos differ in exposure."""
+        """Name the option that helps if SfM tracks show that photos differ in exposure."""
         if not any(len(view.seen) for view in scene.train_views):
             return ()
         from crossgrad_plugins.exposures.tracks.gains import deciding_gains

@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 _IFD = 0x8769
 _TIME, _APERTURE, _SENSITIVITY = 33434, 33437, 34855  # ExposureTime, FNumber, ISOSpeedRatings
-#: What cameras write whose sensitivity does not fit into 16 bits.
+#: Cameras write this value if the sensitivity does not fit into 16 bits.
 _OVERFLOW = 65535
 
 
 def exposure_value(view: View) -> float | None:
-    """log2(t ISO / N^2) of a view's photo: how much brighter than others it shows the same light.
+    """Return log2(t ISO / N^2) of a view's photo: its brightness for the same light, in stops.
 
     Args:
         view: The view; its photo need not come from a file.
 
     Returns:
-        Stops, comparable between photos of one camera; None where the file does not tell exposure
-        time t, sensitivity and f-number N.
+        Stops, comparable between photos of one camera. None if the file lacks exposure time t,
+        sensitivity or f-number N.
     """
     photo = view.photo
     return _of_file(photo.source.path) if isinstance(photo, FilePhoto) else None
@@ -55,7 +55,7 @@ def _value(image: "Image") -> float | None:
 
 
 def _positive(value: object) -> float | None:
-    """The number of a tag; None where it is none, or not above 0."""
+    """Return the number of a tag; None if it is not a number above 0."""
     first = value[0] if isinstance(value, tuple) and value else value
     try:
         number = float(first)  # type: ignore[arg-type]
@@ -64,14 +64,14 @@ def _positive(value: object) -> float | None:
     return number if isfinite(number) and number > 0.0 else None
 
 
-#: Headers that are read at once.
+#: Number of headers that are read in parallel.
 _AT_ONCE = 4
-# A run asks at every evaluation, and a scene does not change.
+# Cached, because a run requests the values at every evaluation and a scene does not change.
 _KNOWN: "WeakKeyDictionary[Scene, Mapping[str, float]]" = WeakKeyDictionary()
 
 
 def exposure_values(scene: Scene) -> Mapping[str, float]:
-    """Name -> log2(t ISO / N^2) of all photos that tell; read once for a scene."""
+    """Return name -> log2(t ISO / N^2) of all photos with EXIF exposure; read once per scene."""
     found = _KNOWN.get(scene)
     if found is None:
         with ThreadPoolExecutor(_AT_ONCE) as pool:

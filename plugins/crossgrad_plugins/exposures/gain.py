@@ -12,10 +12,10 @@ from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 
 
 class Gain(ExposurePerPhoto):
-    """Each photo has 2^stops times the light of the scene; the stops of all have a mean of 0.
+    """Each photo shows 2^stops times the light of the scene; the stops of all have a mean of 0.
 
-    The render is decoded from sRGB, multiplied, and encoded again: what shutter, aperture and
-    sensitivity of a camera on automatic exposure do.
+    The render is decoded from sRGB, multiplied, and encoded again. Shutter, aperture and
+    sensitivity of a camera with automatic exposure have the same effect.
     """
 
     parameter: ClassVar[str] = "stops"
@@ -42,7 +42,7 @@ class Gain(ExposurePerPhoto):
 
 
 class ChannelGain(ExposurePerPhoto):
-    """As `gain`, with stops of its own for red, green and blue: exposure and white balance."""
+    """Like `gain`, with separate stops for red, green and blue: exposure and white balance."""
 
     parameter: ClassVar[str] = "stops"
 

@@ -1,4 +1,4 @@
-"""Where the exposure of each training photo starts: SfM tracks, EXIF, or neighbours."""
+"""Initial exposure of each training photo, from SfM tracks, EXIF, or neighbours."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-#: What a start is taken from.
+#: The source of the initial values.
 Start: TypeAlias = Literal["auto", "tracks", "exif", "none"]
-#: Photos so many stops from the mean share hardly any usable value with the others.
+#: Photos farther than this from the mean, in stops, share few usable values with other photos.
 _FAR = 4.0
 _NAMED = 3
-#: Photos that one is told from, at most.
+#: Maximum number of neighbours that predict a photo.
 TELLING = 4
-#: Of so many photos each is told by all others, both ways.
+#: Up to this number of photos, neighbours and regimes predict each photo alike.
 _SAME = 2
-#: Distances below it count alike, so that a photo taken twice does not outweigh all others.
+#: Smaller distances count as this one, so that a photo taken twice does not outweigh all others.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
-# A run asks for each held-out photo at every evaluation, and a scene does not change.
+# Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
 _KNOWN: "WeakKeyDictionary[Scene, Neighbours]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """The gains at the start.
+    """The initial gains.
 
     Attributes:
         stops: [P] stops above the mean of the training photos.
-        messages: Where they come from, and what is unusual about them.
+        messages: The source of the gains, and unusual photos.
     """
 
     stops: NDArray[np.float64]
@@ -48,11 +48,11 @@ class Starts:
 
 
 def starts_of(scene: Scene, start: Start) -> Starts:
-    """The gains of the training photos at the start.
+    """Return the initial gains of the training photos.
 
     Args:
         scene: The scene.
-        start: `tracks` or `exif` alone, `auto` both, tracks first; `none` starts from 0.
+        start: `tracks` or `exif` alone; `auto` for both, with tracks first; `none` for 0.
     """
     names = [view.name for view in scene.train_views]
     if len(names) == 1:
@@ -84,7 +84,7 @@ def starts_of(scene: Scene, start: Start) -> Starts:
 
 
 def _beside(told: dict[str, float], of_tracks: dict[str, float]) -> dict[str, float]:
-    """EXIF's stops on the scale of the tracks, or around their own mean where there are none."""
+    """Shift EXIF's stops to the scale of the tracks; without common photos, to a mean of 0."""
     if not told:
         return {}
     both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
@@ -93,7 +93,7 @@ def _beside(told: dict[str, float], of_tracks: dict[str, float]) -> dict[str, fl
 
 
 def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[np.float64], str]:
-    """NaN replaced by what neighbours or regimes tell, and by which of them."""
+    """Replace NaN by predictions of neighbours or regimes; return the source, too."""
     known = np.flatnonzero(~np.isnan(stops)).tolist()
     of_regime = "the mean of their regime"
     if not len(known):
@@ -118,7 +118,7 @@ def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
 
 
 def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
-    """What there is to say of photos, each with its stops from the mean."""
+    """Yield a message if photos are far from the mean, from each photo's stops."""
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (
@@ -134,10 +134,10 @@ def _some(names: Sequence[str]) -> str:
 
 
 class Neighbours:
-    """Some photos by where they were taken and where they look.
+    """Photos by their camera's position and viewing direction.
 
-    The distance of two cameras is that of their centres, in median distances from the middle of
-    all, and that of their unit viewing directions, squared and added.
+    The squared distance of two cameras is the squared distance of their centres, in units of the
+    median distance from the middle, plus that of their unit viewing directions.
     """
 
     def __init__(self, views: Sequence[View]) -> None:
@@ -150,19 +150,19 @@ class Neighbours:
         self._regimes = np.unique([view.regime for view in views], return_inverse=True)[1]
 
     def rows_and_weights(self, camera: Camera) -> tuple[NDArray[np.int64], _Floats]:
-        """The photos [N] that tell of one with this camera, and their weights, of sum 1."""
+        """Return the photos [N] that predict a photo with this camera, and weights of sum 1."""
         rows, weights = self._told(self._place(camera)[None], min(TELLING, len(self._places)))
         return rows[0], weights[0]
 
     def errors(self, values: _Floats) -> tuple[float, float]:
-        """How far off a photo would be had it been left out, by root mean square.
+        """Return the leave-one-out errors of the values of the photos, as root mean square.
 
         Args:
             values: [P, V] of the photos, P > 1.
 
         Returns:
-            Told by its neighbours; by the mean over the others of its regime, over all others
-            where it has none.
+            The error of the prediction by neighbours, and the error of the mean over the other
+            photos of the regime. A photo alone in its regime uses the mean of all other photos.
         """
         rows, weights = self._others
         near = (weights[..., None] * values[rows]).sum(axis=1)
@@ -171,23 +171,26 @@ class Neighbours:
         return of_near, of_regime
 
     def tell(self, values: _Floats) -> bool:
-        """Whether neighbours tell more of each other than regimes do; of two photos, neither."""
+        """Return True if neighbouring photos predict a photo's values better than its regime does.
+
+        With only two photos, return False.
+        """
         if len(values) <= _SAME:
             return False
         of_near, of_regime = self.errors(values)
         return of_near < of_regime
 
     def _place(self, camera: Camera) -> _Floats:
-        """[6] where a camera stands and looks."""
+        """Return position and viewing direction [6] of a camera."""
         looks = camera.world_to_camera[2, :3].numpy()
         return np.concatenate([(camera.center.numpy() - self._middle) / self._scale, looks])
 
     @cached_property
     def _others(self) -> tuple[NDArray[np.int64], _Floats]:
-        """[P, N] the other photos that tell of each, and their weights."""
+        """The other photos [P, N] that predict each photo, and their weights."""
         count = min(TELLING + 1, len(self._places))
         rows, weights = self._told(self._places, count)
-        # Photos taken in one place may come in any order: a photo is itself wherever it comes.
+        # Photos at the same position come in any order, so a photo is excluded wherever it appears.
         weights[rows == np.arange(len(rows))[:, None]] = 0.0
         return rows, weights / weights.sum(axis=1, keepdims=True)
 
@@ -203,7 +206,7 @@ class Neighbours:
         return rows, weights / weights.sum(axis=1, keepdims=True)
 
     def _means(self, values: _Floats) -> _Floats:
-        """[P, V] means over the others of each photo's regime."""
+        """Return the means [P, V] over the other photos of each photo's regime."""
         sums = np.zeros((self._regimes.max() + 1, values.shape[1]))
         np.add.at(sums, self._regimes, values)
         counts = np.bincount(self._regimes)[self._regimes][:, None]
@@ -213,7 +216,7 @@ class Neighbours:
 
 
 def neighbours_of(scene: Scene) -> Neighbours:
-    """Those among the training photos of a scene, worked out once for it."""
+    """Return the neighbours among the training photos of a scene; computed once per scene."""
     found = _KNOWN.get(scene)
     if found is None:
         found = _KNOWN[scene] = Neighbours(scene.train_views)

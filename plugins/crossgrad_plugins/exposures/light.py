@@ -1,4 +1,4 @@
-"""Images through gains and affine maps: compiled on the CPU in float32, plain torch elsewhere."""
+"""Gains and affine maps of images: compiled on the CPU in float32, plain torch elsewhere."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from crossgrad_plugins.exposures import srgb
 
 
 def with_gain(image: Tensor, stops: Tensor) -> Tensor:
-    """The image with 2^stops times the light, decoded from sRGB for it and encoded again.
+    """Return the image with 2^stops times the light; it is decoded from sRGB and encoded again.
 
     Args:
         image: [H, W, 3] sRGB values, also outside [0, 1].
@@ -25,11 +25,11 @@ def with_gain(image: Tensor, stops: Tensor) -> Tensor:
 
 
 def mapped(image: Tensor, matrix: Tensor) -> Tensor:
-    """A x + b of every pixel x, in sRGB values.
+    """Return A x + b of every pixel x, in sRGB values.
 
     Args:
-        image: [H, W, 3].
-        matrix: [3, 4] A beside b.
+        image: [H, W, 3] sRGB values.
+        matrix: [3, 4], the matrix [A | b].
     """
     if not _is_compiled(image, matrix):
         return image @ matrix[:, :3].T + matrix[:, 3]
@@ -95,5 +95,5 @@ class _Affine(torch.autograd.Function):
 
 
 def _flat(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """The numbers of a contiguous tensor without a graph, shared."""
+    """Return the numbers of a contiguous tensor without a graph, as shared memory."""
     return tensor.view(-1).numpy()

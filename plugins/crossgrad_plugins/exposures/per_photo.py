@@ -1,4 +1,4 @@
-"""Base of exposures with values per photo: start, rates, and the values of unseen photos."""
+"""Base class of exposures with values per photo: start, learning rates, unseen photos."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ from crossgrad_plugins.exposures.initial_values import Start, neighbours_of, out
 
 
 class ExposurePerPhoto(Exposure):
-    """An exposure with one parameter of which every training photo has a value.
+    """An exposure with one parameter that has a value for every training photo.
 
-    Values start from the gains that SfM tracks or EXIF tell, learn at rates of their own, and keep
-    a neutral mean over the training photos: so the scene keeps its own brightness and colours.
+    Values start from the gains of SfM tracks or EXIF, and use their own learning rates. Their mean
+    over the training photos stays neutral, so that the scene keeps its own brightness and colours.
 
     Attributes:
         parameter: Name of the parameter.
@@ -38,19 +38,19 @@ class ExposurePerPhoto(Exposure):
 
     @abstractmethod
     def of_stops(self, stops: Tensor) -> Tensor:
-        """Values [..., V] that stand for gains of so many stops [...]."""
+        """Return the values [..., V] for gains in stops [...]."""
 
     @abstractmethod
     def in_stops(self, values: Tensor) -> Tensor:
-        """Stops [...] or [..., 3] by which values [..., V] brighten what is white."""
+        """Return the stops [...] or [..., 3] by which values [..., V] brighten white."""
 
     @abstractmethod
     def beside(self, values: Tensor, stops: Tensor) -> Tensor:
-        """Values [P, V] of photos that differ from those of `values` by stops [P]."""
+        """Return the values [P, V] of photos that differ from `values` by stops [P]."""
 
     @abstractmethod
     def neutral(self) -> Tensor:
-        """What the mean of the values is held at."""
+        """Return the mean that the values are kept at."""
 
     @override
     def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
@@ -73,7 +73,7 @@ class ExposurePerPhoto(Exposure):
         return {name: self._centred(each.double()) for name, each in values.items()}
 
     def _centred(self, values: Tensor) -> Tensor:
-        """The values [P, V] in float64 with their mean where it belongs, in float32."""
+        """Shift the values [P, V], in float64, to a neutral mean; return them in float32."""
         neutral = self.neutral().to(values, non_blocking=True)
         return self.shift(self.parameter, values, values.mean(dim=0), neutral).float()
 
@@ -81,16 +81,16 @@ class ExposurePerPhoto(Exposure):
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """By EXIF, where the view and training photos have it; else by neighbours or by regime.
+        """Predict by EXIF if the view and training photos have it; else by neighbours or regime.
 
-        Neighbours are the training photos nearest in pose. They are asked where they tell more of
-        each other than the mean over a regime does.
+        Neighbours are the training photos nearest in pose. They are used if they predict each other
+        better than the mean over a regime does.
         """
         told = exposure_values(scene)
         own = values[self.parameter]
         rows = [row for row, each in enumerate(scene.train_views) if each.name in told]
         if view.name in told and rows:
-            # Sensors differ, and a regime often has one of its own.
+            # Sensors differ, and a regime often has its own sensor.
             rows = [row for row in rows if scene.train_views[row].regime == view.regime] or rows
             stops = [told[view.name] - told[scene.train_views[row].name] for row in rows]
             shift = self.beside(own[rows], torch.tensor(stops).to(own))
@@ -103,7 +103,7 @@ class ExposurePerPhoto(Exposure):
         return {self.parameter: torch.tensordot(shares, own[torch.from_numpy(near)], dims=1)}
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """`decay` without a rate."""
+        """Report `decay` as unused if the rate is 0."""
         if self.rate:
             return {}
         return {"decay": "exposure.rate is 0: the values stay where they start"}

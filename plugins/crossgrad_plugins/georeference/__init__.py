@@ -1,1 +1,1 @@
-"""Where on Earth a scene is, and its Gaussians in coordinates of maps."""
+"""Georeferencing of scenes, and conversion of Gaussians to map coordinates."""

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.georeference.frames import Frame3D
 
-#: WGS 84: half the longer axis in metres, and the square of the eccentricity.
+#: WGS 84: semi-major axis in metres, flattening, and square of the eccentricity.
 _AXIS: Final = 6_378_137.0
 _FLATTENING: Final = 1 / 298.257223563
 _ECCENTRICITY: Final = _FLATTENING * (2 - _FLATTENING)
-#: Farther than this from the surface, in metres, no photo is taken.
+#: Maximum distance of a photo from the Earth's surface, in metres.
 _HIGHEST: Final = 100_000.0
 _PASSES: Final = 10
 
@@ -28,12 +28,12 @@ class Place:
 
     @property
     def text(self) -> str:
-        """Latitude and longitude to a centimetre."""
+        """Latitude and longitude as text, to a centimetre."""
         return f"latitude {self.latitude:.7f}, longitude {self.longitude:.7f}"
 
     @property
     def to_enu(self) -> Frame3D:
-        """From geocentric coordinates to metres east, north and up from here."""
+        """The frame change from geocentric coordinates to metres east, north and up from here."""
         sine, cosine, sine_l, cosine_l = (
             *(math.sin(math.radians(self.latitude)), math.cos(math.radians(self.latitude))),
             *(math.sin(math.radians(self.longitude)), math.cos(math.radians(self.longitude))),
@@ -50,7 +50,7 @@ class Place:
 
 
 def geocentric(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 3] metres from the Earth's centre of latitudes, longitudes (degrees) and altitudes."""
+    """Return geocentric coordinates [N, 3] in metres of latitudes, longitudes (deg), altitudes."""
     latitude, longitude = np.radians(places[:, :2]).T
     bend = _AXIS / np.sqrt(1 - _ECCENTRICITY * np.sin(latitude) ** 2)
     around = (bend + places[:, 2]) * np.cos(latitude)
@@ -59,7 +59,7 @@ def geocentric(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def place_at(point: NDArray[np.float64]) -> Place | None:
-    """The place of geocentric coordinates [3]; None where it is not near the Earth's surface."""
+    """Return the place of geocentric coordinates [3]; None if far from the Earth's surface."""
     x, y, z = (float(value) for value in point)
     around = math.hypot(x, y)
     if not abs(math.hypot(around, z) - _AXIS) < _HIGHEST:
@@ -69,7 +69,7 @@ def place_at(point: NDArray[np.float64]) -> Place | None:
         bend = _AXIS / math.sqrt(1 - _ECCENTRICITY * math.sin(latitude) ** 2)
         latitude = math.atan2(z + _ECCENTRICITY * bend * math.sin(latitude), around)
     sine, cosine = math.sin(latitude), math.cos(latitude)
-    # Along the vertical, which holds at the poles and at the equator.
+    # The altitude along the vertical; this formula also holds at the poles and at the equator.
     flat = _AXIS * math.sqrt(1 - _ECCENTRICITY * sine**2)
     altitude = around * cosine + z * sine - flat
     return Place(math.degrees(latitude), math.degrees(math.atan2(y, x)), altitude)

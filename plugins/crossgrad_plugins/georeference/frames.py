@@ -1,4 +1,4 @@
-"""Similarities from one frame of the world to another, known or fitted to points.
+"""Similarities between two frames of the world, known or fitted to points.
 
 Source of the least-squares similarity: Umeyama 1991; of the search among triples by their median
 residual: Rousseeuw 1984.
@@ -10,22 +10,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: What a rotation may be off by where its digits were rounded; it is made orthonormal again.
+#: Maximum deviation of a rotation with rounded digits; it is made orthonormal again.
 _ROUNDED: Final = 1e-3
 _EXACT: Final = 1e-12
 _LAST_ROW: Final = np.array([0.0, 0.0, 0.0, 1.0])
-#: Fewer than these leave none to compare with; none of so few is rejected.
+#: Minimum number of points for a fit with a residual, and minimum number for rejecting outliers.
 FEWEST, _FEWEST_TO_REJECT = 3, 8
-#: Triples that are tried, on how many of the points at most, and passes of leaving out.
+#: Number of triples that are tried, maximum number of points per trial, and maximum number of
+#: rejection passes.
 _TRIPLES, _MOST_TRIED, _PASSES = 500, 100, 50
-#: Residuals beyond so many medians are wrong; of normal errors one in 10^5 is where two axes have
-#: them alike, and fewer where three do.
+#: Residuals beyond this many medians are outliers. Of normal errors, one in 10^5 is beyond it if
+#: two axes have equal errors, and fewer if three have.
 _FAR: Final = 4.0
-#: Share of the extent that is rounding, not error.
+#: Residuals below this share of the extent are rounding errors.
 _ROUNDING: Final = 1e-9
-#: Radians by which the whole may turn about its longest extent, standard error.
+#: Maximum standard error of the turn about the longest extent, radians.
 _LARGEST_TILT: Final = np.radians(10.0)
-#: A hundred times closer to a line than that is on it, however exact the measurements.
+#: Points closer to a line than this share of their extent count as collinear, even if exact.
 _THINNEST: Final = 1e-5
 
 
@@ -44,11 +45,11 @@ class Frame3D:
     scale: float = 1.0
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points."""
+        """Map points [N, 3]."""
         return np.asarray(self.scale * (points @ self.rotation.T) + self.shift)
 
     def after(self, first: "Frame3D") -> "Frame3D":
-        """Both similarities in one: `first`, then this one."""
+        """Return both similarities as one: `first`, then this one."""
         return Frame3D(
             self.rotation @ first.rotation,
             self.points(first.shift[None])[0],
@@ -57,13 +58,13 @@ class Frame3D:
 
     @property
     def inverse(self) -> "Frame3D":
-        """The way from the other frame to the one."""
+        """The similarity in the opposite direction."""
         turned = self.rotation.T
         return Frame3D(turned, -turned @ self.shift / self.scale, 1.0 / self.scale)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[4, 4], for columns (x, y, z, 1)."""
+        """The similarity as a matrix [4, 4] for columns (x, y, z, 1)."""
         whole = np.eye(4)
         whole[:3, :3], whole[:3, 3] = self.scale * self.rotation, self.shift
         return whole
@@ -73,11 +74,12 @@ SAME: Final = Frame3D(np.eye(3), np.zeros(3))
 
 
 def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The rotation [3, 3] that a matrix is, up to the rounding of its digits; None if it is none.
+    """Return the rotation [3, 3] nearest to a matrix; None if the matrix is not a rotation.
 
-    A matrix that is orthonormal to float64 comes back as it is.
+    The matrix may deviate by the rounding of its digits. A matrix that is orthonormal to float64 is
+    returned unchanged.
     """
-    # What overflows is off as well, and so is what is not a number.
+    # Overflow and NaN also fail the test below.
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(matrix.T @ matrix - np.eye(3)).max()
     if not off <= _ROUNDED or np.linalg.det(matrix) < 0.0:
@@ -89,7 +91,7 @@ def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def similarity_of(matrix: NDArray[np.float64]) -> Frame3D | None:
-    """The similarity that a matrix [4, 4] is; None where it stretches unevenly or mirrors."""
+    """Return the similarity of a matrix [4, 4]; None if it stretches unevenly or mirrors."""
     with np.errstate(over="ignore", invalid="ignore"):
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not 0.0 < scale < np.inf or np.abs(matrix[3] - _LAST_ROW).max() > 0.0:
@@ -100,12 +102,12 @@ def similarity_of(matrix: NDArray[np.float64]) -> Frame3D | None:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A similarity of points to measured ones.
+    """A similarity fitted from points to measured points.
 
     Attributes:
         frame: The similarity.
         errors: [N, 3] measured minus fitted, in the frame of the measured points.
-        kept: [N] bool, which points it was fitted to.
+        kept: [N] bool, True for the points used in the fit.
         tilt: Standard error of the turn about the longest extent of the points, radians.
     """
 
@@ -116,10 +118,10 @@ class Fit:
 
 
 def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -> Fit | str:
-    """The similarity from points [N, 3] to measured ones [N, 3], or why none can be told.
+    """Fit the similarity from points [N, 3] to measured points [N, 3], or return why it fails.
 
-    Deterministic. From eight points on, those whose residuals are far beyond the others' are left
-    out, as long as more than half agree.
+    The result is deterministic. With eight points or more, outliers are rejected, as long as more
+    than half of the points agree.
     """
     if len(points) < FEWEST:
         return f"there are {len(points)} of them, and {FEWEST} are needed"
@@ -128,7 +130,7 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
         kept = _agreeing(points, measured)
     frame = _frame(points[kept], measured[kept])
     errors = measured - frame.points(points)
-    # Three points leave two numbers of nine: seven have gone into the similarity.
+    # The similarity has seven parameters, so three points leave two of nine degrees of freedom.
     sigma = float(np.sqrt((errors[kept] ** 2).sum() / (3 * int(kept.sum()) - 7)))
     posed = frame.scale * (points[kept] - points[kept].mean(axis=0))
     along, *across = np.linalg.svd(posed, compute_uv=False)
@@ -142,7 +144,7 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
 
 
 def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[N] bool, the points that agree with each other."""
+    """Return the points [N], as bool, that agree with each other."""
     rng = np.random.default_rng(0)
     triples = np.argsort(rng.random((_TRIPLES, len(points))), axis=1)[:, :FEWEST]
     rotations, shifts, scales = _fitted(points[triples], measured[triples])
@@ -153,7 +155,7 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
-    # Worked out again the residuals are rounded in another way: half of them must remain.
+    # The residuals are computed again with other rounding; half of the points must remain.
     half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
     kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half
     for _ in range(_PASSES):
@@ -166,7 +168,7 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
 
 
 def _frame(points: NDArray[np.float64], measured: NDArray[np.float64]) -> Frame3D:
-    """The least-squares similarity of points [N, 3] to measured ones [N, 3]."""
+    """Return the least-squares similarity from points [N, 3] to measured points [N, 3]."""
     (rotation,), (shift,), (scale,) = _fitted(points[None], measured[None])
     return Frame3D(rotation, shift, float(scale))
 
@@ -174,11 +176,11 @@ def _frame(points: NDArray[np.float64], measured: NDArray[np.float64]) -> Frame3
 def _fitted(
     points: NDArray[np.float64], measured: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Rotations [S, 3, 3], shifts [S, 3] and scales [S] of S sets of points [S, N, 3]."""
+    """Fit S sets of points [S, N, 3]; return rotations [S, 3, 3], shifts [S, 3] and scales [S]."""
     middle, aim = points.mean(axis=1), measured.mean(axis=1)
     source, target = points - middle[:, None], measured - aim[:, None]
     left, sizes, right = np.linalg.svd(target.transpose(0, 2, 1) @ source)
-    # A mirrored solution is turned about its shortest axis.
+    # A mirrored solution is corrected along its shortest axis.
     signs = np.ones_like(sizes)
     signs[:, 2] = np.sign(np.linalg.det(left @ right))
     rotations = (left * signs[:, None]) @ right

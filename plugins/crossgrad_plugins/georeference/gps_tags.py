@@ -1,4 +1,4 @@
-"""Where a photo was taken, by the GPS tags of its EXIF header."""
+"""The position of a photo, from the GPS tags of its EXIF header."""
 
 import math
 from collections.abc import Mapping
@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: Latitude and longitude in degrees, and the altitude, each of which may be NaN.
+#: Latitude and longitude in degrees, and altitude in metres; each may be NaN.
 Numbers: TypeAlias = tuple[float, float, float]
 _IFD: Final = 0x8825
 _SOUTH_OR_WEST: Final = {"S", "W"}
-#: EXIF says so of altitudes below the sea, and below the ellipsoid.
+#: EXIF values of altitudes below sea level, and below the ellipsoid.
 _BELOW: Final = {1, 3}
 _STEPS: Final = (1.0, 60.0, 3600.0)
 
 
 def gps_of(image: "Image") -> Numbers:
-    """What the tags of a photo say; NaN where they do not, or say no number."""
+    """Return the position in the tags of a photo; NaN for missing or invalid numbers."""
     tags: Mapping[int, object] = image.getexif().get_ifd(_IFD)
     latitude, longitude = (_degrees(tags.get(side), tags.get(side + 1)) for side in (1, 3))
     below, altitude = tags.get(5), number(tags.get(6))
@@ -27,16 +27,16 @@ def gps_of(image: "Image") -> Numbers:
 
 
 def is_place(latitude: float, longitude: float) -> bool:
-    """Whether degrees are a place on Earth where photos are taken.
+    """Return True if degrees are a possible place of a photo on Earth.
 
-    A receiver without a fix writes 0, 0, which lies in the sea off Ghana.
+    A receiver without a fix writes 0, 0, which is in the sea off Ghana.
     """
     there = abs(latitude) <= 90.0 and abs(longitude) <= 180.0  # noqa: PLR2004 - degrees
     return there and (latitude, longitude) != (0.0, 0.0)
 
 
 def _degrees(side: object, value: object) -> float:
-    """Degrees of degrees, minutes and seconds, negative in the south and in the west, or NaN."""
+    """Convert degrees, minutes, seconds to degrees; negative in south and west, NaN if invalid."""
     if not isinstance(value, tuple) or not 1 <= len(value) <= len(_STEPS):
         return math.nan
     degrees = sum(number(part) / step for part, step in zip(value, _STEPS, strict=False))
@@ -44,7 +44,7 @@ def _degrees(side: object, value: object) -> float:
 
 
 def number(value: object) -> float:
-    """The number that a tag or a word is; NaN where it is none."""
+    """Convert a tag or a word to a number; NaN if it is not a number."""
     try:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):

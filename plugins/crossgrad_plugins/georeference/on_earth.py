@@ -1,4 +1,4 @@
-"""A scene whose place on Earth is known."""
+"""A scene with a known position on Earth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,15 +18,15 @@ from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.georeference.projection import Projection, utm_code
 from crossgrad_plugins.rasterizers.reference.harmonics import harmonics
 
-#: Directions in which the harmonics of a turned frame are compared; more than twice as many as
-#: there are harmonics.
+#: Number of directions in which the harmonics of a rotated frame are compared; more than twice the
+#: number of harmonics.
 _DIRECTIONS = 48
 
 
 def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
-    """Gaussians about other centres [N, 3], each turned by one rotation [3, 3] float64.
+    """Return Gaussians with other centres [N, 3], each rotated by one rotation [3, 3] float64.
 
-    A camera that is turned alike sees what it saw before.
+    A camera that is moved in the same way sees the same image.
     """
     x, y, z, w = Rotation.from_matrix(rotation.cpu().numpy()).as_quat().tolist()
     quats = _product((w, x, y, z), gaussians.quats)
@@ -38,17 +38,17 @@ def turned(gaussians: Gaussians, means: Tensor, rotation: Tensor) -> Gaussians:
 
 
 def _product(first: tuple[float, ...], second: Tensor) -> Tensor:
-    """The quaternions [N, 4] wxyz of a turn by `second` [N, 4], then by `first`."""
+    """Return the quaternions [N, 4] wxyz of a rotation by `second` [N, 4], then by `first`."""
     w, x, y, z = first
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return second @ torch.tensor(rows, dtype=torch.float64).T.to(second)
 
 
 def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
-    """[B, B] float64, what turns coefficients of bands 1 to `degree` (B of them).
+    """Return the matrix [B, B], float64, that rotates coefficients of bands 1 to `degree`.
 
-    Harmonics of a turned direction are linear in those of the direction, with an orthogonal matrix
-    for each band; it is told by their values in enough directions.
+    The harmonics of a rotated direction are linear in the harmonics of the direction, with an
+    orthogonal matrix for each band. The matrix is fitted to their values in enough directions.
     """
     directions = _directions()
     before, after = (harmonics(each, degree)[:, 1:] for each in (directions, directions @ rotation))
@@ -58,13 +58,13 @@ def _harmonics_turn(rotation: Tensor, degree: int) -> Tensor:
 
 @cache
 def _directions() -> Tensor:
-    """[48, 3] float64 unit vectors all around."""
+    """Return unit vectors [48, 3], float64, in all directions."""
     drawn = torch.randn((_DIRECTIONS, 3), generator=torch.Generator().manual_seed(0)).double()
     unit: Tensor = drawn / drawn.norm(dim=1, keepdim=True)
     return unit
 
 
-#: How far photos are from where their GPS says, in metres: 3-D, along the ground, upright.
+#: Distances of photos from their GPS positions, in metres: 3-D, along the ground, vertical.
 RESIDUALS: Final = ("median", "rms", "max", "rms_horizontal", "rms_vertical")
 _CONVENTION: Final = (
     "position = numbers of the file + offset; [east, north, up, 1] = transform [position, 1], "
@@ -75,15 +75,17 @@ _CONVENTION: Final = (
 
 @dataclass(frozen=True, eq=False)
 class OnEarth:
-    """A scene whose place on Earth is known.
+    """A scene with a known position on Earth.
 
     Attributes:
-        origin: Of east, north, up.
-        to_enu: From the coordinates of the scene's input to metres east, north and up from there.
-        source: What told it.
-        residuals: Metres by name, of `RESIDUALS`; empty where nothing could be compared.
-        system: Of the input, where that is in coordinates of maps. They are no similarity of east,
-            north, up: centres go by the system, and `to_enu` fits it best at the origin.
+        origin: The origin of east, north, up.
+        to_enu: From the coordinates of the scene's input to metres east, north and up from the
+            origin.
+        source: The source of the georeference.
+        residuals: Name from `RESIDUALS` -> metres; empty if there was nothing to compare.
+        system: The coordinate system of the input, if the input is in map coordinates. Map
+            coordinates are not a similarity of east, north, up: centres are converted by the
+            system, and `to_enu` is the best fit at the origin.
     """
 
     origin: Place
@@ -129,7 +131,7 @@ class OnEarth:
         return replace(placed, notes=projection.messages)
 
     def _enu_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] metres east, north and up from the origin of points [N, 3] of the input."""
+        """Convert points [N, 3] of the input to metres east, north, up from the origin [N, 3]."""
         if self.system is None:
             return self.to_enu.points(points)
         return self.origin.to_enu.points(self.system.geocentric(points))
@@ -142,10 +144,10 @@ class OnEarth:
         points: NDArray[np.float64],
         facts: dict[str, Json],
     ) -> Placed:
-        """Gaussians about `points` [N, 3], turned and scaled by a similarity from the input frame.
+        """Return Gaussians at `points` [N, 3], rotated and scaled by a similarity from the input.
 
-        They get a frame of their own, turned against the local one and of its size, so that an
-        exporter only moves and scales them.
+        They get their own frame, which is rotated against the local frame and has the same size, so
+        that an exporter only moves and scales them.
         """
         offset = frame.points(similarity.offset[None])[0]
         own = Similarity(offset, similarity.scale / frame.scale)
@@ -154,7 +156,7 @@ class OnEarth:
         return Placed(moved, own, {**facts, **self._ways(frame)})
 
     def _facts(self) -> dict[str, Json]:
-        """What holds in any coordinates."""
+        """Return the facts that hold in any coordinates."""
         residuals: dict[str, Json] = dict(self.residuals)
         return {
             "crs": None,
@@ -165,7 +167,7 @@ class OnEarth:
         }
 
     def _ways(self, frame: Frame3D) -> dict[str, Json]:
-        """The matrices of a file in coordinates to which `frame` leads from those of the input."""
+        """Return the matrices of a file in the coordinates to which `frame` maps the input."""
         back = frame.inverse
         to_enu = self.to_enu.after(back)
         return {
@@ -180,9 +182,9 @@ def _means(gaussians: Gaussians) -> NDArray[np.float64]:
 
 
 def _apart(points: NDArray[np.float64], others: NDArray[np.float64]) -> float | None:
-    """How far two sets of points [N, 3] are apart; None where there are none.
+    """Return the distance between two sets of points [N, 3]; None without finite distances.
 
-    Of all but the farthest hundredth, which may be as far as the horizon.
+    The distance is the 99th percentile, because the farthest points may be at the horizon.
     """
     off = np.linalg.norm(points - others, axis=1)
     off = off[np.isfinite(off)]

@@ -1,4 +1,4 @@
-"""Coordinates of maps, by their EPSG codes."""
+"""Map coordinates, by their EPSG codes."""
 
 import re
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ _CODE: Final = re.compile(r"epsg:[0-9]{1,6}", re.IGNORECASE | re.ASCII)
 _SHOWN: Final = 80
 #: Geocentric coordinates of WGS 84.
 GEOCENTRIC: Final = "epsg:4978"
-#: Metres to both sides of a place between which a projection is told by its ends.
+#: Distance in metres on both sides of a place between which a projection is linearized.
 _NEAR: Final = 10.0
-#: Metres of accuracy that need no mention.
+#: Accuracy in metres that needs no message.
 _KNOWN_WELL: Final = 1.0
-#: What a projection may stretch in one direction more than in another; a UTM zone does by 0.001.
+#: Maximum relative difference of scale between directions; a UTM zone has 0.001.
 _UNEVEN: Final = 0.005
 
 
@@ -31,9 +31,9 @@ class Projection:
     """A coordinate reference system with metres or another unit of length on all axes.
 
     Attributes:
-        code: Such as `epsg:32633`.
-        forward: From geocentric coordinates, x east and y north where it is a map.
-        accuracy: Metres to which it is known in WGS 84; None where PROJ does not say.
+        code: The code, such as `epsg:32633`.
+        forward: From geocentric coordinates; for a map, x is east and y is north.
+        accuracy: Accuracy in metres relative to WGS 84; None if PROJ does not report it.
     """
 
     code: str
@@ -42,16 +42,16 @@ class Projection:
 
     @classmethod
     def of(cls, code: str, where: str) -> "Projection":
-        """The system of a code.
+        """Return the system of a code.
 
         Args:
-            code: Such as `epsg:32633`.
-            where: Names in errors what asked for it.
+            code: A code such as `epsg:32633`.
+            where: Origin of the request, for error messages.
 
         Raises:
-            UserError: It is no code, there is no such code, a grid is missing, or pyproj.
+            UserError: The code is invalid or unknown, or a grid or pyproj is missing.
         """
-        # Other forms of PROJ may name files anywhere.
+        # Other forms of PROJ could name files anywhere.
         if not _CODE.fullmatch(code):
             raise _unknown(where, repr(code)[:_SHOWN])
         try:
@@ -73,12 +73,12 @@ class Projection:
 
     @property
     def facts(self) -> dict[str, Json]:
-        """Of `.georef.json`, for a file in it."""
+        """The entries of `.georef.json` for a file in this system."""
         return {"crs": self.code.upper(), "crs_accuracy_m": self.accuracy}
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What the user should know about coordinates in it."""
+        """Messages on the accuracy of coordinates in this system."""
         if self.accuracy is None:
             return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)
         if self.accuracy > _KNOWN_WELL:
@@ -86,24 +86,24 @@ class Projection:
         return ()
 
     def points(self, geocentric: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] from geocentric coordinates [N, 3]; infinite where there are none."""
+        """Convert geocentric coordinates [N, 3] to this system [N, 3]; infinite if undefined."""
         return np.column_stack(self.forward.transform(*geocentric.T))
 
     def geocentric(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] geocentric coordinates of points [N, 3]; NaN where there are none."""
+        """Convert points [N, 3] to geocentric coordinates [N, 3]; NaN if undefined."""
         found = np.column_stack(self.forward.transform(*points.T, direction="INVERSE"))
         return np.where(np.isfinite(found), found, np.nan)
 
     def near(self, to_enu: Frame3D, place: NDArray[np.float64], where: str) -> Frame3D:
-        """The similarity from east, north, up to this system that fits best around a place.
+        """Fit the similarity from east, north, up to this system around a place.
 
         Args:
             to_enu: From geocentric coordinates.
             place: [3] in east, north, up.
-            where: Names in errors what asked for it.
+            where: Origin of the request, for error messages.
 
         Raises:
-            UserError: Around the place the system stretches unevenly, mirrors, or is not defined.
+            UserError: Around the place the system stretches unevenly, mirrors, or is undefined.
         """
         ends = place + _NEAR * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         here, *sides = self.points(to_enu.inverse.points(ends))
@@ -142,6 +142,6 @@ def _unknown(where: str, found: str) -> UserError:
 
 
 def utm_code(place: Place) -> str:
-    """The EPSG code of the UTM zone of a place (WGS 84), without the exceptions of Norway."""
+    """Return the EPSG code of a place's UTM zone (WGS 84), without the exceptions of Norway."""
     zone = int((place.longitude + 180.0) // 6.0) % 60 + 1
     return f"epsg:{(32600 if place.latitude >= 0.0 else 32700) + zone}"

@@ -1,4 +1,4 @@
-"""Progress in a terminal or notebook: a bar; elsewhere plain lines on stderr."""
+"""Progress of a run: a bar in a terminal or notebook, else plain lines on stderr."""
 
 import sys
 from time import monotonic
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counted in most steps, hence no news.
+#: Counts that most steps report, so they are not shown.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 
@@ -37,8 +37,8 @@ class Progress(Observer):
     """Shows step, loss, PSNR, primitives, speed and time left on stderr.
 
     Attributes:
-        level: How much is shown.
-        interval: Seconds between plain lines; one also comes at every tenth of the run.
+        level: The amount of output.
+        interval: Seconds between plain lines; a line also comes at every tenth of the run.
     """
 
     level: Literal["quiet", "normal", "verbose"] = Field(
@@ -48,7 +48,7 @@ class Progress(Observer):
     )
     interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
 
-    # What is on the screen; no part of the run's state.
+    # The state of the display; it is not part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
     _tenth: int = PrivateAttr(default=1)
     _bar: "tqdm[Any] | None" = PrivateAttr(default=None)
@@ -56,7 +56,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Shows the scene, the length, the device and the decisions; with `verbose` all notes."""
+        """Show the scene, the length, the device and the decisions; with `verbose` all notes."""
         self._pace = Pace(run.schedule.total)
         self._tenth = max(1, self._pace.total // 10)
         self._last_line = monotonic()
@@ -76,7 +76,7 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
-        """Moves the bar, or writes a line now and then."""
+        """Move the bar, or write a line at intervals."""
         if self.level == "quiet":
             return
         self._pace = self._pace.after(record)
@@ -90,27 +90,27 @@ class Progress(Observer):
 
     @hookimpl
     def crossgrad_length_changed(self, total: int) -> None:
-        """Moves the end of the bar."""
+        """Move the end of the bar."""
         self._pace = self._pace.with_length(total)
         if self._bar is not None:
             self._bar.total = total
 
     @hookimpl
     def crossgrad_evaluation(self, report: EvaluationReport) -> None:
-        """Shows the metrics."""
+        """Show the metrics."""
         self._pace = self._pace.evaluated(report)
         if self.level != "quiet":
             self._say(evaluation_line(report))
 
     @hookimpl
     def crossgrad_log(self, text: str) -> None:
-        """Shows what the run says."""
+        """Show a message of the run."""
         if self.level != "quiet":
             self._say(text)
 
     @hookimpl
     def crossgrad_run_end(self, status: str) -> None:
-        """Leaves the finished bar on the screen."""
+        """Leave the finished bar on the screen, and show how the run ended."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -153,5 +153,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # The bar would otherwise be torn by the line.
+            # `tqdm` writes the line above the bar, which would otherwise be broken.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

@@ -1,1 +1,1 @@
-"""`crossgrad plan` and `--plan`: what a scene calls for, on evidence that anyone can check."""
+"""`crossgrad plan` and `--plan`: decisions on the settings of a run, with verifiable evidence."""

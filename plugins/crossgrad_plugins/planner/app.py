@@ -23,13 +23,13 @@ from crossgrad_plugins.planner.finding import Finding
 from crossgrad_plugins.planner.length import length
 from crossgrad_plugins.planner.planner import Plan, plan_of
 
-#: Below this width the cost and the option of a part stand below its evidence.
+#: In narrower terminals, the cost and the option of a part are printed below its evidence.
 _WIDE: Final = 110
 _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
-#: Columns of a wide table without the evidence, which has the rest.
+#: Widths of the columns of a wide table; the evidence gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
-#: What is added to a choice that the evidence did not make.
+#: Basis of a choice -> text after the choice.
 _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 
@@ -54,7 +54,7 @@ def _cells(finding: Finding) -> tuple[str, ...]:
 
 
 def _wide(row: Sequence[str], width: int) -> Iterator[str]:
-    """A row in columns, each cell wrapped."""
+    """Yield the lines of a row in columns, each cell wrapped."""
     rest = width - sum(_WIDTHS) - len(_GAP) * (len(_WIDTHS) - 1)
     widths = [each or rest for each in _WIDTHS]
     cells = [_wrapped(text, space) for text, space in zip(row, widths, strict=True)]
@@ -64,7 +64,7 @@ def _wide(row: Sequence[str], width: int) -> Iterator[str]:
 
 
 def _narrow(row: Sequence[str], width: int) -> Iterator[str]:
-    """A row as a block: part and decision, below them the evidence, the cost and the option."""
+    """Yield the lines of a row as a block: part and decision, then evidence, cost and option."""
     part, choice, *below = row
     indent = " " * (_WIDTHS[0] + len(_GAP))
     yield f"{part.ljust(_WIDTHS[0])}{_GAP}{choice}"
@@ -80,7 +80,7 @@ def _wrapped(text: str, width: int) -> list[str]:
     return wrap(text, max(1, width), break_on_hyphens=False) or [""]
 
 
-#: Columns where nothing tells how many there are.
+#: Width of the output if the terminal does not report its width.
 _COLUMNS = 120
 
 
@@ -91,20 +91,20 @@ def plan(
     probe_seconds: float | None,
     write: Path | None,
 ) -> tuple[Plan, str]:
-    """What the scene calls for, and how to run it.
+    """Plan a run on a scene, and return the command that runs it.
 
     Args:
         file: Configuration file of the run, or None.
-        options: Options of the run that the user gave; None stands for nothing.
+        options: Options of the run that the user gave; None means not given.
         assignments: `KEY=VALUE` texts.
         probe_seconds: Training seconds of a probe, or None.
-        write: Where the run's settings go, or None.
+        write: Output file for the run's settings, or None.
 
     Returns:
         The plan, and the command that carries it out.
 
     Raises:
-        UserError: The input is bad, or the file cannot be written; nothing was written.
+        UserError: The input is invalid, or the file cannot be written; nothing was written.
     """
     if write is not None:
         _check_free(write)
@@ -113,9 +113,9 @@ def plan(
     scene, _ = read_scene(config)
     made = plan_of(config, scene, probe_seconds)
     if write is not None:
-        # The bundled scene has a length by itself, which it would lose where the file names it.
+        # The bundled scene has its own length, which would be lost if the file names the scene.
         seconds = {} if config.seconds is None else {"seconds": config.seconds}
-        # Of another folder, too.
+        # An absolute path, so that the file also works from another folder.
         asked = {**settings, **seconds, "scene": str(Path(str(config.scene)).resolve())}
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
@@ -126,7 +126,7 @@ def plan(
 
 
 def advised(scene: Path) -> tuple[str, str]:
-    """Return the length that the planner advises for a scene, and the command that trains it so.
+    """Return the length that the planner advises for a scene, and the training command.
 
     No photo is decoded.
 
@@ -139,7 +139,7 @@ def advised(scene: Path) -> tuple[str, str]:
 
 
 def _command(scene: Path | None, options: Mapping[str, object], assignments: Sequence[str]) -> str:
-    """The command that trains a scene as planned; the bundled one where none is named."""
+    """Return the command that trains a scene as planned; without a scene, the bundled one."""
     given = {**options, "scene": None}
     words = ["crossgrad run"] if scene is None else ["crossgrad run", quote(str(scene))]
     words += [f"--{name.replace('_', '-')} {_word(each)}" for name, each in given.items() if each]
@@ -148,12 +148,12 @@ def _command(scene: Path | None, options: Mapping[str, object], assignments: Seq
 
 
 def _word(value: object) -> str:
-    """A value of an option as a shell reads it."""
+    """Format the value of an option for a shell."""
     return quote(f"{value:.10g}" if isinstance(value, float) else str(value))
 
 
 def show(made: Plan, way: str, *, as_json: bool) -> None:
-    """Prints a plan, and the command that carries it out."""
+    """Print a plan, and the command that carries it out."""
     if as_json:
         print(json.dumps(made.as_data(), indent=2))  # noqa: T201
         return

@@ -1,4 +1,4 @@
-"""Exposure, degree of spherical harmonics, and the filter of scale."""
+"""Decisions on exposure, degree of spherical harmonics, and the scale filter."""
 
 from math import isnan
 from typing import Final
@@ -6,16 +6,16 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: Share of the variance of tracks that a view dependence worth its cost explains.
+#: Minimum share of the variance of tracks that view dependence must explain to be worth its cost.
 LEAST_SHARE: Final = 0.02
-#: Numbers of a Gaussian without higher bands: position, shape, opacity, colour.
+#: Numbers per Gaussian without higher bands: position, shape, opacity, colour.
 _OTHER_NUMBERS: Final = 14
-#: Range of footprints below which all photos show the scene at one scale: an octave.
+#: If the footprints range over less than this factor, all photos show the scene at one scale.
 ONE_SCALE: Final = 2.0
 
 
 def exposure(evidence: Evidence) -> Finding:
-    """Whether photos get an exposure each."""
+    """Decide whether each photo gets an exposure."""
     part, config = "exposure", evidence.config
     if evidence.is_given("exposure", "exposure_from") or not evidence.is_measured:
         chosen = config.exposure.name if config.exposure else "as a run has it"
@@ -59,7 +59,7 @@ def exposure(evidence: Evidence) -> Finding:
 
 
 def degree(evidence: Evidence) -> Finding:
-    """Up to which degree colours depend on the direction."""
+    """Decide the degree of spherical harmonics, by how colours depend on the direction."""
     part, config = "SH degree", evidence.config
     name = config.backbone.name
     of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "rules.sparse-sh")
@@ -81,7 +81,7 @@ def degree(evidence: Evidence) -> Finding:
 
 
 def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
-    """The degree by the view dependence of the tracks."""
+    """Decide the degree by the view dependence of the tracks."""
     from crossgrad_plugins.planner.view_dependence import (
         FEWEST_TRACKS,
         LEAST_OBSERVATIONS,
@@ -112,7 +112,7 @@ def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def scale_filter(evidence: Evidence) -> Finding:
-    """Whether Gaussians are filtered to the sampling of the photos."""
+    """Decide whether Gaussians are filtered to the sampling of the photos."""
     part, name = "scale filter", evidence.config.backbone.name
     if evidence.is_given("backbone"):
         return given(part, f"as backbone {name} has it", "--backbone mip")

@@ -1,4 +1,4 @@
-"""`crossgrad plan`: what a scene needs, and what it does not, before a run."""
+"""`crossgrad plan`: decisions on a run, from the evidence of its scene."""
 
 from dataclasses import dataclass
 from pathlib import Path

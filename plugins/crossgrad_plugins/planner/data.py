@@ -1,4 +1,4 @@
-"""Where training starts, and what reading the photos has decided: lenses, masks, background."""
+"""Decisions on initialization, held-out photos, lenses, masks and background."""
 
 import re
 from collections import Counter
@@ -7,14 +7,14 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: A photo shares points with no other one.
+#: A single photo shares no points with another photo.
 _ONE_PHOTO: Final = 1
-#: How a reader notes the colour behind photos with transparency.
+#: The reader's note on the colour over which transparent photos were blended.
 _BLENDED: Final = re.compile(r"blended over RGB \(([\d.]+), ([\d.]+), ([\d.]+)\)")
 
 
 def start(evidence: Evidence) -> Finding:
-    """Where training starts."""
+    """Decide from which points training starts."""
     part, config = "initializer", evidence.config
     if evidence.is_given("initializer", "data.init"):
         chosen = config.initializer.name if config.initializer else config.data.init
@@ -46,7 +46,7 @@ def start(evidence: Evidence) -> Finding:
 
 
 def held_out(evidence: Evidence) -> Finding:
-    """Which photos are held out, and whether every regime has some."""
+    """Report which photos are held out, and whether every regime has held-out photos."""
     part, scene = "held out", evidence.scene
     photos = Counter(view.regime for view in scene.test_views)
     chosen = ", ".join(f"{number} of {name}" for name, number in sorted(photos.items())) or "none"
@@ -68,7 +68,7 @@ def held_out(evidence: Evidence) -> Finding:
 
 
 def undistortion(evidence: Evidence) -> Finding:
-    """Whether photos are undistorted."""
+    """Report whether photos were undistorted."""
     note = evidence.scene_note("undistorted")
     plain = Finding(
         "undistortion",
@@ -85,7 +85,7 @@ def undistortion(evidence: Evidence) -> Finding:
 
 
 def masks(evidence: Evidence) -> Finding:
-    """Whether pixels are masked."""
+    """Report whether pixels are masked."""
     part = "masks"
     if evidence.is_given("data.masks"):
         return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")
@@ -105,7 +105,7 @@ def masks(evidence: Evidence) -> Finding:
 
 
 def background(evidence: Evidence) -> Finding:
-    """What is drawn behind the scene."""
+    """Decide the background colour of renders."""
     part, usual = "background", evidence.config.background
     if evidence.is_given("background"):
         return given(part, usual, "--background COLOR")

@@ -1,4 +1,4 @@
-"""Figures that decisions rest on: from the scene, and from a probe where one may be taken."""
+"""The evidence for decisions: figures of the scene, and of a probe if one is allowed."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The figures of a run to be; each is worked out when a decision asks for it.
+    """The evidence about a planned run; each figure is computed at first use.
 
     Attributes:
-        config: The configuration, in which only what the user set is set.
-        scene: Its scene.
-        seconds: Training seconds of the probe; None where none may be taken.
+        config: The configuration, which contains only settings of the user.
+        scene: The scene of the run.
+        seconds: Training seconds of the probe; None if no probe is allowed.
     """
 
     config: RunConfig
@@ -27,13 +27,13 @@ class Evidence:
     seconds: float | None = None
 
     def is_given(self, *names: str) -> bool:
-        """Whether the user set any of these settings; None leaves one to the run.
+        """Return True if the user set any of these settings; a value of None counts as not set.
 
         Args:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
         known = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
-        # A run writes down its defaults, too: in the group `data` these leave a setting open.
+        # A run also stores its defaults; in the group `data`, a default value counts as not set.
         own, usual = self.config.data, type(self.config.data)()
         known |= {f"data.{n}" for n in own.model_fields_set if getattr(own, n) != getattr(usual, n)}
         known |= {f"backbone.{name}" for name in self.config.backbone.options}
@@ -47,13 +47,13 @@ class Evidence:
 
     @cached_property
     def sampler(self) -> Sampler:
-        """The sampler, without decisions on it."""
+        """The sampler as configured, before any decision."""
         choice = self.config.sampler
         return build_component(Sampler, choice.name, choice.options)
 
     @property
     def grouping(self) -> ComponentChoice:
-        """Which views are near and far: as the user has it, or where the modes part."""
+        """The grouping into near and far views: the user's choice, or the cut between the modes."""
         if self.config.grouping is not None:
             return self.config.grouping
         if self.is_given("sampler") and self.sampler.default_grouping is not None:
@@ -62,7 +62,7 @@ class Evidence:
 
     @cached_property
     def probe(self) -> "Probe | None":
-        """What a short training run shows; None where none may be taken."""
+        """The results of a short training run; None if no probe is allowed."""
         if self.seconds is None:
             return None
         from crossgrad_plugins.planner.probe import probed
@@ -71,26 +71,26 @@ class Evidence:
 
     @cached_property
     def view_plan(self) -> ViewsPerStepSpec:
-        """How many views the steps have, without decisions on it."""
+        """The number of views per step as configured, before any decision."""
         return views_per_step_of(self.config)[0]
 
     @property
     def is_measured(self) -> bool:
-        """Whether the run has the recipe that the rules of the planner were measured with."""
+        """True if the run uses recipe `auto`, with which the planner's rules were measured."""
         return self.config.recipe.name == "auto"
 
     @cached_property
     def backbone(self) -> Backbone:
-        """The backbone as it fits itself to the scene."""
+        """The backbone, fitted to the scene."""
         choice = self.config.backbone
         return build_component(Backbone, choice.name, choice.options).fitted_to(self.scene)[0]
 
     @property
     def degree(self) -> int | None:
-        """The highest degree of its spherical harmonics; None where none can be set."""
+        """The highest degree of its spherical harmonics; None without such an option."""
         degree = self.backbone.model_dump().get("sh_degree")
         return degree if isinstance(degree, int) else None
 
     def scene_note(self, word: str) -> str | None:
-        """What the reader noted with that word; None where it did not."""
+        """Return the reader's first note that contains a word; None if there is none."""
         return next((note for note in self.scene.notes if word in note), None)

@@ -7,12 +7,12 @@ from typing import Literal, TypeAlias
 
 from crossgrad_core.plugin import Decision, Json
 
-#: The figures of a finding, by name.
+#: Name -> figure of a finding.
 Figures: TypeAlias = Mapping[str, float]
 #: Setting, or option of a component -> value.
 Settings: TypeAlias = Mapping[str, Json]
-#: How a choice came about: the evidence decided; the default stays, because evidence is missing or
-#: undecided; or the user set it.
+#: The origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or
+#: undecided, so the default is kept. `given`: the user set it.
 Basis: TypeAlias = Literal["decided", "default", "given"]
 #: The saving of a choice that a run without a plan makes, too.
 NOTHING = "-"
@@ -24,16 +24,16 @@ class Finding:
 
     Attributes:
         part: The part of the run.
-        choice: What it will be.
-        basis: How the choice came about.
-        evidence: What was found out, with its figure.
+        choice: The choice for the part.
+        basis: The origin of the choice.
+        evidence: The evidence as text, with its figure.
         rule: The threshold.
-        source: Where the rule is from.
-        saved: What the choice saves compared with a run that has the part.
+        source: The source of the rule.
+        saved: The cost that the choice saves compared with a run that has the part.
         force: The option that sets another choice.
         figures: The figures of the evidence.
-        settings: The settings that change; none if the choice is the default.
-        because: Why they change, in a few words.
+        settings: The settings that change; empty if the choice is the default.
+        because: The reason for the change, in a few words.
     """
 
     part: str
@@ -59,9 +59,9 @@ class Finding:
         """Return the same choice with its evidence.
 
         Args:
-            evidence: What was found out.
-            decided: Whether the evidence decides; if not, the default stays without it.
-            saved: What the choice saves.
+            evidence: The evidence as text.
+            decided: True if the evidence decides; if not, the default is kept.
+            saved: The cost that the choice saves.
             figures: The figures of the evidence.
         """
         basis: Basis = "decided" if decided else "default"
@@ -72,14 +72,14 @@ class Finding:
     def changed(
         self, choice: str, settings: Settings, because: str, force: str, saved: str = NOTHING
     ) -> "Finding":
-        """Return another choice on the same evidence, which decides.
+        """Return a finding with another choice, decided by the same evidence.
 
         Args:
-            choice: What the part will be.
+            choice: The choice for the part.
             settings: The settings that change.
-            because: Why, in a few words.
+            because: The reason, in a few words.
             force: The option that sets another choice.
-            saved: What the choice saves.
+            saved: The cost that the choice saves.
         """
         return replace(
             self,
@@ -120,5 +120,5 @@ class Finding:
 
 
 def given(part: str, choice: object, force: str) -> Finding:
-    """Return the choice of the user, which wins without a look at the scene."""
+    """Return the choice of the user, which applies without evidence from the scene."""
     return Finding(part, str(choice), "given", "set by you", "what you set wins", "you", force)

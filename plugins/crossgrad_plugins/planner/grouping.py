@@ -1,4 +1,4 @@
-"""Modes of the cameras, pairs of views, views per step, and the operator."""
+"""Decisions on camera modes, pairs of views, views per step, and the operator."""
 
 from dataclasses import replace
 from math import isfinite, isnan
@@ -13,12 +13,12 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: sigma_b^2 / sigma_w^2 from which pairs pay: they take its share out of a step's variance.
+#: Minimum sigma_b^2 / sigma_w^2 for pairs: they remove its share of a step's gradient variance.
 LEAST_RHO: Final = 0.1
-#: Share of the views that the smaller mode needs for pairs: they weigh both modes alike, so that
-#: with fewer another objective is trained.
+#: Minimum share of views in the smaller mode for pairs. Pairs weight both modes equally, so with a
+#: smaller share, training would optimize another objective.
 EVEN: Final = 0.4
-#: Conflict of gradients whose directions have nothing to do with each other.
+#: Share of conflicts between gradients with independent directions.
 CHANCE: Final = 0.5
 
 #: Groups of a sampler that draws near and far views.
@@ -35,7 +35,7 @@ _NOT_KNOWN: Final = "not known; --probe SECONDS measures it"
 
 
 def modes(evidence: Evidence) -> Finding:
-    """How many modes the distances of the cameras have."""
+    """Report how many modes the distances of the cameras have."""
     found = evidence.modes
     rule = (
         f"two: distances or heights that Otsu's cut separates better than the best of {ONE_OF} "
@@ -59,7 +59,7 @@ def modes(evidence: Evidence) -> Finding:
 
 
 def pairs(evidence: Evidence) -> Finding:
-    """Whether steps draw pairs of near and far views."""
+    """Decide whether steps use pairs of near and far views."""
     config, found = evidence.config, evidence.modes
     part, usual = "pairs of views", config.sampler.name
     if evidence.is_given("sampler", "grouping"):
@@ -77,7 +77,7 @@ def pairs(evidence: Evidence) -> Finding:
 
 
 def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
-    """Whether pairs pay, by the probe."""
+    """Decide by the probe whether pairs of views are worth their cost."""
     probe = evidence.probe
     if probe is None:
         return plain.found(f"two modes; sigma_b^2 / sigma_w^2 is {_NOT_KNOWN}")
@@ -109,13 +109,13 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def views_of_steps(evidence: Evidence) -> ViewsPerStepSpec:
-    """How many views the steps have, the decision on pairs included."""
+    """Return the number of views per step, including the decision on pairs."""
     planned = "sampler" in pairs(evidence).settings and not evidence.is_given("views_per_step")
     return ViewsPerStepSpec((2,)) if planned else evidence.view_plan
 
 
 def _draws_pairs(evidence: Evidence) -> bool:
-    """Whether steps have near and far views: by the plan, or by the user's sampler."""
+    """Return True if steps have near and far views, by the plan or by the user's sampler."""
     if "sampler" in pairs(evidence).settings:
         return True
     return evidence.sampler.groups == _BOTH and _even(evidence.view_plan)
@@ -126,20 +126,20 @@ def _even(views: ViewsPerStepSpec) -> bool:
 
 
 def settings_of(grouping: ComponentChoice) -> dict[str, str]:
-    """A grouping as options are called."""
+    """Return a grouping as settings of a run."""
     options = {f"grouping.{name}": str(value) for name, value in grouping.options.items()}
     return {"grouping": grouping.name, **options}
 
 
 def _without_interval(probe: "Probe") -> str:
-    """Why sigma_b^2 / sigma_w^2 has no interval that could decide."""
+    """Return the reason why sigma_b^2 / sigma_w^2 has no interval that could decide."""
     if probe.rho < 0.0 and isnan(probe.rho_low):
         return f"sigma_b^2 / sigma_w^2 {probe.rho:.3f}, 95 % interval none, the estimate is below 0"
     return "no variance"
 
 
 def views_per_step(evidence: Evidence) -> Finding:
-    """How many views a step has."""
+    """Decide the number of views per step."""
     part = "views per step"
     if evidence.is_given("views_per_step"):
         return given(part, evidence.config.views_per_step, "--views K")
@@ -164,7 +164,7 @@ def views_per_step(evidence: Evidence) -> Finding:
 
 
 def operator(evidence: Evidence) -> Finding:
-    """Whether the views' gradients are kept apart, and how they are combined."""
+    """Decide whether gradients are kept per view, and how they are combined."""
     part = "operator"
     usual = "+".join(link.name for link in evidence.config.operators)
     if evidence.is_given("operator"):

@@ -1,4 +1,4 @@
-"""The length of a run."""
+"""The decision on the length of a run."""
 
 from typing import Final
 
@@ -8,18 +8,18 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import views_of_steps
 
 _EXACTLY: Final = "--steps N or --max-views N"
-#: Views of each training photo after which more views gain little, and the least of all together.
+#: Views per training photo, and minimum of all views, beyond which more views gain little.
 PASSES: Final = 100
 FEWEST_VIEWS: Final = 1_000
 
 
 def most_views(evidence: Evidence) -> int:
-    """Return the number of views after which more of them gain little."""
+    """Return the number of views beyond which more views gain little."""
     return max(FEWEST_VIEWS, PASSES * len(evidence.scene.train_views))
 
 
 def length(evidence: Evidence) -> Finding:
-    """How long the run is."""
+    """Decide the length of the run."""
     part, config, photos = "length", evidence.config, len(evidence.scene.train_views)
     most, seconds = most_views(evidence), config.seconds
     within = "" if seconds is None else f" within {seconds:g} s"

@@ -1,4 +1,4 @@
-"""Whether the cameras stand in one mode or in two, and how far apart these are."""
+"""The modes of the cameras: one or two, and the ratio of their distances."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -12,23 +12,23 @@ from crossgrad_core.plugin import Scene, bimodality, footprint_of
 from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import log_distances, otsu_separability, otsu_threshold
 
-#: Two modes that lie closer than this show the scene at much the same size.
+#: With a smaller ratio of distances, two modes show the scene at nearly the same size.
 LEAST_RATIO: Final = 1.5
-#: Views without which two modes are those of a few points.
+#: Minimum number of views to detect two modes.
 FEWEST: Final = 10
-#: Share of the views that the smaller mode has: fewer are stragglers.
+#: Minimum share of views in the smaller mode; a smaller group counts as outliers.
 LEAST_SHARE: Final = 0.1
-#: Of so many evenly spread samples, one may be cut as cleanly as two modes are.
+#: Of this many evenly spread samples, one may be separated as well as two modes.
 ONE_OF: Final = 100
-#: What is taken for the distance where views show SfM points.
+#: The kind of distance that is used if views show SfM points.
 DEPTH: Final = "depth over focal length"
 FROM_THE_MEAN: Final = "distance from the mean camera"
 HEIGHT: Final = "height"
-#: The grouping that splits by a quantity.
+#: Quantity -> the grouping that splits views by it.
 _GROUPINGS: Final = {DEPTH: "footprint", FROM_THE_MEAN: "radial", HEIGHT: "altitude"}
-#: Evenly spread samples that are cut, and their largest size: a cut of more separates no more.
+#: Number of evenly spread samples, and their maximum size; larger samples separate no better.
 _TRIALS, _LARGEST = 1000, 1000
-#: The largest logarithm whose exponential is a number.
+#: Largest logarithm whose exponential is finite.
 _MOST: Final = 700.0
 
 _Floats = NDArray[np.float64]
@@ -36,14 +36,14 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """The views cut in two by one number each, where Otsu cuts them.
+    """The split of the views in two by one quantity, at Otsu's threshold.
 
     Attributes:
-        quantity: What the number is.
-        separability: Share of its variance that lies between both sides.
-        usual: What the cleanest of `ONE_OF` samples that are evenly spread have of that.
-        share: Share of the views that the smaller side has.
-        ratio: Far over near: the median distances on both sides; 1 where there is one side.
+        quantity: Name of the quantity.
+        separability: Share of its variance between both sides.
+        usual: The separability of the best of `ONE_OF` evenly spread samples.
+        share: Share of the views on the smaller side.
+        ratio: Far over near: the median distances of both sides; 1 if there is one side.
     """
 
     quantity: str
@@ -54,23 +54,23 @@ class Cut:
 
     @property
     def two(self) -> bool:
-        """Whether both sides are modes that show the scene at different sizes."""
+        """True if both sides are modes that show the scene at different sizes."""
         clean = self.separability > self.usual and self.share >= LEAST_SHARE
         return clean and self.ratio >= LEAST_RATIO
 
     @property
     def grouping(self) -> ComponentChoice:
-        """The grouping that splits the views there."""
+        """The grouping that splits the views at this threshold."""
         return ComponentChoice.model_validate({"name": _GROUPINGS[self.quantity], "cut": "otsu"})
 
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """The distances from which the training views see the scene, and their heights.
+    """The distances and heights of the training views.
 
     Attributes:
-        quantity: What is taken for the distance.
-        logs: [V] its logarithms, of the views that have one.
+        quantity: The kind of distance.
+        logs: [V] logarithms of the distances, of the views that have a distance.
         heights: [V] heights of the same cameras, local units.
     """
 
@@ -80,14 +80,15 @@ class Modes:
 
     @cached_property
     def bimodality(self) -> float:
-        """Sarle's coefficient of the distances, in the form that decides; NaN where undefined."""
+        """Sarle's coefficient of the distances, in the form for decisions; NaN if undefined."""
         return bimodality(self.logs).deciding
 
     @cached_property
     def cut(self) -> Cut:
-        """The views cut in two by distance or by height, where that makes two modes.
+        """The split of the views by distance or by height.
 
-        Where both do, the cleaner one; by distance where neither does.
+        If both make two modes, the split with the better separability; if neither does, the split
+        by distance.
         """
         cuts = (self._by(self.quantity, self.logs), self._by(HEIGHT, self.heights))
         modes = [each for each in cuts if each.two]
@@ -95,7 +96,7 @@ class Modes:
 
     @cached_property
     def spread(self) -> float:
-        """The 95th over the 5th percentile of the distances; 1 without any."""
+        """The ratio of the 95th to the 5th percentile of the distances; 1 without distances."""
         if not len(self.logs):
             return 1.0
         low, high = np.percentile(self.logs, [5.0, 95.0])
@@ -103,17 +104,17 @@ class Modes:
 
     @property
     def two(self) -> bool:
-        """Whether there are two modes that show the scene at different sizes."""
+        """True if there are two modes that show the scene at different sizes."""
         return self.enough and self.cut.two
 
     @property
     def enough(self) -> bool:
-        """Whether there are views enough to tell two modes from one."""
+        """True if there are enough views to distinguish two modes from one."""
         return len(self.logs) >= FEWEST
 
     @property
     def one(self) -> bool:
-        """Whether there is one mode."""
+        """True if there is one mode."""
         return not self.two and (self.enough or self.spread < LEAST_RATIO)
 
     def _by(self, quantity: str, values: _Floats) -> Cut:
@@ -129,10 +130,10 @@ class Modes:
 
 
 def modes_of(scene: Scene) -> Modes:
-    """The modes of the training views.
+    """Return the modes of the training views.
 
-    A distance is the median depth of the SfM points that a view shows over its focal length; that
-    from the mean camera where fewer than half of the views show points.
+    The distance of a view is the median depth of its SfM points over its focal length. If fewer
+    than half of the views show points, it is the distance from the mean camera.
     """
     views = scene.train_views
     if not views:
@@ -150,7 +151,7 @@ def modes_of(scene: Scene) -> Modes:
 
 @cache
 def _usual(views: int) -> float:
-    """What a cut separates in the cleanest of `ONE_OF` evenly spread samples of so many views."""
+    """Return the separability of the best of `ONE_OF` evenly spread samples of `views` views."""
     samples = np.random.default_rng(0).uniform(size=(_TRIALS, views))
     return float(np.quantile(otsu_separability(samples), 1.0 - 1.0 / ONE_OF))
 

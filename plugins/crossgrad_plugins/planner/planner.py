@@ -11,7 +11,7 @@ from crossgrad_plugins.planner import appearance, data, grouping, length, view_s
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, Settings
 
-#: The functions that look at each part of a run, in the order of the table.
+#: The functions that decide each part of a run, in the order of the table.
 PARTS: Final[tuple[Callable[[Evidence], Finding], ...]] = (
     *(grouping.modes, grouping.pairs, view_schedule.view_schedule),
     *(grouping.views_per_step, grouping.operator),
@@ -26,8 +26,8 @@ class Plan:
 
     Attributes:
         scene: Name of the scene.
-        findings: One for each part.
-        seconds: How long they took.
+        findings: One finding for each part.
+        seconds: Seconds that the plan took.
     """
 
     scene: str
@@ -36,7 +36,7 @@ class Plan:
 
     @property
     def decisions(self) -> list[Decision]:
-        """The rows of the settings that change."""
+        """The decisions on settings that change."""
         return [row for finding in self.findings for row in finding.decisions]
 
     @property
@@ -49,10 +49,10 @@ class Plan:
         return next(finding for finding in self.findings if finding.part == part)
 
     def applied_to(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a run's settings in their long form with the ones that change."""
+        """Return a run's settings in their long form, with the planned changes."""
         decided, seconds = dict(self.settings), settings.get("seconds")
         if "max_views" in decided and seconds is not None:
-            # A layer with a length replaces the lengths of the layers before.
+            # A layer with a length replaces the lengths of earlier layers.
             decided["seconds"] = seconds
         return layered([settings, decided])
 
@@ -67,11 +67,11 @@ class Plan:
 
 
 def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None) -> Plan:
-    """Return what the scene requires; settings of the user stay.
+    """Plan a run on a scene; settings of the user are kept.
 
     Args:
-        config: The configuration, with the settings of the user alone.
-        scene: Its scene.
+        config: The configuration, with only the settings of the user.
+        scene: The scene of the run.
         probe_seconds: Training seconds of a probe; None for no probe.
 
     Raises:
@@ -84,7 +84,7 @@ def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None)
 
 
 def planned(config: RunConfig, scene: Scene) -> list[Decision]:
-    """Return the rows of the settings that the scene decides: the planner of `--plan auto`.
+    """Return the decisions on settings by the scene: the planner of `--plan auto`.
 
     Raises:
         UserError: A photo cannot be decoded.

@@ -1,4 +1,4 @@
-"""A short training run that measures gradients: what cameras and photos cannot tell."""
+"""A short training run that measures gradients, which cameras and photos do not show."""
 
 from dataclasses import dataclass
 from math import nan, sqrt
@@ -16,7 +16,7 @@ from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
 #: The optimizer sees gradients in Adam's metric.
 _METRIC: Final = "adam"
-#: Standard errors of a 95 % interval.
+#: Standard errors in half of a 95 % interval.
 _WIDE: Final = 1.96
 
 
@@ -27,12 +27,12 @@ class Probe:
     Attributes:
         rho: sigma_b^2 / sigma_w^2, between and within near and far views.
         rho_low: Lower end of its 95 % interval.
-        rho_high: The upper one.
-        noise_scale: How many views a step could use.
+        rho_high: Upper end of its 95 % interval.
+        noise_scale: Number of views that a step could use.
         conflict: Share of the near-far pairs whose gradients conflict.
-        conflict_low: Lower end of its 95 % interval, the views of the smaller group taken as the
+        conflict_low: Lower end of its 95 % interval; the views of the smaller group count as the
             independent ones.
-        problem: Why there are no figures; empty where there are.
+        problem: Reason why there are no figures; empty if there are figures.
     """
 
     rho: float = nan
@@ -45,12 +45,12 @@ class Probe:
 
 
 def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Probe:
-    """The figures of a vanilla run of so many training seconds.
+    """Train a vanilla run for some seconds, and return its figures.
 
     Args:
         config: The configuration, with a scene; components are replaced.
         seconds: Training seconds.
-        grouping: Which views are near and far.
+        grouping: The grouping into near and far views.
     """
     Progress().tell(f"training {seconds:g} seconds to measure gradients")
     length = {"steps": None, "max_views": None, "seconds": seconds, "plan": "off"}

@@ -1,4 +1,4 @@
-"""How much the brightness of SfM points depends on the direction from which they are seen."""
+"""The dependence of the brightness of SfM points on the viewing direction."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from crossgrad_core.plugin import Scene
 from crossgrad_plugins.exposures.tracks.gains import fitted
 from crossgrad_plugins.exposures.tracks.observations import Observations, observations_of
 
-#: Observations of a track, twice the coefficients of degree 1, and the radius in degrees of the
-#: cone of its directions, without which it cannot tell.
+#: Minimum number of observations of a track (twice the coefficients of degree 1), and minimum
+#: radius, in degrees, of the cone of its directions.
 LEAST_OBSERVATIONS: Final = 8
 LEAST_RADIUS: Final = 10.0
-#: Tracks without which an interval says little, and those that are looked at, at most.
+#: Minimum number of tracks for a useful interval, and maximum number of tracks used.
 FEWEST_TRACKS: Final = 100
 _MOST_TRACKS: Final = 3_000
-#: Of the coefficients of degree 1, relative to the number of observations: directions of a narrow
-#: cone are nearly the same.
+#: Regularization of the coefficients of degree 1, relative to the number of observations, because
+#: the directions of a narrow cone are nearly the same.
 _RIDGE: Final = 0.01
 _DRAWS: Final = 400
 
@@ -28,14 +28,14 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewDependence:
-    """The share of the brightness of tracks that degree 1 explains, beyond exposure.
+    """The share of the brightness of tracks that degree 1 explains, after exposure is removed.
 
     Attributes:
-        tracks: Tracks that were seen from enough directions.
-        share: Share of the variance that degree 1 explains of an observation that was left out;
-            negative where it explains less than nothing, NaN without tracks.
+        tracks: Number of tracks that were seen from enough directions.
+        share: Share of the variance of a left-out observation that degree 1 explains; negative if
+            degree 1 predicts worse than the mean, NaN without tracks.
         low: Lower end of its 95 % interval, tracks resampled.
-        high: The upper one.
+        high: Upper end of its 95 % interval.
     """
 
     tracks: int
@@ -45,10 +45,11 @@ class ViewDependence:
 
 
 def view_dependence(scene: Scene) -> ViewDependence:
-    """The view dependence of the tracks of the training photos.
+    """Measure the view dependence of the tracks of the training photos.
 
-    Of each track that is seen from enough directions, every observation is predicted from the
-    others: by their mean, and by a plane over the directions. Exposures are taken out before.
+    For each track that is seen from enough directions, every observation is predicted from the
+    other observations: by their mean, and by a plane over the directions. Exposures are removed
+    first.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -67,7 +68,7 @@ def view_dependence(scene: Scene) -> ViewDependence:
 
 
 def _tracks(found: Observations) -> Iterator[NDArray[np.int64]]:
-    """[T, n] observations of the tracks of each length n that is enough, the longest first."""
+    """Yield the observations [T, n] of the tracks of each sufficient length n, longest first."""
     order = np.argsort(found.points, kind="stable")
     lengths = np.bincount(found.points)
     starts = np.cumsum(lengths) - lengths
@@ -76,10 +77,10 @@ def _tracks(found: Observations) -> Iterator[NDArray[np.int64]]:
 
 
 def _errors(stops: _Floats, directions: _Floats) -> _Floats:
-    """[T', 2] mean squared errors of both predictions of each track that is wide enough.
+    """Return the mean squared errors [T', 2] of both predictions for each wide enough track.
 
     Args:
-        stops: [T, n].
+        stops: [T, n] brightness in stops.
         directions: [T, n, 3] unit vectors.
     """
     count = stops.shape[1]
@@ -96,7 +97,7 @@ def _errors(stops: _Floats, directions: _Floats) -> _Floats:
 
 
 def _share(errors: _Floats) -> ViewDependence:
-    """The share with its interval, from the errors [T, 2] of the tracks."""
+    """Return the share with its interval, from the errors [T, 2] of the tracks."""
     count = len(errors)
     if not errors[:, 0].sum() > 0.0:
         return ViewDependence(count, float("nan"), float("nan"), float("nan"))

@@ -1,4 +1,4 @@
-"""How often far and near views come if far cameras look down and near ones to the side."""
+"""The decision on how often far and near views are drawn, by the directions in which they look."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -13,20 +13,20 @@ from crossgrad_plugins.planner.finding import Finding, given
 from crossgrad_plugins.planner.grouping import EVEN, pairs, settings_of
 from crossgrad_plugins.planner.length import most_views
 
-#: Far views to a near one in the first part of a run; what that part is, sampler `horizon` knows.
+#: Far views per near view in the first part of a run; sampler `horizon` defines that part.
 FAR_TO_NEAR: Final = 5
-#: Degrees from the far views' common direction: far ones that have one, near ones that look
-#: elsewhere.
+#: Limits, in degrees from the far views' mean direction: maximum for far views, minimum for near
+#: views.
 WITHIN, BEYOND = 45.0, 60.0
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Median angles to the mean direction in which far views look.
+    """Median angles to the mean viewing direction of the far views.
 
     Attributes:
-        far: Of the far views themselves, degrees.
-        near: Of the near views, degrees.
+        far: Median angle of the far views, degrees.
+        near: Median angle of the near views, degrees.
     """
 
     far: float
@@ -34,12 +34,12 @@ class Directions:
 
     @property
     def differ(self) -> bool:
-        """Whether far views look one way, and near ones another one."""
+        """True if far views look in one direction, and near views in another."""
         return self.far <= WITHIN and self.near >= BEYOND
 
 
 def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
-    """Where the far and the near training views of a grouping look."""
+    """Measure the viewing directions of the far and near training views of a grouping."""
     made = build_component(Grouping, grouping.name, grouping.options)
     labels = made.fit(scene, np.random.default_rng(0)).labels(scene.train_views)
     far = np.array([label == FAR for label in labels])
@@ -51,7 +51,7 @@ def directions(scene: Scene, grouping: ComponentChoice) -> Directions:
 
 
 def view_schedule(evidence: Evidence) -> Finding:
-    """Whether far views come more often than near ones at first."""
+    """Decide whether far views are drawn more often than near views at first."""
     part, usual = "view schedule", evidence.config.sampler.name
     if evidence.is_given("sampler", "grouping"):
         return given(part, usual, "--sampler NAME")
@@ -73,7 +73,7 @@ def view_schedule(evidence: Evidence) -> Finding:
 
 
 def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
-    """Whether far views come more often, by where both look."""
+    """Decide by the viewing directions whether far views are drawn more often."""
     if "sampler" in pairs(evidence).settings:
         return plain.found("a step has a near and a far view", decided=True)
     cut = evidence.modes.cut
@@ -99,7 +99,7 @@ def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
 
 
 def _in_short_run(evidence: Evidence) -> bool:
-    """Whether the run is short, with the length that the plan gives it."""
+    """Return True if the run is short, with the length from the plan."""
     config = evidence.config
     if config.steps is config.seconds is config.max_views is None:
         config = config.model_copy(update={"max_views": most_views(evidence)})

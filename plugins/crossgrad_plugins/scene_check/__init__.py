@@ -1,1 +1,1 @@
-"""`crossgrad check`: points, poses and photos of a scene, held against each other."""
+"""`crossgrad check`: whether points, poses and photos of a scene agree with each other."""

@@ -6,12 +6,12 @@ from typing import Final
 
 from crossgrad_core.commands import configured, merged, read_scene
 
-#: Notes that are printed.
+#: Maximum number of notes that are printed.
 _MOST: Final = 12
 
 
 def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
-    """The notes on a scene, the warnings first, and the verdict.
+    """Return the notes on a scene, the warnings first, and the verdict.
 
     Args:
         path: The scene's folder.

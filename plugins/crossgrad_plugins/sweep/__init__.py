@@ -1,1 +1,1 @@
-"""`crossgrad sweep`: configurations x scenes x seeds, on the cores of a machine or of a cluster."""
+"""`crossgrad sweep`: runs of configurations x scenes x seeds, on one machine or on a cluster."""

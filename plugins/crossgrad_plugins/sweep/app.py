@@ -1,4 +1,4 @@
-"""A sweep from its grid to its summary."""
+"""The command `crossgrad sweep`: from its grid to its summary."""
 
 import signal
 import sys
@@ -42,10 +42,10 @@ _WORDS = "stopping: the runs under way save a checkpoint first (once more: witho
 
 @contextmanager
 def noted(stop: Stop) -> Iterator[list[int]]:
-    """Counts signals inside the block.
+    """Count stop signals inside the block.
 
     Yields:
-        The signals that came.
+        The numbers of the received signals; the list grows while the block runs.
     """
     came: list[int] = []
 
@@ -63,7 +63,7 @@ def noted(stop: Stop) -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-#: Where sweeps are kept, below the working folder.
+#: Default parent folder of sweeps, below the working folder.
 SWEEPS = Path("runs/sweeps")
 
 
@@ -74,14 +74,14 @@ class Request:
     Attributes:
         path: The grid file.
         out: Folder of the sweep.
-        scenes: Scenes instead of those of the grid.
-        seeds: Seeds instead of those of the grid.
-        assignments: `KEY=VALUE` texts that win over the grid.
-        workers: Runs at a time.
-        threads: Threads of a run.
-        memory: GiB that a run may take.
+        scenes: Scenes that replace the scenes of the grid.
+        seeds: Seeds that replace the seeds of the grid.
+        assignments: `KEY=VALUE` texts that override the grid.
+        workers: Number of runs in parallel.
+        threads: Threads per run.
+        memory: Maximum memory per run, GiB.
         engine: Name of the engine.
-        options: Its options.
+        options: Options of the engine.
     """
 
     path: Path
@@ -100,11 +100,11 @@ class Sweep:
     """A sweep: its runs and its folder.
 
     Args:
-        request: What the user asked for.
-        read_only: Whether nothing is going to be run.
+        request: The request of the user.
+        read_only: True if no run will be started.
 
     Raises:
-        UserError: The grid is bad, this machine is too small, or another sweep is under way in the
+        UserError: The grid is invalid, this machine is too small, or another sweep is active in the
             folder.
     """
 
@@ -113,7 +113,9 @@ class Sweep:
         check_options(request.engine, (key for key, _ in request.options))
         grid = _grid(request)
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
-        if not read_only:  # Before the work of planning; the lock itself comes after it.
+        if (
+            not read_only
+        ):  # Checked before planning, which takes time; the lock itself is taken later.
             _refuse_a_second(self.layout.out)
             _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)
@@ -124,24 +126,24 @@ class Sweep:
 
     @property
     def at_a_time(self) -> int:
-        """How many runs are trained at a time, as far as that is known."""
+        """The number of parallel runs, as far as it is known."""
         return len(self.machine.cores) if self.machine else self.request.workers or 1
 
     def standings(self, *, alive: bool) -> tuple[Standing, ...]:
-        """How far the runs are, where a sweep is under way in the folder or not."""
+        """Return the state of each run; `alive` is True if a sweep is active in the folder."""
         return standings(
             self.plan.jobs, self.layout, read_records(self.layout.records), alive=alive
         )
 
     def tell(self) -> int:
-        """Prints how far each run is, and the table of what is finished."""
+        """Print the state of each run, and the table of finished runs."""
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         _say(listing(self.plan.cells, found))
         _say(["", *table(self.plan.cells, found, self.plan.grid.metric)])
         return 0
 
     def foretell(self) -> int:
-        """Prints the runs that would be carried out, and how long that takes."""
+        """Print the runs that would be started, and their estimated time."""
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         left = [each for each in found if each.state != "finished"]
         ids = {each.job.id for each in left}
@@ -154,10 +156,10 @@ class Sweep:
         return 0
 
     def write_best(self, path: Path) -> int:
-        """Writes a grid with the best parameters of each arm and scene, for other seeds.
+        """Write a grid with the best parameters of each arm and scene, for other seeds.
 
         Raises:
-            UserError: They are not known yet, the file is there already, or cannot be written.
+            UserError: The best parameters are not known yet, the file exists, or cannot be written.
         """
         check_file(path)
         if path.exists():
@@ -171,14 +173,14 @@ class Sweep:
         return 0
 
     def carry_out(self) -> int:
-        """Carries out what is not finished.
+        """Carry out the runs that are not finished.
 
         Returns:
-            The exit code: 0 where all runs are finished, 1 where one failed, 128 and the number of
+            The exit code: 0 if all runs are finished, 1 if one failed, or 128 plus the number of
             the signal that stopped the sweep.
 
         Raises:
-            UserError: Another sweep is under way in the folder, or it cannot be written to.
+            UserError: Another sweep is active in the folder, or the folder is not writable.
         """
         check_folder(self.layout.out)
         self.layout.make()
@@ -196,7 +198,7 @@ class Sweep:
         return self._result(signals)
 
     def _watched(self, before: Sequence[Standing]) -> list[int]:
-        """Carries out what is left and shows how; answers the signals that came."""
+        """Carry out the remaining runs and show their progress; return the received signals."""
         screen = Screen(Watch(self.layout, before), self.at_a_time)
         work = self._work(before)
         with noted(work.stop) as signals:
@@ -206,7 +208,7 @@ class Sweep:
         return signals
 
     def _work(self, before: Sequence[Standing]) -> Work:
-        """What is to be done."""
+        """Return the arguments of the engine."""
         request = self.request
         return Work(
             jobs=[each.job for each in before if each.state != "finished"],
@@ -220,7 +222,7 @@ class Sweep:
         )
 
     def _result(self, signals: Sequence[int]) -> int:
-        """Prints what was found and what failed; the exit code."""
+        """Print the results and the failed runs; return the exit code."""
         found = self.standings(alive=False)
         _say(table(self.plan.cells, found, self.plan.grid.metric))
         failed = [each for each in found if each.state == "failed"]
@@ -248,7 +250,7 @@ class Sweep:
 
 
 def _grid(request: Request) -> Grid:
-    """The grid with what the user named instead of parts of it."""
+    """Read the grid, and replace its scenes and seeds as the user requested."""
     grid = read_grid(request.path)
     check_assignments(request.assignments)
     if request.scenes:

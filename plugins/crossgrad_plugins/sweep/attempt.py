@@ -1,4 +1,4 @@
-"""Attempts at a run: a process watched until it ends, and tried again if it died."""
+"""Attempts at a run: processes that are watched until they end, and repeated if they died."""
 
 import os
 import signal
@@ -15,32 +15,32 @@ from crossgrad_core.commands import summary_of, write_settings, writer_of
 from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.run_status import Status, append, begun, is_finished
 
-#: Seconds between two looks.
+#: Seconds between two checks of a process's memory.
 _PAUSE = 1.0
 _GIB = 2**30
-#: Seconds between two looks at a process.
+#: Seconds between two polls of a process.
 PAUSE = 0.1
-#: What trains a run; the numbers of cores and the arguments of `crossgrad` follow.
+#: The command that trains a run; core numbers and the arguments of `crossgrad` follow.
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
-#: What says how many threads a library takes.
+#: Environment variables that limit the threads of a library.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 #: Exit status of a run that was refused.
 _REFUSED = 2
-#: Lines of a process that are kept as the reason of its failure, at most.
+#: Maximum number of output lines that are kept as the reason of a failure.
 _MOST_LINES = 12
-#: Deaths without a new checkpoint after which a run has failed.
+#: Number of deaths without a new checkpoint after which a run has failed.
 MOST: Final = 3
-#: Seconds between two looks at a folder that another process writes into.
+#: Seconds between two checks of a folder that another process writes into.
 _WAIT = 1.0
 
 
 @dataclass
 class Bound:
-    """Watches the memory of a process.
+    """A memory limit that watches a process.
 
     Attributes:
-        most: Bytes that it may take; None where there is no bound.
-        taken: Bytes that it took when it was too much.
+        most: Maximum memory in bytes; None for no limit.
+        taken: Memory in bytes when the limit was exceeded; 0 before.
     """
 
     most: int | None
@@ -49,19 +49,19 @@ class Bound:
 
     @property
     def exceeded(self) -> bool:
-        """Whether it ever took too much."""
+        """True if the process ever exceeded the limit."""
         return self.taken > 0
 
     @property
     def reason(self) -> str:
-        """What is to be said then."""
+        """The message for a process that exceeded the limit."""
         return (
             f"took {self.taken / _GIB:.1f} GiB, more than the {(self.most or 0) / _GIB:.1f} GiB of "
             "a run; start fewer --workers, or name more --memory"
         )
 
     def is_exceeded(self, process: int) -> bool:
-        """Looks, once in a while, whether a process takes too much."""
+        """Check at intervals whether a process exceeds the limit; return True if it ever did."""
         if self.most is None or monotonic() - self._looked < _PAUSE:
             return self.exceeded
         self._looked = monotonic()
@@ -72,7 +72,7 @@ class Bound:
 
 
 def resident_bytes(process: int) -> int | None:
-    """Memory that a process holds; None where the system does not say."""
+    """Return the resident memory of a process in bytes; None if the system does not report it."""
     try:
         text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError):
@@ -85,16 +85,16 @@ def resident_bytes(process: int) -> int | None:
 
 @dataclass(frozen=True)
 class Worker:
-    """Who carries out runs, one at a time.
+    """A worker that carries out runs, one at a time.
 
     Attributes:
-        name: Its name, which is that of its file of records.
+        name: Name of the worker and of its file of records.
         out: Folder of the sweep.
-        folder: Working folder of its processes, which paths in settings are relative to.
-        threads: Threads of a run.
-        cores: Numbers of its cores; any where there are none.
-        memory: Bytes that a run may take; None where there is no bound.
-        command: What trains a run.
+        folder: Working folder of its processes; paths in settings are relative to it.
+        threads: Threads per run.
+        cores: Numbers of its cores; empty for any cores.
+        memory: Maximum memory of a run in bytes; None for no limit.
+        command: The command that trains a run.
     """
 
     name: str
@@ -108,11 +108,11 @@ class Worker:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an attempt ended.
+    """The outcome of an attempt.
 
     Attributes:
-        status: Whether the run is finished, and if not, why.
-        error: What went wrong; empty where nothing did.
+        status: Finished, or the way in which the attempt ended without finishing.
+        error: The error message; empty without an error.
     """
 
     status: Status
@@ -120,16 +120,16 @@ class Outcome:
 
 
 def is_free(job: Job, worker: Worker) -> bool:
-    """Whether no process writes into a run's folder, such as one of a sweep that was killed."""
+    """Return True if no process, such as one of a killed sweep, writes into a run's folder."""
     return writer_of(Layout(worker.out).run(job.id)) is None
 
 
 class Attempt:
-    """A process that trains a run from its beginning, or from its newest checkpoint.
+    """A process that trains a run from its start, or from its newest checkpoint.
 
     Args:
         job: The run.
-        worker: Who carries it out.
+        worker: The worker that carries it out.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
@@ -146,7 +146,7 @@ class Attempt:
             self._process = self._started(output)
 
     def poll(self) -> Outcome | None:
-        """How it ended; None while it is under way."""
+        """Return the outcome; None while the process runs."""
         code = self._process.poll()
         if code is None:
             if self._bound.is_exceeded(self._process.pid) and not self._asked:
@@ -169,7 +169,7 @@ class Attempt:
         return outcome
 
     def stop(self) -> None:
-        """Asks the run to stop with a checkpoint; asked again, it does so faster."""
+        """Request the run to stop with a checkpoint; a second request skips the evaluation."""
         self._asked += 1
         self._process.send_signal(signal.SIGTERM)
 
@@ -190,7 +190,7 @@ class Attempt:
             stderr=subprocess.STDOUT,
             cwd=worker.folder,
             env={**os.environ, **dict.fromkeys(_THREADS, str(worker.threads))},
-            # Ctrl-C in the terminal is for the sweep, which tells its runs.
+            # Ctrl-C in the terminal is for the sweep, which then stops its runs.
             start_new_session=True,
         )
 
@@ -214,9 +214,9 @@ class Attempt:
         return Outcome("failed", self._reason(folder, code) or f"ended with exit status {code}")
 
     def _reason(self, folder: Path, code: int) -> str:
-        """Why the run failed: what it says itself, or the end of what its process printed."""
+        """Return why the run failed: its own error, or the end of its process's output."""
         error = (summary_of(folder) or {}).get("error")
-        # One that was refused has not touched the summary, which may be of an earlier attempt.
+        # A refused run does not write the summary, which may be from an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:
@@ -227,7 +227,7 @@ class Attempt:
 
 
 def _signal(code: int) -> str:
-    """Name of the signal that ended a process; empty where none did."""
+    """Return the name of the signal that ended a process; empty without a signal."""
     number = -code if code < 0 else code - 128
     known = {each.value: each.name for each in signal.Signals}
     killed = " (by hand, or for want of memory)" if known.get(number) == "SIGKILL" else ""
@@ -247,9 +247,9 @@ class Retries:
         self._reached: dict[str, str] = {}
 
     def once_more(self, job: Job, outcome: Outcome, worker: str = "sweep") -> bool:
-        """Whether a run is to be tried again after an attempt.
+        """Return True if a run must be tried again after an attempt.
 
-        One that died too often gets a record that says that it failed.
+        A run that died too often gets a record that it failed.
         """
         if outcome.status != "died":
             return False
@@ -266,20 +266,20 @@ class Retries:
         return False
 
     def _newest(self, job: Job) -> str:
-        """The newest checkpoint of a run; empty where it has none."""
+        """Return the newest checkpoint of a run; empty without a checkpoint."""
         folders = self._layout.run(job.id).glob("checkpoints/step-*")
         return max((folder.name for folder in folders), default="")
 
 
 def carried_out(job: Job, worker: Worker, name: str) -> Outcome:
-    """Carries out a run and waits for its end; an interrupt stops it with a checkpoint.
+    """Carry out a run and wait for its end; an interrupt stops it with a checkpoint.
 
-    A task that is repeated because its machine was lost finds what the first one left.
+    If the machine was lost and the task is repeated, the run continues from its files.
 
     Args:
         job: The run.
-        worker: Who carries it out.
-        name: His name.
+        worker: The worker that carries it out.
+        name: Name of the worker in records.
     """
     worker = replace(worker, name=name)
     while not is_free(job, worker):

@@ -1,4 +1,4 @@
-"""Of each arm and scene the best parameters: tuned on some seeds, to be measured on others."""
+"""The best parameters of each arm and scene, tuned on some seeds for tests on further seeds."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,34 +11,35 @@ from crossgrad_plugins.sweep.grid import Arm, Choice, Grid, Settings, choices, s
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.run_status import Standing, figure
 
-#: Settings of which a run has one.
+#: Settings of the length; a run uses one of them.
 LENGTHS = frozenset({"steps", "max_views", "seconds"})
-#: Seeds that the new grid has.
+#: Number of seeds in the new grid.
 SEEDS = 3
-#: Configuration and scene -> seed -> the metric, None where the run failed or has none; a run that
-#: is left to do is not there.
+#: Configuration and scene -> seed -> the metric. The metric is None if the run failed or lacks it;
+#: a run that has not ended is absent.
 Ends: TypeAlias = Mapping[tuple[str, str], Mapping[int, float | None]]
 
 
 def best_grid(
     grid: Grid, cells: Iterable[Job], standings: Iterable[Standing], folder: Path
 ) -> tuple[dict[str, Any], list[str]]:
-    """A grid with each arm twice: as it is, and on each scene with its best parameters.
+    """Return a grid with each arm twice: unchanged, and with its best parameters per scene.
 
-    Its seeds are others than those that the parameters were chosen on.
+    Its seeds differ from the seeds on which the parameters were chosen.
 
     Args:
         grid: The grid in which parameters vary.
         cells: Its combinations.
-        standings: How far they are.
-        folder: Where the new grid is going to be.
+        standings: State of each run.
+        folder: Folder of the new grid.
 
     Returns:
-        The content of its file, and notes: on parameters of which a run failed, which are no
-        candidates, and on those that are best at the end of their values.
+        The content of its file, and notes. The notes name parameters with a failed run, which are
+        not candidates, and best parameters at the end of their values.
 
     Raises:
-        UserError: Of some arm and scene a run is left to do, all values failed, or nothing varies.
+        UserError: A run of some arm and scene has not ended, all its values failed, or the grid has
+            no parameters that vary.
     """
     if len(choices(grid)) == len(grid.arms):
         raise UserError(
@@ -54,10 +55,10 @@ def best_grid(
     for arm in grid.arms:
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         if len(own) == 1:
-            # Nothing varies in it: an arm that the others are held against.
+            # Nothing varies in this arm, so it is a reference for the rest.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
-            # As parameters, which may change what the settings say, not as settings beside them.
+            # Written as parameters, because parameters can override settings and settings cannot.
             fixed = {name: {"values": [value]} for name, value in own[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})
@@ -82,17 +83,17 @@ def best_grid(
 
 
 def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The arm as it is, and with its best parameters by scene."""
+    """Yield the arm unchanged, and the arm with its best parameters by scene."""
     own = {"settings": arm.settings}
     yield {"name": arm.name, **own, "by_scene": arm.by_scene}
     yield {"name": f"{arm.name}, best", **own, "by_scene": best}
 
 
 def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[str, Any]:
-    """Settings by scene with which an arm has the parameters that were chosen.
+    """Return settings by scene that give an arm the chosen parameters.
 
-    Its own settings by scene win, as before. Where one layer cannot say that, they are all that the
-    best runs were started with.
+    Settings by scene that the arm already has still override them. If one layer of settings cannot
+    express the result, all settings of the best runs are returned.
     """
     arm, name = chosen.arm, scene_name(scene)
     wanted = chosen.settings(base, scene)
@@ -104,10 +105,10 @@ def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[
 
 
 def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Values below settings that win over them, in one layer.
+    """Merge values below settings that override them, in one layer.
 
-    What another component is chosen for takes the options of the first with it, and a run has one
-    length.
+    If a setting chooses another component, the options of the replaced component are dropped. A run
+    has one length, so another length is dropped, too.
     """
     lengths = LENGTHS if LENGTHS & own.keys() else frozenset()
     components = {name.removesuffix(".name") for name in own if name.endswith(".name")}
@@ -121,7 +122,7 @@ def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> Ends:
-    """What the runs that are at their ends came to."""
+    """Return the metric of the runs that have ended."""
     known = {each.job.id: each for each in standings}
     found: dict[tuple[str, str], dict[int, float | None]] = {}
     for job in cells:
@@ -132,9 +133,9 @@ def _ends(grid: Grid, cells: Iterable[Job], standings: Iterable[Standing]) -> En
 
 
 def _best(own: Sequence[Choice], scene: str, ends: Ends, grid: Grid) -> tuple[Choice, list[str]]:
-    """The best of an arm's choices on a scene, and notes on those that were none.
+    """Return the best of an arm's choices on a scene, and notes on excluded choices.
 
-    All of them are measured on the same seeds: one of which a run failed is no candidate.
+    All choices are compared on the same seeds, so a choice with a failed run is excluded.
     """
     found = [(choice, ends[choice.label, scene]) for choice in own]
     _check_ended(found, scene, grid)

@@ -1,9 +1,9 @@
-"""The process of a run: `crossgrad run` that stops, with a checkpoint, when its starter is gone.
+"""The process of a run: `crossgrad run` that stops, with a checkpoint, when its parent is gone.
 
     python -m crossgrad_plugins.sweep.child CORES ARGUMENT ...
 
 CORES are the numbers of the cores that it may use, joined by commas, or `-` for any. Its standard
-input is a pipe from its starter; where that ends, the run is asked to stop.
+input is a pipe from its parent; when the pipe closes, the run is requested to stop.
 """
 
 import os
@@ -14,14 +14,14 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
-#: Standard input, which nothing is ever written to.
+#: Standard input; nothing is ever written to it.
 _PIPE = 0
-#: Linux shares processors among sessions first; the `nice` of a process only counts within one.
+#: Linux first shares processors among sessions; a process's `nice` only counts within its session.
 _SESSION_NICENESS = Path("/proc/self/autogroup")
 
 
 def main() -> None:
-    """Runs the command line after the cores."""
+    """Run the command line after the cores."""
     cores, *arguments = sys.argv[1:]
     if cores != "-" and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core) for core in cores.split(",")})
@@ -32,9 +32,9 @@ def main() -> None:
 
 
 def _be_as_nice_as_asked() -> None:
-    """Gives the session of this run, which is its own, the niceness of the process (`nice`)."""
+    """Give the session of this run the niceness of its process."""
     if (niceness := getattr(os, "nice", lambda _: 0)(0)) > 0:
-        with suppress(OSError):  # Not Linux, or a Linux that shares in other ways.
+        with suppress(OSError):  # Not Linux, or a Linux without session scheduling.
             _SESSION_NICENESS.write_text(str(niceness), encoding="ascii")
 
 

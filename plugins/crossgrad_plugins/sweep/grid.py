@@ -1,4 +1,4 @@
-"""The grid file: which settings, on which scenes, with which seeds."""
+"""The grid file: settings, scenes and seeds of a sweep."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,18 +24,19 @@ Settings: TypeAlias = dict[str, Any]
 T = TypeVar("T")
 
 _TODO = "docs/sweep.md shows the format"
-#: Every run is planned before the first one begins; a few lines of a grid can stand for any number.
+#: Maximum number of runs; all runs are planned before the first starts, and a short grid can
+#: describe very many.
 MOST_RUNS = 100_000
-#: Settings that the sweep decides about, and how.
+#: Settings that the sweep itself controls -> explanation.
 _RESERVED = {
     "out": "every run has its own folder below --out",
     "stop_after": "a sweep runs its runs to their ends",
     "threads": "say --threads, for all runs alike",
 }
-#: Settings that options of the sweep are for.
+#: Settings that have an option of the sweep.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
 _SHAPE = "must be `values: [...]`, `value: ...` or `parameters: {...}`"
-#: What is wrong, in the words of the file, where the library's are those of a language.
+#: Error type of pydantic -> message in the terms of YAML instead of Python.
 _IN_YAML = {"tuple_type": "should be a list", "too_short": "should not be empty"}
 _WITH_DISTRIBUTION = frozenset({"min", "max", "distribution", "mu", "sigma", "q", "probabilities"})
 
@@ -50,7 +51,7 @@ class Parameter(_Part):
     Attributes:
         values: Its values.
         value: Its only value.
-        parameters: Those of the settings inside it, such as the options of a component.
+        parameters: Settings inside it, such as the options of a component.
     """
 
     values: tuple[Any, ...] | None = Field(None, min_length=1)
@@ -69,7 +70,7 @@ class Parameter(_Part):
         return given
 
     def axes(self, name: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
-        """Each setting with its values; a setting inside another one has a name with a dot."""
+        """Yield each setting with its values; a nested setting has a name with a dot."""
         if self.parameters is not None:
             for inner, parameter in self.parameters.items():
                 yield from parameter.axes(f"{name}.{inner}")
@@ -81,10 +82,10 @@ class Arm(_Part):
     """A configuration with a name.
 
     Attributes:
-        name: Its name.
+        name: Name of the configuration.
         settings: Its settings.
-        parameters: What varies in it, besides what varies in all arms.
-        by_scene: Name of a scene's folder -> settings that hold on that scene only.
+        parameters: Settings that vary in this arm, in addition to those that vary in all arms.
+        by_scene: Name of a scene's folder -> settings for that scene only.
     """
 
     name: str = Field(min_length=1)
@@ -94,11 +95,11 @@ class Arm(_Part):
 
 
 class Metric(_Part):
-    """A column of the table at the end.
+    """The metric of the final table.
 
     Attributes:
         name: A figure of the held-out views, as in summary.json.
-        goal: Whether more of it is better; by default so, but of LPIPS less.
+        goal: `maximize` or `minimize`; the default is `maximize`, but `minimize` for LPIPS.
     """
 
     name: str = "psnr"
@@ -116,15 +117,15 @@ class Grid(_Part):
     """The contents of a grid file.
 
     Attributes:
-        name: Its name; that of the file by default.
-        description: What it is for.
-        method: Every combination is run.
+        name: Name of the sweep; by default the name of the file.
+        description: The purpose of the grid.
+        method: `grid`: every combination is run.
         base: Settings of all runs, as in a configuration file.
         scenes: Scene folders; None is the bundled scene.
         seeds: Seeds.
-        arms: Configurations by name; a nameless one where there are none.
-        parameters: What varies in all arms.
-        metric: What the table at the end shows.
+        arms: Configurations by name; by default a single one.
+        parameters: Settings that vary in all arms.
+        metric: The metric of the final table.
     """
 
     name: str | None = None
@@ -147,7 +148,7 @@ class Grid(_Part):
     @model_validator(mode="before")
     @classmethod
     def _axes_with_names(cls, given: object) -> object:
-        """Scenes and seeds may stand among the parameters, as everything does elsewhere."""
+        """Move scenes and seeds out of the parameters; other grid formats list them there."""
         if not isinstance(given, dict) or not isinstance(given.get("parameters"), dict):
             return given
         moved = {"scene": "scenes", "seed": "seeds"}
@@ -159,10 +160,10 @@ class Grid(_Part):
 
 
 def check_assignments(assignments: Iterable[str]) -> None:
-    """Refuses what `--set` cannot set for all runs of a sweep.
+    """Refuse settings that `--set` cannot set for all runs of a sweep.
 
     Raises:
-        UserError: The sweep decides about a setting, or an option of its own is for it.
+        UserError: The sweep controls a setting itself, or has a separate option for it.
     """
     for name in (each.partition("=")[0].strip() for each in assignments):
         instead = f"say {_OPTIONS[name]}" if name in _OPTIONS else _RESERVED.get(name)
@@ -175,7 +176,7 @@ class Choice(_Part):
 
     Attributes:
         arm: The arm.
-        parameters: Setting -> value of what varies.
+        parameters: Setting -> value, for the settings that vary.
     """
 
     arm: Arm
@@ -183,22 +184,22 @@ class Choice(_Part):
 
     @property
     def label(self) -> str:
-        """What the configuration is called in tables."""
+        """Name of the configuration in tables."""
         values = [f"{name}={value}" for name, value in self.parameters.items()]
         return ", ".join([self.arm.name, *values])
 
     def settings(
         self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
     ) -> Settings:
-        """What its runs on a scene are started with, all but the seed.
+        """Return the settings of its runs on a scene, without the seed.
 
         Args:
             base: The settings of all runs of the grid.
             scene: The scene's folder; None is the bundled scene.
-            assignments: `KEY=VALUE` texts that win over the grid.
+            assignments: `KEY=VALUE` texts that override the grid.
 
         Raises:
-            UserError: An assignment, or a key with a dot, makes no sense.
+            UserError: An assignment, or a key with a dot, is invalid.
         """
         own = self.arm.by_scene.get(scene_name(scene), {})
         layers = (base, self.arm.settings, self.parameters, own)
@@ -206,14 +207,14 @@ class Choice(_Part):
 
 
 def _values(parameter: object) -> object:
-    """The values of a parameter that is no setting."""
+    """Return the values of a parameter that is not a setting, such as scene or seed."""
     if isinstance(parameter, Mapping):
         return parameter.get("values", [parameter.get("value")])
     return parameter
 
 
 def choices(grid: Grid) -> list[Choice]:
-    """All configurations, arm by arm; the last parameter varies fastest."""
+    """Return all configurations, arm by arm; the last parameter varies fastest."""
     found = []
     for arm in grid.arms:
         axes = _axes(grid, arm)
@@ -225,16 +226,16 @@ def choices(grid: Grid) -> list[Choice]:
 
 
 def _axes(grid: Grid, arm: Arm) -> dict[str, tuple[Any, ...]]:
-    """What varies in an arm: setting -> its values."""
+    """Return setting -> values, for the settings that vary in an arm."""
     parameters = {**grid.parameters, **arm.parameters}
     return dict(axis for name, each in parameters.items() for axis in each.axes(name))
 
 
 def read_grid(path: Path) -> Grid:
-    """The grid in a YAML file.
+    """Read the grid in a YAML file.
 
     Raises:
-        UserError: The file cannot be read; or it is no grid: everything that is wrong with it.
+        UserError: The file cannot be read, or is not a valid grid; the message lists all problems.
     """
     content = read_settings(path, "the grid", _TODO)
     try:
@@ -254,7 +255,7 @@ def _absolute(scene: str, here: Path) -> str:
 
 
 def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The errors without those that say that too little is left of a list without its bad parts."""
+    """Drop errors about too few items that only follow from invalid items of the same list."""
     return [
         each
         for each in errors
@@ -264,7 +265,7 @@ def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _problem(error: Mapping[str, Any]) -> Problem:
-    """What pydantic found, with its place in the file."""
+    """Convert an error of pydantic to a problem with its place in the file."""
     path = [part for part in error["loc"] if part != "dict"]
     place = ".".join(str(part) for part in path) or "the grid"
     if error["type"] == "extra_forbidden":
@@ -320,7 +321,7 @@ def _of_the_names(grid: Grid) -> Iterator[Problem]:
 
 
 def _twice(values: Iterable[T]) -> list[T]:
-    """What occurs more than once, in its order."""
+    """Return the values that occur more than once, in order."""
     return [value for value, number in Counter(values).items() if number > 1]
 
 
@@ -330,12 +331,12 @@ def _number_of_runs(grid: Grid) -> int:
 
 
 def scene_name(scene: str | None) -> str:
-    """What a scene is called: its folder's name."""
+    """Return the name of a scene: its folder's name."""
     return "the bundled scene" if scene is None else Path(scene).name
 
 
 def with_scenes(grid: Grid, scenes: Sequence[Path]) -> Grid:
-    """The grid on other scenes, of which the arms' settings by scene hold for those they name.
+    """Return the grid with other scenes; settings by scene are kept for scenes with the same name.
 
     Raises:
         UserError: Two scenes have one name.

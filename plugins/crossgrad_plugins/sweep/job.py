@@ -1,4 +1,4 @@
-"""One run of a sweep, its id, and where things are in the folder of the sweep."""
+"""One run of a sweep, its id, and the layout of the sweep's folder."""
 
 import json
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-#: Settings that change neither what is trained nor what is reported.
+#: Settings that change neither the training nor the results.
 _OF_NO_CONSEQUENCE: Final = (
     *("scene", "out", "threads", "stop_after", "save_every", "decided"),
     *("revisions", "planned_seconds", "planned_views"),
@@ -20,12 +20,12 @@ class Job:
     """A run.
 
     Attributes:
-        id: Its id, which names its folder.
-        label: What its configuration is called.
+        id: Its id, which is the name of its folder.
+        label: Name of its configuration.
         scene: Name of its scene.
         seed: Its seed.
-        settings: What it is started with.
-        seconds: Its budget of training seconds; None where its length is another.
+        settings: The settings with which it is started.
+        seconds: Its budget of training seconds; None if another setting limits its length.
     """
 
     id: str
@@ -37,20 +37,20 @@ class Job:
 
     @property
     def title(self) -> str:
-        """What it is called in one line."""
+        """Description of the run in one line."""
         return f"{self.scene}, {self.label}, seed {self.seed}"
 
 
 def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
-    """The id of a run: a hash of its resolved configuration, seed included, and its scene.
+    """Return the id of a run: a hash of its resolved configuration, seed included, and its scene.
 
     Args:
         resolved: The configuration with all options of all components.
-        fingerprint: Digest of the scene, wherever that lies.
+        fingerprint: Digest of the scene, independent of its folder.
     """
     kept = {name: value for name, value in resolved.items() if name not in _OF_NO_CONSEQUENCE}
     if kept.get("seconds") is not None:
-        kept.pop("steps", None)  # They follow the clock.
+        kept.pop("steps", None)  # The steps follow from the seconds.
     text = json.dumps([kept, fingerprint], sort_keys=True, default=str)
     return sha256(text.encode()).hexdigest()[:_DIGITS]
 
@@ -66,28 +66,28 @@ class Layout:
     out: Path
 
     def run(self, name: str) -> Path:
-        """Results of a run, as `crossgrad run` writes them."""
+        """Return the results folder of a run of `crossgrad run`."""
         return self.out / "runs" / name
 
     def settings(self, name: str) -> Path:
-        """What a run is started with."""
+        """Return the settings file of a run."""
         return self.out / "settings" / f"{name}.yaml"
 
     def output(self, name: str) -> Path:
-        """What the processes of a run printed."""
+        """Return the file with the output of a run's processes."""
         return self.out / "output" / f"{name}.txt"
 
     @property
     def records(self) -> Path:
-        """One file for each worker."""
+        """The folder of the workers' records, one file for each worker."""
         return self.out / "workers"
 
     @property
     def plan(self) -> Path:
-        """Which run is what, as a table."""
+        """The table of all runs."""
         return self.out / "runs.csv"
 
     def make(self) -> None:
-        """Makes the folders."""
+        """Make the folders."""
         for path in ("runs", "settings", "output", "workers"):
             (self.out / path).mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""How many runs this machine trains at a time: none shares its cores, and all fit into memory."""
+"""The number of parallel runs on this machine: separate cores for each, memory for all."""
 
 import time
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from pathlib import Path
 from crossgrad_core.commands import UserError, available_cores, available_memory
 
 _GIB = 2**30
-#: Memory that a run needs at least, torch and kernels included.
+#: Minimum memory of a run, including torch and kernels.
 LEAST = 3 * _GIB // 2
-#: Share of the available memory that runs may take.
+#: Maximum share of the available memory for runs.
 SHARE = 0.9
-#: Linux counts here what each core did so far, and how long it is looked at, seconds.
+#: The file in which Linux counts the ticks of each core, and the measuring time in seconds.
 _COUNTS, _LOOK = Path("/proc/stat"), 0.25
-#: Of the counts of a core: those of doing nothing, and of waiting for a disk.
+#: The fields of /proc/stat that count idle time and I/O wait.
 _IDLE = slice(3, 5)
 
 
@@ -25,8 +25,8 @@ class Machine:
     """Cores and memory, divided among workers.
 
     Attributes:
-        cores: Of each worker, the numbers of its cores.
-        memory: Bytes that each may take; None where the system does not say what there is.
+        cores: The core numbers of each worker.
+        memory: Bytes per worker; None if the system does not report its memory.
     """
 
     cores: tuple[tuple[int, ...], ...]
@@ -34,15 +34,15 @@ class Machine:
 
 
 def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
-    """This machine, divided.
+    """Divide this machine among workers.
 
     Args:
-        workers: Number of workers; by default as many as there are cores and memory for.
-        threads: Threads of each.
-        memory: GiB for each; by default an equal share of what there is.
+        workers: Number of workers; by default as many as cores and memory allow.
+        threads: Threads per worker.
+        memory: GiB per worker; by default an equal share of the available memory.
 
     Raises:
-        UserError: There are not so many cores, or there is not so much memory.
+        UserError: The machine has too few cores, or too little memory.
     """
     cores, there = available_cores(), available_memory()
     by_cores = len(cores) // threads
@@ -68,26 +68,26 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
-    """The cores, those first that do nothing: another sweep has taken some, perhaps."""
-    with suppress(OSError, ValueError):  # Not Linux, or counts of another kind.
+    """Return the cores, idle cores first, because another sweep may use some cores."""
+    with suppress(OSError, ValueError):  # Not Linux, or another format of the counts.
         before = _counts()
         time.sleep(_LOOK)
         after = _counts()
         busy = {core: _busy(before[core], after[core]) for core in before.keys() & after.keys()}
-        # Halves: a core that does a little is as good as its neighbour.
+        # Round the load of a core to one half, so that a nearly idle core counts as idle.
         return tuple(sorted(cores, key=lambda core: (round(2.0 * busy.get(core, 0.0)), core)))
     return tuple(cores)
 
 
 def _counts() -> dict[int, list[int]]:
-    """Number of each core -> what it did so far, in ticks."""
+    """Return core number -> its ticks in each state so far."""
     rows = (line.split() for line in _COUNTS.read_text(encoding="ascii").splitlines())
     named = ((row[0].removeprefix("cpu"), row[1:]) for row in rows if row)
     return {int(name): list(map(int, counts)) for name, counts in named if name.isdecimal()}
 
 
 def _busy(before: list[int], after: list[int]) -> float:
-    """Share of the time in between that a core worked."""
+    """Return the share of ticks between two counts in which a core was busy."""
     ticks = [late - early for early, late in zip(before, after, strict=True)]
     return 1.0 - sum(ticks[_IDLE]) / max(1, sum(ticks))
 

@@ -1,4 +1,4 @@
-"""From a grid to its runs: every setting validated, every combination assembled, none trained."""
+"""The plan of a sweep: all runs of a grid, validated and assembled, but not trained."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import chdir
@@ -24,7 +24,7 @@ from crossgrad_plugins.sweep.problems import Problem, refuse
 if TYPE_CHECKING:
     from crossgrad_core.commands import RunConfig
 
-#: Of configurations with the same fault, how many are named.
+#: Maximum number of configurations that are named for one problem.
 MOST_PLACES = 3
 
 
@@ -34,7 +34,7 @@ class Plan:
 
     Attributes:
         grid: The grid.
-        cells: All combinations in the order in which they are run; two may be the same run.
+        cells: All combinations, in the order of their runs; two combinations may be the same run.
     """
 
     grid: Grid
@@ -42,7 +42,7 @@ class Plan:
 
     @property
     def jobs(self) -> tuple[Job, ...]:
-        """The runs, each of them once."""
+        """The runs, each run once."""
         found: dict[str, Job] = {}
         for job in self.cells:
             found.setdefault(job.id, job)
@@ -50,17 +50,17 @@ class Plan:
 
 
 def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
-    """The runs of a grid.
+    """Plan the runs of a grid.
 
-    Seeds vary slowest, so that an interrupted sweep has every configuration, with fewer seeds.
+    Seeds vary slowest, so an interrupted sweep has every configuration with fewer seeds.
 
     Args:
         grid: The grid.
         path: Its file; paths in settings are relative to its folder.
-        assignments: `KEY=VALUE` texts that win over the grid.
+        assignments: `KEY=VALUE` texts that override the grid.
 
     Raises:
-        GridError: Everything that is wrong with settings, components and scenes.
+        GridError: Settings, components or scenes are invalid; the error lists all problems.
     """
     planner = _Planner(grid.base, tuple(assignments))
     pairs = list(product(grid.scenes, choices(grid)))
@@ -78,7 +78,7 @@ def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
 
 @dataclass(frozen=True)
 class _Checked:
-    """A configuration on a scene: what it is started with, what that comes to, the scene's mark."""
+    """A configuration on a scene: its settings, its resolved configuration, the scene's digest."""
 
     settings: Mapping[str, Any]
     resolved: Mapping[str, Any]
@@ -87,7 +87,7 @@ class _Checked:
 
 @dataclass
 class _Planner:
-    """Checks configurations and collects what is wrong, each thing once."""
+    """A planner that checks configurations and collects their problems, each problem once."""
 
     base: Settings
     assignments: tuple[str, ...]
@@ -95,11 +95,11 @@ class _Planner:
     _scenes: dict[str, Any] = field(default_factory=dict)
 
     def problems(self) -> list[Problem]:
-        """What was found, with the configurations that it concerns."""
+        """Return the problems, with the configurations that they concern."""
         return [Problem(_shortened(places), text) for text, places in self._wrong.items()]
 
     def checked(self, scene: str | None, choice: Choice) -> _Checked | None:
-        """The configuration on that scene; None where something is wrong with it."""
+        """Check a configuration on a scene; return None if it has a problem."""
         place = choice.label
         try:
             settings = choice.settings(self.base, scene, self.assignments)
@@ -122,7 +122,7 @@ class _Planner:
         return _Checked(settings, final, found[2])
 
     def _scene(self, config: "RunConfig") -> Any:  # noqa: ANN401 - a scene, its reader, its digest
-        """The scene as the configuration reads it; None where it cannot be read."""
+        """Read the scene as configured; return None if it cannot be read."""
         key = f"{config.scene} {config.reader} {config.data}"
         if key not in self._scenes:
             try:
@@ -140,13 +140,13 @@ class _Planner:
 
 
 def _shortened(places: Sequence[str]) -> str:
-    """The first of the places, and how many more there are."""
+    """Return the first places, and the number of further places."""
     more = len(places) - MOST_PLACES
     return "; ".join([*places[:MOST_PLACES], *([f"and {more} more"] if more > 0 else [])])
 
 
 def _faults(config: "RunConfig") -> Iterator[UserError]:
-    """What is wrong with the components by themselves."""
+    """Yield the errors of the components themselves."""
     for slot, choice in chosen(config):
         try:
             build(slot, choice.name, choice.options)

@@ -1,4 +1,4 @@
-"""Everything that is wrong with a grid, in one error."""
+"""All problems of a grid, in one error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from typing_extensions import override
 
 from crossgrad_core.commands import UserError
 
-#: How many are shown.
+#: Maximum number of problems that are shown.
 MOST = 20
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
+    """One problem of a grid.
 
     Attributes:
-        place: Where in the grid.
-        what: What is wrong.
-        hint: What to do about it, where that is known.
+        place: The place in the grid.
+        what: The problem.
+        hint: The remedy; empty if it is unknown.
     """
 
     place: str
@@ -34,10 +34,10 @@ class Problem:
 
 
 class GridError(UserError):
-    """A grid with all that is wrong with it.
+    """A grid with all its problems.
 
     Args:
-        problems: What is wrong.
+        problems: The problems.
         path: The grid's file.
     """
 
@@ -53,14 +53,14 @@ class GridError(UserError):
 
     @override
     def message(self) -> str:
-        """The error, and below it each thing that is wrong."""
+        """Return the error, followed by the problems."""
         shown = [f"- {problem}" for problem in self.problems[:MOST]]
         more = len(self.problems) - len(shown)
         return "\n".join([super().message(), *shown, *([f"- and {more} more"] if more else [])])
 
 
 def refuse(problems: Sequence[Problem], path: Path) -> None:
-    """Refuses a grid with which something is wrong.
+    """Raise an error if a grid has problems.
 
     Raises:
         GridError: There are problems.

@@ -1,4 +1,4 @@
-"""The screen of a sweep: how far it is, and how long it is going to take."""
+"""The progress of a sweep on the screen, and its estimated time."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,20 +13,20 @@ from crossgrad_core.commands import controls_of, count, is_live, one_line
 from crossgrad_plugins.sweep.job import Job, Layout
 from crossgrad_plugins.sweep.run_status import Record, Standing, newest_row, read_records
 
-#: Seconds between two looks at the records, and failures that the live table shows.
+#: Seconds between two reads of the records, and maximum number of failures in the live table.
 PAUSE: Final = 1.0
 MOST_FAILURES: Final = 8
-#: Seconds of a run besides its training, where none has told: libraries, scene, results.
+#: Default seconds of a run in addition to training: libraries, scene, results.
 BESIDES = 12.0
 
 
 @dataclass(frozen=True)
 class UnderWay:
-    """A run under way.
+    """An active run.
 
     Attributes:
         job: The run.
-        record: The line that says that it began.
+        record: The record of its start.
         row: Its newest evaluation, column -> text.
     """
 
@@ -37,13 +37,13 @@ class UnderWay:
 
 @dataclass
 class Watch:
-    """The events since the sweep began.
+    """The events since the sweep started.
 
     Attributes:
         layout: Folder of the sweep.
-        before: How far all runs were.
-        ended: Id of a run -> its last end since then.
-        under_way: What is under way.
+        before: State of each run when the sweep started.
+        ended: Id of a run -> record of its last end since then.
+        under_way: The active runs.
     """
 
     layout: Layout
@@ -58,8 +58,8 @@ class Watch:
         self._begun: dict[str, Record] = {}
 
     def look(self) -> list[Record]:
-        """Reads what is new; answers how runs ended since the last look."""
-        # The clocks of several machines differ: what is new need not be the latest.
+        """Read new records; return the records of runs that ended since the last call."""
+        # The clocks of machines differ, so a new record may have an earlier time.
         found = [each for each in read_records(self.layout.records) if each not in self._known]
         self._known.update(found)
         new = [each for each in found if each.run in self._jobs]
@@ -76,24 +76,24 @@ class Watch:
         return [each for each in new if each.event == "ended"]
 
     def job(self, record: Record) -> Job:
-        """The run that a record is about."""
+        """Return the run of a record."""
         return self._jobs[record.run]
 
     @property
     def finished(self) -> int:
-        """Runs that are finished, before or since."""
+        """Number of finished runs, including runs that finished earlier."""
         return sum(
             each.state == "finished" or self._is(each.job, "finished") for each in self.before
         )
 
     @property
     def failed(self) -> list[Record]:
-        """The last lines of runs that failed since."""
+        """The last records of runs that failed since the sweep started."""
         return [each for each in self.ended.values() if each.status == "failed"]
 
     @property
     def left(self) -> list[Job]:
-        """Runs that are neither finished nor failed since, those under way included."""
+        """Runs that are neither finished nor failed, including active runs."""
         return [
             each.job
             for each in self.before
@@ -109,8 +109,8 @@ class Screen:
     """Shows a sweep on stderr.
 
     Args:
-        watch: What happened.
-        at_a_time: How many runs are trained at a time.
+        watch: The events of the sweep.
+        at_a_time: Number of runs in parallel.
     """
 
     def __init__(self, watch: Watch, at_a_time: int) -> None:
@@ -121,7 +121,7 @@ class Screen:
         self._last = 0.0
 
     def show(self, *, at_once: bool = False) -> None:
-        """Looks at the records and shows what is new, once a second at most."""
+        """Read the records and show new events, at most once a second."""
         if monotonic() - self._last < PAUSE and not at_once:
             return
         self._last = monotonic()
@@ -133,7 +133,7 @@ class Screen:
                 _write(f"... {one_line(self._end(record))}\n")
 
     def close(self) -> None:
-        """Shows the last state; a live table stays on the screen."""
+        """Show the final state; a live table stays on the screen."""
         self.show(at_once=True)
 
     def _draw(self, lines: list[str]) -> None:
@@ -158,7 +158,7 @@ class Screen:
         return [*([f"  {more} earlier failures"] if more else []), *shown]
 
     def _end(self, record: Record) -> str:
-        """How a run ended, in one line."""
+        """Return a line about the end of a run."""
         watch = self._watch
         took = "" if record.seconds is None else f" after {duration(record.seconds)}"
         reason = f": {' '.join((record.error or '').split())}" if record.error else ""
@@ -180,12 +180,12 @@ def _write(text: str) -> None:
 
 @dataclass(frozen=True)
 class Estimate:
-    """How long some runs take, one after another.
+    """The estimated time of some runs, one after another.
 
     Attributes:
-        seconds: Wall seconds of those of which something is known.
-        unknown: Number of the others.
-        longest: Seconds of the longest of those of which something is known.
+        seconds: Wall seconds of the runs with a known time.
+        unknown: Number of runs without a known time.
+        longest: Seconds of the longest run with a known time.
     """
 
     seconds: float
@@ -193,7 +193,7 @@ class Estimate:
     longest: float = 0.0
 
     def text(self, at_a_time: int) -> str:
-        """The estimate in words, for so many runs at a time."""
+        """Return the estimate as text, for `at_a_time` parallel runs."""
         if not self.seconds:
             return "their time is known once one has finished" if self.unknown else "nothing to do"
         known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
@@ -203,12 +203,14 @@ class Estimate:
 
 
 def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Record]) -> Estimate:
-    """How long runs take: as those of the same configuration and scene, or of the same scene.
+    """Estimate the time of runs from finished runs of the same configuration and scene.
+
+    Without such runs, the run's budget of seconds or finished runs of the same scene are used.
 
     Args:
         jobs: The runs.
-        of: Id -> run, of all that the records may be about.
-        records: What workers did.
+        of: Id -> run, of all runs that the records may concern.
+        records: The records of the workers.
     """
     same: dict[tuple[str, ...], list[float]] = {}
     for record in records:
@@ -230,7 +232,7 @@ def _seconds(job: Job, same: Mapping[tuple[str, ...], Sequence[float]]) -> float
 
 
 def duration(seconds: float) -> str:
-    """A time for people."""
+    """Format a time for people."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.{unit == 'h':d}f} {unit}"

@@ -1,4 +1,4 @@
-"""How far the runs of a sweep are, read from their folders and from the workers' records."""
+"""The state of the runs of a sweep, from their folders and from the workers' records."""
 
 import json
 import os
@@ -14,19 +14,19 @@ from crossgrad_core.commands import disk_errors, read_rows, summary_of
 from crossgrad_plugins.sweep.job import Job, Layout
 
 State = Literal["finished", "failed", "training", "interrupted", "waiting"]
-#: How an attempt at a run ended: `stopped` by the sweep, `died` by anything else that left it
-#: unfinished without an error of its own.
+#: The end of an attempt at a run: `stopped` by the sweep, or `died` if something else ended it
+#: without an error of its own.
 Status = Literal["finished", "failed", "stopped", "died"]
 
 
 @dataclass(frozen=True)
 class Standing:
-    """How far a run is.
+    """The state of a run.
 
     Attributes:
         job: The run.
-        state: `interrupted` is one that began and goes on from its checkpoint.
-        error: Why it failed.
+        state: Its state; an `interrupted` run has started and continues from its checkpoint.
+        error: The reason of its failure.
         summary: The content of its summary.json, once it is finished.
     """
 
@@ -37,23 +37,23 @@ class Standing:
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether nothing is left to do in a run's folder."""
+    """Return True if the run in a folder is finished."""
     return (summary_of(folder) or {}).get("status") == "finished"
 
 
 @dataclass(frozen=True)
 class Record:
-    """A line.
+    """A line of a worker's file.
 
     Attributes:
-        event: An attempt at a run began, or ended.
+        event: An attempt at a run `begun`, or `ended`.
         run: Id of the run.
         worker: Name of the worker.
         time: UTC, ISO 8601.
         host: Name of the machine.
-        status: How it ended; None of one that began.
-        seconds: Wall seconds that it took.
-        error: What went wrong.
+        status: How the attempt ended; None for a start.
+        seconds: Wall seconds of the attempt.
+        error: The error message.
     """
 
     event: Literal["begun", "ended"]
@@ -67,20 +67,20 @@ class Record:
 
     @property
     def when(self) -> datetime:
-        """When it was written."""
+        """Time of the record."""
         return datetime.fromisoformat(self.time)
 
 
 def standings(
     jobs: Iterable[Job], layout: Layout, records: Sequence[Record], *, alive: bool
 ) -> tuple[Standing, ...]:
-    """How far the runs are, in their order.
+    """Return the state of each run, in the order of the runs.
 
     Args:
         jobs: The runs.
         layout: The folder of the sweep.
-        records: What its workers did.
-        alive: Whether a sweep is under way there.
+        records: The records of its workers.
+        alive: True if a sweep is active in the folder.
     """
     last = {record.run: record for record in records}
     return tuple(_standing(job, layout.run(job.id), last.get(job.id), alive=alive) for job in jobs)
@@ -98,24 +98,24 @@ def _standing(job: Job, folder: Path, last: Record | None, *, alive: bool) -> St
 
 
 def figures(standing: Standing) -> dict[str, float]:
-    """The finite figures of all held-out views of a finished run, by name."""
+    """Return name -> finite figure of all held-out views of a finished run."""
     overall = (standing.summary or {}).get("overall") or {}
     numbers = ((n, v) for n, v in overall.items() if isinstance(v, int | float))
     return {name: float(value) for name, value in numbers if isfinite(value)}
 
 
 def figure(standing: Standing, name: str) -> float | None:
-    """A figure of all held-out views of a finished run; None where it is none or not finite."""
+    """Return a figure of all held-out views of a finished run; None if missing or not finite."""
     return figures(standing).get(name)
 
 
 def begun(folder: Path) -> bool:
-    """Whether a run has a folder to go on in."""
+    """Return True if a run has a folder in which it can continue."""
     return (folder / "config.yaml").is_file()
 
 
 def newest_row(folder: Path) -> dict[str, str]:
-    """The newest evaluation of a run, column -> text; empty before the first."""
+    """Return the newest evaluation of a run, column -> text; empty before the first one."""
     path = folder / "metrics.csv"
     if not path.is_file():
         return {}
@@ -124,11 +124,11 @@ def newest_row(folder: Path) -> dict[str, str]:
 
 
 def append(folder: Path, record: Mapping[str, Any]) -> None:
-    """Adds a line to a worker's file; time and machine are added to what is given.
+    """Add a record to a worker's file, together with time and machine.
 
     Args:
-        folder: Where the files of workers are.
-        record: The fields of a `Record` besides those.
+        folder: Folder of the workers' files.
+        record: The fields of a `Record`, without time and host.
 
     Raises:
         UserError: The disk is full, or the folder is read-only.
@@ -144,7 +144,7 @@ def append(folder: Path, record: Mapping[str, Any]) -> None:
 def _add(path: Path, content: str) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     try:
-        # Begins with a line end where somebody was killed in the middle of a line.
+        # Start with a line end if a killed process left an incomplete line.
         os.write(descriptor, (("" if _is_whole(path) else "\n") + content + "\n").encode())
         os.fsync(descriptor)
     finally:
@@ -159,7 +159,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def read_records(folder: Path) -> list[Record]:
-    """The lines of all workers in the order of time; torn and foreign ones are left out."""
+    """Read the records of all workers, ordered by time; skip incomplete and invalid lines."""
     paths = sorted(folder.glob("*.jsonl"))
     return sorted((each for path in paths for each in _lines(path)), key=lambda each: each.time)
 

@@ -1,4 +1,4 @@
-"""The summary of a sweep: a table of means over seeds, and what failed."""
+"""The summary of a sweep: a table of means over seeds, and the failed runs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, stdev
@@ -20,7 +20,7 @@ _COLUMNS = ("run", "scene", "configuration", "seed")
 
 
 def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str]:
-    """A line for each combination: id, how far it is, what it is."""
+    """Yield a line for each combination: id, state and description."""
     state = {each.job.id: each for each in standings}
     for job in cells:
         found = state[job.id]
@@ -29,10 +29,10 @@ def listing(cells: Iterable[Job], standings: Iterable[Standing]) -> Iterator[str
 
 
 def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -> Iterator[str]:
-    """Mean and, over seeds, standard deviation of a figure: configurations x scenes.
+    """Yield a table of a figure, configurations x scenes: mean and standard deviation over seeds.
 
-    The best mean of each scene has an asterisk. Where no finished run has the figure, a line says
-    which ones they have.
+    An asterisk marks the best mean of each scene. If no finished run has the figure, a line lists
+    the figures that the runs have.
     """
     known = tuple(standings)
     values = {each.job.id: figure(each, metric.name) for each in known}
@@ -72,9 +72,9 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Writes runs.csv: which run is what; runs of earlier grids in the folder stay below it.
+    """Write runs.csv, the table of runs; rows of earlier grids in the folder follow below.
 
-    A run of both is what the new grid calls it.
+    A run of both grids gets its name in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     known = {run for run, *_ in rows}
@@ -89,10 +89,10 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
 
 
 def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
-    """Run and configuration of the rows of runs.csv that are those of earlier grids.
+    """Return run and configuration of the rows of runs.csv that belong to earlier grids.
 
-    The newest grid stands on top: a scene, configuration and seed that has another run above is
-    that one now, whether it has finished or not.
+    The rows of the newest grid come first. If a scene, configuration and seed has another run
+    above, this other run replaces the row, even if it has not finished.
 
     Raises:
         UserError: The table cannot be read.
@@ -106,10 +106,10 @@ def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
 
 
 def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
-    """The rows of runs.csv; none where there is no such table, or one with other columns.
+    """Return the rows of runs.csv; empty if there is no such table, or one with other columns.
 
     Raises:
-        UserError: It cannot be read; or it `writes`, which another table is not to be lost by.
+        UserError: The table cannot be read, or `writes` would overwrite one with other columns.
     """
     if not layout.plan.is_file():
         return []

@@ -1,1 +1,1 @@
-"""A package's components trained with all others, as a command and as a plugin of pytest."""
+"""Training of a package's components with all others, as a command and as a pytest plugin."""

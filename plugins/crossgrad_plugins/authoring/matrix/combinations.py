@@ -1,7 +1,8 @@
-"""Combinations of components, few that bring every two together, and the run of one.
+"""Combinations of components: few rows that contain every pair, and the run of one row.
 
-Components of five slots meet in every combination. The components of further slots (losses,
-exposures, starts, resolutions, groupings, observers) are put into such combinations one at a time.
+Every combination contains components of five slots. The components of further slots (losses,
+exposures, initializers, resolutions, groupings, observers) are added to such combinations one at a
+time.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,24 +24,25 @@ from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
-#: Options without which a component has nothing to do in so few steps.
+#: Options without which a component has no effect in so few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
-    # Anchors are judged at once, and find free cells near by.
+    # Anchors are evaluated at once, and find free cells nearby.
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
     ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
     ("densifier", "octree"): {"success_threshold": 0},
-    # In so small a scene no primitive is blended in many pixels.
+    # In so small a scene, each primitive is blended in few pixels only.
     ("densifier", "multiview"): {"importance": 0},
     ("densifier", "multiview-gate"): {"importance": 0},
 }
-#: A run of the matrix: density control edits in steps 2 and 4 and resets opacities in step 4.
+#: Steps of a run of the matrix: density control edits in steps 2 and 4, and resets opacities in
+#: step 4.
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
 _TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
 #: One value per factor.
 Row: TypeAlias = tuple[str, ...]
-#: Row -> reasons; rows that work are not there.
+#: Row -> reasons for its refusal; rows that work are absent.
 Refused: TypeAlias = Mapping[Row, Collection[str]]
 
 
@@ -58,19 +60,19 @@ class Factors:
 
 
 def every_row(names: Mapping[str, Iterable[str]]) -> tuple[Row, ...]:
-    """One name per slot of `SLOTS`, all that there are, in alphabetical order."""
+    """Return all combinations of one name per slot of `SLOTS`, in alphabetical order."""
     return tuple(product(*(sorted(names[slot]) for slot in SLOTS)))
 
 
 def default_row(given: Mapping[str, str], slots: Sequence[str]) -> Row:
-    """A combination with what a run takes by default in the slots that are not given."""
+    """Complete a combination with the default component of each slot that is not given."""
     backbone = given.get("backbone", _default("backbone"))
     usual = {"densifier": load_component(Backbone, backbone).default_densifier, **given}
     return tuple(usual.get(slot) or _default(slot) for slot in slots)
 
 
 def _default(slot: str) -> str:
-    """The name that a run takes where it names none; of rasterizers the fastest on the CPU."""
+    """Return the default name of a slot; for rasterizers, the fastest on the CPU."""
     if slot == "rasterizer":
         return max(entries("rasterizers"), key=_speed)
     config = RunConfig.model_validate({})
@@ -86,12 +88,12 @@ def _speed(rasterizer: str) -> float:
 
 
 def device_of(rasterizer: str) -> str:
-    """The device on which a rasterizer is tried: the CPU where it runs there."""
+    """Return the device for testing a rasterizer: the CPU if the rasterizer supports it."""
     return "cpu" if "cpu" in load_component(Rasterizer, rasterizer).devices else "cuda"
 
 
 def config_of(row: Row, slots: Sequence[str] = SLOTS) -> RunConfig:
-    """A short run of one combination whose density control acts."""
+    """Return the configuration of a short run of one combination, with active density control."""
     choices = {
         slot: ComponentChoice.model_validate({"name": name, **NEEDED.get((slot, name), {})})
         for slot, name in zip(slots, row, strict=True)
@@ -110,7 +112,7 @@ def config_of(row: Row, slots: Sequence[str] = SLOTS) -> RunConfig:
 
 @cache
 def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int | None:
-    """The smallest K above 1 that both admit, so that operators have something to do."""
+    """Return the smallest K above 1 that both admit, so that operators have an effect."""
     counts = (
         build(Sampler, sampler.name, sampler.options).view_counts,
         build(Operator, operator.name, operator.options).views,
@@ -120,15 +122,14 @@ def _several_views(sampler: ComponentChoice, operator: ComponentChoice) -> int |
 
 
 def named(row: Row, slots: Sequence[str] = SLOTS) -> str:
-    """A combination as `slot=name slot=name`."""
+    """Format a combination as `slot=name slot=name`."""
     return " ".join(f"{slot}={name}" for slot, name in zip(slots, row, strict=True))
 
 
 def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOTS) -> list[str]:
-    """The refusals among `rows` as sorted lines `slot=name slot=name: reason`.
+    """Format the refusals among `rows` as sorted lines `slot=name slot=name: reason`.
 
-    A line speaks for all rows with these names; together the lines say neither more nor less than
-    the refusals.
+    A line covers all rows with these names. Together, the lines cover exactly the refusals.
     """
     by_reason: dict[str, set[Row]] = {}
     for row, reasons in refusals.items():
@@ -144,7 +145,7 @@ def as_lines(refusals: Refused, rows: Sequence[Row], slots: Sequence[str] = SLOT
 
 
 def _slots_that_decide(concerned: set[Row], rows: Sequence[Row]) -> tuple[int, ...]:
-    """The fewest slots whose names tell the rows that are concerned from all others."""
+    """Return the fewest slots whose names separate the given rows from all other rows."""
     everything = range(len(rows[0]))
     for count in everything:
         for places in combinations(everything, count):
@@ -161,18 +162,18 @@ def meetings(
     usual: Callable[[Mapping[int, str]], Row],
     admits: Callable[[Row], bool],
 ) -> Iterator[Row]:
-    """Few admitted rows in which one value meets every value of the other factors.
+    """Yield few admitted rows in which one value meets every value of the other factors.
 
-    The values of all factors come in turn first. Those that such a row did not admit are tried with
-    the usual values of the other factors, of which one at a time is changed. Not every row is tried
-    like this: with many factors there are too many.
+    First, the values of all factors are taken in turn. Values that do not occur in an admitted row
+    are then tried with the default values of the other factors, of which one at a time is changed.
+    Not every row is tried, because many factors have too many rows.
 
     Args:
         place: Factor of the value.
         value: The value.
         values: The values of each factor.
-        usual: Completes a row of which some values are given.
-        admits: Whether a row can work.
+        usual: Completes a row in which some values are given.
+        admits: Returns True if a row can work.
     """
     missing = {(i, each) for i, some in enumerate(values) if i != place for each in some}
     for turn in range(max(map(len, values))):

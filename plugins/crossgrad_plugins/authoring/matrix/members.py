@@ -1,4 +1,4 @@
-"""The components that take part in the matrix of a package, and their combinations."""
+"""The components in the matrix of a package, and their combinations."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     meetings,
 )
 
-#: Whether a combination of these slots can work.
+#: Returns True if a combination of these slots can work.
 Admits = Callable[[Row, tuple[str, ...]], bool]
 
 
@@ -25,10 +25,10 @@ class Members:
     """The components that are combined.
 
     Attributes:
-        package: What the package is called and its version.
+        package: Name and version of the package.
         names: Slot -> the names of all installed components that can be combined.
         own: (slot, name) of the components of the package.
-        left_out: Which components of others cannot be combined, and why.
+        left_out: Components of other packages that cannot be combined, with the reason.
     """
 
     package: str
@@ -38,11 +38,11 @@ class Members:
 
 
 def members_of(package: str) -> Members:
-    """The components of a package, and all others that are installed.
+    """Find the components of a package, and all other installed components.
 
     Raises:
-        UserError: There is no such package, it has nothing that takes part in training, or one of
-            its components cannot be loaded.
+        UserError: There is no such package, none of its components takes part in training, or one
+            of them cannot be combined, for example because it cannot be loaded.
     """
     own = entries_of(package)
     slots = {slot: plural(slot) for slot in (*SLOTS, *FURTHER)}
@@ -78,7 +78,7 @@ def members_of(package: str) -> Members:
 
 
 def _cannot_be_combined(entry: Entry) -> str:
-    """Why a component is left out; empty where it is not."""
+    """Return why a component is left out; empty if it is not."""
     if [each.name for each in offers(entry.slot)].count(entry.name) > 1:
         return "two packages offer that name"
     try:
@@ -98,13 +98,13 @@ def _runs_here(rasterizer: type[Rasterizer]) -> bool:
 
 
 def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator[Factors]:
-    """The combinations to train: those of the five slots, then those of each further slot.
+    """Yield the combinations to train: first of the five slots, then of each further slot.
 
     Args:
-        members: What takes part.
-        admits: Asked of every combination that is wanted.
-        full: All combinations with a component of the package; otherwise as few as bring each of
-            these together with every component of the other slots that it can work with.
+        members: The components that are combined.
+        admits: Called with every requested combination; returns True if it can work.
+        full: True for all combinations with a component of the package. False for as few as bring
+            each of them together with every component of the other slots that it works with.
     """
     ours = sorted((SLOTS.index(slot), name) for slot, name in members.own if slot in SLOTS)
     if ours:
@@ -120,14 +120,14 @@ def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator
 
 
 def _all_of(members: Members, ours: set[tuple[int, str]]) -> Iterator[Row]:
-    """Every combination of the five slots with a component of the package."""
+    """Return every combination of the five slots that contains a component of the package."""
     return (row for row in every_row(members.names) if ours.intersection(enumerate(row)))
 
 
 def _few_of(
     members: Members, slots: tuple[str, ...], ours: list[tuple[int, str]], admits: Admits
 ) -> Iterator[Row]:
-    """Combinations in which each component of the package meets all others that it works with."""
+    """Yield combinations in which each component of the package meets all that it works with."""
     values = [members.names[slot] for slot in slots[: len(SLOTS)]]
     values += [(name,) for _, name in ours[: len(slots) - len(SLOTS)]]
 

@@ -1,4 +1,4 @@
-"""`crossgrad plugins matrix`: trains the combinations of a package and says what came of them."""
+"""`crossgrad plugins matrix`: trains the combinations of a package and reports the results."""
 
 import traceback
 from dataclasses import dataclass, field
@@ -25,13 +25,13 @@ _PAUSE = 5.0
 
 @dataclass
 class Tally:
-    """The combinations that trained, were refused or failed.
+    """The combinations that were trained, refused or failed.
 
     Attributes:
-        members: What takes part.
+        members: The components that are combined.
         trained: (slot, name) of each component that was trained, by combination.
         refused: Slots -> combination with a component of the package -> reasons.
-        failed: Combination in words -> why it failed.
+        failed: Combination as text -> reason of its failure.
     """
 
     members: Members
@@ -40,9 +40,9 @@ class Tally:
     failed: dict[str, str] = field(default_factory=dict)
 
     def admits(self, row: Row, slots: tuple[str, ...]) -> bool:
-        """Whether a run of the combination can begin; takes note of reasons why not.
+        """Return True if a run of the combination can start; record the reasons if it cannot.
 
-        An error other than a refusal is found again when it is trained.
+        An error other than a refusal occurs again in training, and is recorded then.
         """
         try:
             reasons = reasons_to_refuse(config_of(row, slots))
@@ -53,7 +53,7 @@ class Tally:
         return not reasons
 
     def train(self, row: Row, slots: tuple[str, ...]) -> None:
-        """Trains a combination and takes note of what came of it."""
+        """Train a combination and record the result."""
         try:
             try_out(config_of(row, slots), STEPS)
         except (Exception, SystemExit) as error:
@@ -62,13 +62,13 @@ class Tally:
 
     @property
     def never_trained(self) -> list[str]:
-        """Components of the package that every combination with them refuses."""
+        """Components of the package that were refused in every combination."""
         met = frozenset().union(*self.trained)
         return [f"{slot} {name}" for slot, name in sorted(self.members.own - met)]
 
 
 def reason_of(error: BaseException) -> str:
-    """An error in one line, and the line of the source that raised it."""
+    """Return an error in one line, with the source line that raised it."""
     text = f"{error.what}: {error.found}" if isinstance(error, UserError) else str(error)
     frames = traceback.extract_tb(error.__traceback__)
     place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
@@ -76,14 +76,14 @@ def reason_of(error: BaseException) -> str:
 
 
 def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
-    """Trains a package's components with all others.
+    """Train a package's components with all others.
 
     Args:
         package: Name of a distribution, or of an import package that holds plugins.
         full: All combinations instead of a pairwise design.
 
     Returns:
-        The report in 80 columns, and whether everything trained that was not refused.
+        The report in 80 columns, and whether everything was trained or refused without failure.
 
     Raises:
         UserError: See `members_of`.
@@ -104,14 +104,14 @@ def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
 
 
 def train_one(package: str, combination: str) -> None:
-    """Trains a single combination; whatever it raises comes through.
+    """Train a single combination, and let its errors propagate.
 
     Args:
         package: Name of the package.
         combination: `slot=name slot=name`, as the report shows it.
 
     Raises:
-        UserError: It is not written so, or names something that is not installed.
+        UserError: The format is invalid, or a component is not installed.
     """
     members = members_of(package)
     pairs = [tuple(part.split("=", 1)) for part in combination.split()]
@@ -129,7 +129,7 @@ def train_one(package: str, combination: str) -> None:
 
 
 def report(tally: Tally, package: str) -> str:
-    """What was trained, refused and failed, in 80 columns."""
+    """Return the report on trained, refused and failed combinations, in 80 columns."""
     members, own = tally.members, tally.members.own
     heading = f"{members.package}: {listed(f'{slot} {name}' for slot, name in sorted(own))}"
     numbers = count(len(tally.trained) - len(tally.failed), "combination")
@@ -151,7 +151,7 @@ def report(tally: Tally, package: str) -> str:
 
 
 def _refusals(rows: Refused, slots: tuple[str, ...], tally: Tally) -> list[str]:
-    """The refusals in few lines: together they say no more than what was refused or trained."""
+    """Return the refusals in few lines, which contain no combination that was trained."""
     known = set(slots)
     trained = [each for each in tally.trained if {slot for slot, _ in each} == known]
     names = [dict(each) for each in trained]

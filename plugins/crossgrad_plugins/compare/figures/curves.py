@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: The first evaluations, far below the others, may be cut off: lower quantile that stays.
+#: Quantile of the figures at which the axis begins; the first, much lower evaluations are cut off.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
-#: Room that the signs of all arms take beside each other, of the distance between two groups.
+#: Width of the markers of all arms together, relative to the distance between two groups.
 _SPREAD: Final = 0.62
 _POINTS = 301
 
 
 def draw_curves(c: Comparison, cost: Cost) -> Drawn:
-    """Draw the figure of all arms over one cost."""
+    """Draw the main figure of all arms over one cost."""
 
     def panel(ax: "Axes", scene: str) -> None:
         limits = draw_bands(ax, c, scene, c.quantity, cost)
@@ -60,7 +60,7 @@ def draw_primitives(c: Comparison, cost: Cost) -> Drawn:
 
 
 def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
-    """Draw final quality over what whole runs spent; None if all runs have one length."""
+    """Draw final quality over the cost of whole runs; return None if all runs have one length."""
     if not c.cells.several:
         return None
     look = looks([arm.name for arm in c.arms])
@@ -82,7 +82,7 @@ def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
                 label=literal(arm),
             )
         ax.set_xscale("log")
-        # Numbers as people write them: 300 and 600 instead of powers of ten.
+        # Show plain numbers such as 300 and 600 instead of powers of ten.
         ax.xaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
         ax.xaxis.set_major_formatter("{x:,g}")
         ax.xaxis.set_minor_locator(NullLocator())
@@ -134,7 +134,7 @@ def draw_regimes(c: Comparison) -> Drawn:
 
 
 def draw_profile(c: Comparison) -> Drawn | None:
-    """Draw a panel for each cost; None with one arm, or if no problem is shared by all arms."""
+    """Draw a panel for each cost; return None with one arm or without a problem of all arms."""
     by_cost = {cost: ratios([row for row in c.reached if row.cost == cost]) for cost in c.costs}
     shown = {cost.title: by for cost, by in by_cost.items() if any(by.values())}
     if len(c.arms) < 2 or not shown:  # noqa: PLR2004 - nothing to compare

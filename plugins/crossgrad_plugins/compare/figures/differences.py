@@ -1,4 +1,4 @@
-"""Paired differences with their intervals, beside the margin."""
+"""The figure of paired differences with their intervals and the margin."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-#: More rows than these would not fit on a page.
+#: Maximum number of rows that fit on a page.
 _MOST_ROWS: Final = 24
-#: How far intervals are above the middle of their row; the signs of pairs are below it.
+#: Intervals are this far above the middle of their row; the markers of pairs are below it.
 _ABOVE: Final = 0.12
-#: Letters of a line of a heading, and the height of each further line in rows.
+#: Letters per line of a heading, and the height of each further line in rows.
 _LETTERS, _LINE = 70, 0.6
 _COLORS: Final = {
     Verdict.DIFFERENT: "#D55E00",
@@ -40,7 +40,7 @@ _COLORS: Final = {
 
 
 def draw_differences(c: Comparison) -> Drawn | None:
-    """Draw all contrasts of the main figure; None with a single arm."""
+    """Draw all contrasts of the main figure; return None with a single arm."""
     by_regime = (each for each in c.regimes if each.where != OVERALL)
     rows = [*c.ends, *c.equal, *by_regime][:_MOST_ROWS]
     if not rows:
@@ -54,7 +54,7 @@ def draw_differences(c: Comparison) -> Drawn | None:
         ax = figure.subplots()
         ax.axvspan(-margin, margin, color=FAINT, alpha=0.13, linewidth=0)
         ax.axvline(0.0, color=FAINT, linewidth=0.8)
-        # The axis ends with the pairs: a row of two pairs may have an interval of many dB.
+        # The pairs limit the axis: with two pairs, the interval of a table row can span many dB.
         dots = [pair.difference for row in rows for pair in row.pairs]
         low, high = min([*dots, -2.0 * margin]), max([*dots, 2.0 * margin])
         ax.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
@@ -121,7 +121,7 @@ def _row(ax: "Axes", row: Contrast, place: float, scenes: Sequence[str]) -> None
 
 
 def _key(rows: Sequence[Contrast], scenes: Sequence[str]) -> list["Line2D"]:
-    """Return what colours and signs mean."""
+    """Return the legend of colours and markers."""
     from matplotlib.lines import Line2D
 
     present = {row.verdict for row in rows}

@@ -1,4 +1,4 @@
-"""The grid of panels that all figures are drawn in, and what panels have in common."""
+"""The grid of panels of all figures, and drawing functions that panels share."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 _IN_A_ROW: Final = 4
 #: Width of a figure with a single panel, as a share of the page.
 _SINGLE: Final = 0.62
-#: A line of so few points has markers; on others they would hide it.
+#: A line with at most this many points has markers; on longer lines, markers would hide the line.
 _MOST_MARKERS: Final = 4
-#: Points of a line; seeds that are evaluated at other seconds would give too many.
+#: Maximum points of a line; seeds evaluated at different seconds would give too many.
 _MOST_POINTS: Final = 60
 
 
@@ -39,14 +39,14 @@ class Grid:
     """A figure of panels side by side, at most four in a row.
 
     Attributes:
-        name: Its name, for files and ids.
-        title: What it is called.
-        caption: What it shows.
+        name: Name of the figure, for files and ids.
+        title: Title of the figure.
+        caption: Description of the figure.
         y: Label of the vertical axes.
-        x: Label of the horizontal axes, or one for each panel; each is below the last panel of its
-            column.
+        x: Label of the horizontal axes, or one label for each panel. A label appears below the
+            last panel of each column.
         height: Height of a row in inches.
-        has_titles: Whether each panel shows its name.
+        has_titles: True if each panel shows its name.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Grid:
 
         Args:
             panels: The name of each panel.
-            draw: Draws the panel of a number into its axes.
+            draw: Draws the panel with the given index into its axes.
             arms: The arms of the legend.
         """
         columns = min(_IN_A_ROW, len(panels))
@@ -107,9 +107,9 @@ def draw_bands(
         ax: The panel.
         c: The comparison.
         scene: The scene.
-        quantity: What is drawn.
-        cost: What it is drawn over.
-        unit: What counts as 1 on the vertical axis.
+        quantity: The figure on the vertical axis.
+        cost: The cost on the horizontal axis.
+        unit: Value that is drawn as 1 on the vertical axis.
 
     Returns:
         The lowest [n] and highest [n] figure of each arm that has a curve.
@@ -122,7 +122,7 @@ def draw_bands(
         color = look[arm].color
         marker = look[arm].marker if 0 < len(x) <= _MOST_MARKERS else ""
         ax.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-        # An arm without a run on this scene is in the legend all the same.
+        # An arm without a run on this scene also gets a legend entry.
         ax.plot(x, middle, color=color, linestyle=look[arm].dash, marker=marker, label=literal(arm))
         if len(x):
             limits += [low, high]
@@ -134,10 +134,10 @@ def draw_bands(
 def band(
     c: Comparison, arm: str, scene: str, quantity: Quantity, cost: Cost
 ) -> tuple[Array, Array, Array, Array]:
-    """Return what was spent, and the lowest, mean and highest figure over the seeds of an arm.
+    """Return the cost, and the lowest, mean and highest figure over the seeds of an arm.
 
-    A run's figure is interpolated between its evaluations. The arrays [n] reach over the costs that
-    all runs have in common; they are empty if there is no run with a curve, or nothing in common.
+    A run's figure is interpolated between its evaluations. The arrays [n] cover the range of costs
+    that all runs share. They are empty if no run has a curve, or if the runs share no range.
     """
     runs = [run for (at, _), run in c.main[arm].items() if at == scene]
     series = [(x, y) for x, y in (run.series(quantity.name, cost) for run in runs) if len(x)]

@@ -1,4 +1,4 @@
-"""Where the seconds went."""
+"""The figure of the milliseconds that each phase of a step took."""
 
 import numpy as np
 
@@ -18,15 +18,16 @@ from crossgrad_plugins.compare.figures.style import (
 from crossgrad_plugins.compare.quantity import SECONDS
 
 _OTHER = "other"
-#: Letters of a line of an arm's name beside its bar.
+#: Letters per line of an arm's name next to its bar.
 _LETTERS = 40
 _HATCHES = ("", "", "", "", "", "", "", "///", "...", "xxx")
 
 
 def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
-    """Arm -> phase -> milliseconds of a step, in the mean over its runs that recorded them.
+    """Return arm -> phase -> milliseconds per step, averaged over the runs that recorded phases.
 
-    Phases are seconds of the clock: empty where these do not compare, or are not wanted.
+    Phases are wall-clock seconds. The result is empty if wall-clock seconds are not comparable or
+    not requested.
     """
     found: dict[str, dict[str, float]] = {}
     if SECONDS not in comparison.costs:
@@ -46,7 +47,7 @@ def phases_of(comparison: Comparison) -> dict[str, dict[str, float]]:
 
 
 def draw_phases(comparison: Comparison) -> Drawn | None:
-    """Milliseconds of a step by phase, a bar for each arm; None where none is comparable."""
+    """Draw milliseconds per step by phase, one bar per arm; return None without comparable runs."""
     found = phases_of(comparison)
     if not found:
         return None

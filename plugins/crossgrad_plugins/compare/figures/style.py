@@ -1,4 +1,4 @@
-"""How all figures look: sizes of print, colours for any colour vision, light and dark pages."""
+"""The style of all figures: font sizes, colour-blind safe colours, light and dark pages."""
 
 import io
 import re
@@ -19,7 +19,7 @@ COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (5, 1.6)), (0, (1, 1)), (0, (4, 1.2, 1, 1.2)))
 INK, FAINT, GRID = "#1a1a1a", "#666666", "#e2e2e2"
-#: Inches: a page of a paper with margins, and a column.
+#: Widths in inches: a page of a paper without its margins, and a column.
 PAGE, COLUMN = 7.0, 3.4
 _RC: Final[Any] = {
     "axes.edgecolor": FAINT,
@@ -52,12 +52,12 @@ _RC: Final[Any] = {
     "ytick.labelsize": 7.5,
 }
 _DPI: Final = 220
-#: About how many letters a page is wide, how many the sign and the space of a label take, and by
-#: what share the lines of a label are made shorter at a time.
+#: Letters per page width, letters that a label's marker and gap take, and the divisor of the line
+#: length by which the lines of a label are shortened in one step.
 _LETTERS, _BESIDE, _LETTERS_AT_ONCE = 110, 8, 10
-#: Lines of a legend that every figure has room for, and inches that each takes.
+#: Legend lines that every figure has space for, and the height of a line in inches.
 _LEGEND_LINES, _LINE = 2, 0.18
-#: A name may go on in the next line behind these signs, and anywhere in a part of this length.
+#: A name may be broken after these characters, and anywhere in a longer part without them.
 _PARTS: Final = re.compile(r"[^\s_./-]{1,18}[\s_./-]*|[\s_./-]+")
 _SVG: Final = re.compile(r"<svg\b.*", re.DOTALL)
 _ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
@@ -65,16 +65,16 @@ _ID: Final = re.compile(r'(\bid="|url\(#|href="#)')
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure in all its forms.
+    """A figure in all its file formats.
 
     Attributes:
-        name: Its name, for files and ids.
-        title: What it is called.
-        caption: What it shows, for the page.
-        svg: For the page: colours are variables of its style sheet.
-        pdf: For a paper.
-        png: For everything else.
-        share: Its width as a share of a page's.
+        name: Name of the figure, for files and ids.
+        title: Title of the figure.
+        caption: Description of the figure, for the page.
+        svg: SVG for the page; its colours are variables of the page's style sheet.
+        pdf: PDF for a paper.
+        png: PNG for other uses.
+        share: Width of the figure as a share of the page width.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Look:
-    """How an arm looks in every figure."""
+    """The colour, marker and line style of an arm in every figure."""
 
     color: str
     marker: str
@@ -96,11 +96,11 @@ class Look:
 
 
 def looks(arms: Sequence[str]) -> dict[str, Look]:
-    """Arm -> how it looks; colour, marker and line differ at once, for print without colours."""
+    """Return arm -> look; arms also differ in marker and line style, for print without colours."""
     return {
         arm: Look(
             COLORS[index % len(COLORS)],
-            # Where colours come again marker and line are others.
+            # When the colours repeat, marker and line style change.
             MARKERS[(index + index // len(COLORS)) % len(MARKERS)],
             DASHES[(index % len(COLORS) + index // len(COLORS)) % len(DASHES)],
         )
@@ -110,7 +110,7 @@ def looks(arms: Sequence[str]) -> dict[str, Look]:
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Figures inside have this style; signs that a font lacks are no warning."""
+    """Apply the style to figures inside the block; ignore warnings about missing glyphs."""
     from matplotlib import rc_context
 
     with rc_context(_RC), warnings.catch_warnings():
@@ -119,7 +119,7 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """An empty figure of that size in inches."""
+    """Return an empty figure of the given size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -129,7 +129,7 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
-    """The figure in all its forms; its layout is worked out once, not for each of them."""
+    """Return the figure in all its formats; its layout is computed only once."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -139,7 +139,7 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
         engine.execute(figure)
     figure.set_layout_engine("none")
     png, pdf, svg = io.BytesIO(), io.BytesIO(), io.StringIO()
-    # Not by `savefig`, which works out the layout once more for every form.
+    # `savefig` would compute the layout again for every format.
     for_png: Any = FigureCanvasAgg(figure)
     for_png.print_png(png)
     for_pdf: Any = FigureCanvasPdf(figure)
@@ -161,7 +161,7 @@ def drawn(figure: "Figure", name: str, title: str, caption: str) -> Drawn:
 
 
 def _for_page(svg: str, name: str) -> str:
-    """The SVG element alone, with ids of its own and colours that the page chooses."""
+    """Return the SVG element alone, with unique ids and with colours that the page sets."""
     found = _SVG.search(svg)
     text = _ID.sub(rf"\1{name}-", found[0] if found else svg)
     for variable, color in variables().items():
@@ -172,26 +172,26 @@ def _for_page(svg: str, name: str) -> str:
 
 
 def variables() -> dict[str, str]:
-    """Name of a variable of the page's style sheet -> the colour that stands for it in figures."""
+    """Return name of a style sheet variable of the page -> its colour in figures."""
     series = {f"series-{number}": color for number, color in enumerate(COLORS)}
     return {"ink": INK, "faint": FAINT, "grid": GRID, **series}
 
 
 def literal(text: str) -> str:
-    """Return text for a legend, which hides what begins with an underscore."""
+    """Return text for a legend; quote a leading underscore, which would hide the entry."""
     text = showable(text)
     return f"'{text}'" if text.startswith("_") else text
 
 
 def panel_title(ax: "Axes", scene: str) -> None:
-    """Writes a scene's name above its panel, on several lines where the panel is too narrow."""
+    """Write a scene's name above its panel, on several lines if the panel is too narrow."""
     place = ax.get_subplotspec()
     beside = 1 if place is None else place.get_gridspec().ncols
     ax.set_title(wrapped(literal(one_line(scene)), _LETTERS // beside - _BESIDE), loc="left")
 
 
 def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4) -> None:
-    """Put the arms above all panels, as they are called in `axes`."""
+    """Put the legend of the arms above all panels, with the handles of `axes`."""
     handles, labels = axes.get_legend_handles_labels()
     known = dict(zip(labels, handles, strict=True))
     shown = [literal(arm) for arm in arms if literal(arm) in known]
@@ -201,13 +201,13 @@ def legend(figure: "Figure", axes: "Axes", arms: Sequence[str], columns: int = 4
 def legend_above(
     figure: "Figure", handles: Sequence[Any], labels: Sequence[str], columns: int
 ) -> None:
-    """Put a legend above all panels; no label leaves the figure, which grows by further lines.
+    """Put a legend above all panels; the figure grows if the legend needs further lines.
 
     Args:
         figure: The figure.
-        handles: A sign for each label.
-        labels: The labels; longer ones than the figure is wide go on in further lines.
-        columns: Columns at most.
+        handles: A handle for each label.
+        labels: The labels; a label wider than the figure continues on further lines.
+        columns: Maximum number of columns.
     """
     letters = int(_LETTERS * figure.get_figwidth() / PAGE)
     longest = max((len(label) for label in labels), default=1)
@@ -225,7 +225,7 @@ def legend_above(
         box = made.get_window_extent()
         if box.width <= figure.bbox.width or letters <= _BESIDE:
             break
-        made.remove()  # Letters that are wider than usual.
+        made.remove()  # The letters are wider than estimated.
         if columns > 1:
             columns -= 1
         else:
@@ -235,7 +235,7 @@ def legend_above(
 
 
 def wrapped(text: str, room: int) -> str:
-    """The text on lines of at most so many letters, as far as its parts allow."""
+    """Break a text into lines of at most `room` letters, if its parts are short enough."""
     lines = [""]
     for part in _PARTS.findall(text):
         if lines[-1] and len(lines[-1] + part) > room:

@@ -10,18 +10,18 @@ from crossgrad_core.numerics.jit import kernel
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Sums: TypeAlias = NDArray[np.float64]  # [3, 4]
 
-# Sums in float32 stay this short before they go on in float64.
+# Number of pixels summed in float32 before the sum is added in float64.
 _PIXELS = 256
 
 
 @kernel
 def map_colors(image: _Floats, matrix: _Floats, taken: _Floats) -> None:
-    """Writes A x + b of every pixel x.
+    """Write A x + b of every pixel x.
 
     Args:
         image: Values in the order R, G, B, R ...
         matrix: [12] the rows of [A | b].
-        taken: Receives as many values.
+        taken: Output, of the same length.
     """
     for pixel in range(len(image) // 3):
         red, green, blue = image[3 * pixel], image[3 * pixel + 1], image[3 * pixel + 2]
@@ -35,14 +35,14 @@ def map_colors(image: _Floats, matrix: _Floats, taken: _Floats) -> None:
 def map_colors_back(
     image: _Floats, matrix: _Floats, upstream: _Floats, gradient: _Floats, sums: _Sums
 ) -> None:
-    """Writes the gradient by the colours, and adds up the gradient by the matrix.
+    """Write the gradient of the colours, and add up the gradient of the matrix.
 
     Args:
-        image: As for `map_colors`; likewise `matrix`.
-        matrix: [12].
-        upstream: The gradient by what was written.
-        gradient: Receives the gradient by the colours.
-        sums: [3, 4] receives the gradient by [A | b]; must be zero.
+        image: As for `map_colors`.
+        matrix: [12], as for `map_colors`.
+        upstream: The gradient of the output of `map_colors`.
+        gradient: Output: the gradient of the colours.
+        sums: [3, 4] output: the gradient of [A | b]; must be zero.
     """
     partial = np.zeros((3, 4), dtype=np.float32)
     pixels = len(image) // 3

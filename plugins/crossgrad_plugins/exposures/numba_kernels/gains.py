@@ -1,9 +1,9 @@
 """Gains in linear light on sRGB values, and their gradients (CPU, float32, one thread).
 
-sRGB's curve has a straight part for dark values, and a power above it. Where a value is in the
-power part before and after, decoding, multiplying by G and encoding again is a straight line: with
-o = 0.055 it makes G^(1/2.4) (x + o) - o of x. In the straight part before and after it makes G x.
-Only values that change sides need a power; eight values at a time are looked through for them.
+sRGB's curve has a straight part for dark values, and a power part above it. If a value is in the
+power part before and after the gain G, decoding, multiplying and encoding are one linear map of x:
+with o = 0.055, G^(1/2.4) (x + o) - o. If it is in the straight part before and after, the map is
+G x. Only values that change parts need a power; they are searched in blocks of eight values.
 """
 
 from typing import TypeAlias
@@ -34,9 +34,9 @@ from crossgrad_plugins.exposures.srgb import (
 _Floats: TypeAlias = NDArray[np.float32]  # 1-D
 _Sums: TypeAlias = NDArray[np.float64]  # [3]
 
-#: Values after which channels and lanes begin together again.
+#: Number of values after which channels and lanes are aligned again.
 PERIOD = 3 * LANES
-# Sums in float32 stay this short before they go on in float64.
+# Number of blocks summed in float32 before the sum is added in float64.
 _ROUNDS = 32
 _ALL = np.uint64(2**LANES - 1)
 
@@ -51,7 +51,7 @@ _OF_POWER, _OF_LINE = np.log(2.0) / EXPONENT, np.log(2.0)
 
 @device
 def _exposed(value: np.float32, gain: np.float32) -> np.float32:
-    """One value as taken."""
+    """Return one value after the gain."""
     if value <= _THRESHOLD:
         light = gain * value / _SLOPE
     else:
@@ -63,7 +63,7 @@ def _exposed(value: np.float32, gain: np.float32) -> np.float32:
 
 @device
 def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32:
-    """The derivative of one value as taken by the value itself; needs no power."""
+    """Return the derivative of one value after the gain by the value itself; needs no power."""
     if taken <= _THRESHOLD:
         if value <= _THRESHOLD:
             return gain
@@ -75,7 +75,7 @@ def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32
 
 @device
 def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np.uint64]:
-    """Which of eight values are in the straight part before and after, and which in the power."""
+    """Return bits of the values in the straight part before and after, and in the power part."""
     dark = splat(_THRESHOLD)
     both = bits(values <= dark) & bits(straight <= dark)
     return both, _ALL & ~bits(values <= dark) & ~bits(bright <= dark)
@@ -83,13 +83,13 @@ def _sides(values: Lanes, straight: Lanes, bright: Lanes) -> tuple[np.uint64, np
 
 @kernel
 def expose(image: _Floats, gains: _Floats, slopes: _Floats, taken: _Floats) -> None:
-    """Writes the values as taken.
+    """Write the values after the gain.
 
     Args:
         image: Values in the order R, G, B, R ...
-        gains: [24] the channels' gains, again and again.
+        gains: [24] the channels' gains, repeated.
         slopes: [24] the gains to the power of 1 / 2.4.
-        taken: Receives as many values.
+        taken: Output, of the same length.
     """
     offset, dark = splat(_OFFSET), splat(_THRESHOLD)
     whole = len(image) // PERIOD * PERIOD
@@ -114,15 +114,15 @@ def expose_back(
     image: _Floats, taken: _Floats, upstream: _Floats, gains: _Floats, gradient: _Floats,
     sums: _Sums,
 ) -> None:  # fmt: skip
-    """Writes the gradient by the values, and adds up the gradient by the stops of each channel.
+    """Write the gradient of the values, and add up the gradient of the stops of each channel.
 
     Args:
-        image: As for `expose`; likewise `gains`.
-        taken: What `expose` wrote.
-        upstream: The gradient by what it wrote.
-        gains: [24].
-        gradient: Receives the gradient by the values.
-        sums: [3] receives the gradient by the stops; must be zero.
+        image: As for `expose`.
+        taken: The output of `expose`.
+        upstream: The gradient of the output of `expose`.
+        gains: [24], as for `expose`.
+        gradient: Output: the gradient of the values.
+        sums: [3] output: the gradient of the stops; must be zero.
     """
     partial = np.zeros((2, PERIOD), dtype=np.float32)
     flat = partial.ravel()
@@ -135,7 +135,7 @@ def expose_back(
             values, after = load(image, start + lane), load(taken, start + lane)
             given = load(upstream, start + lane)
             before_line, after_line = values <= dark, after <= dark
-            # A value on the line is divided by itself times the exponent where it leaves it.
+            # If a value leaves the straight part, it is divided by itself times the exponent.
             below = where(before_line, exponent * values, values + offset)
             above = where(after_line, exponent * after, after + offset)
             slope = where(
@@ -156,7 +156,7 @@ def expose_back(
 
 @device
 def _by_stops(taken: np.float32) -> float:
-    """The derivative of one value as taken by the stops."""
+    """Return the derivative of one value after the gain by the stops."""
     if taken <= _THRESHOLD:
         return _OF_LINE * taken
     return _OF_POWER * (taken + _OFFSET)
@@ -164,7 +164,7 @@ def _by_stops(taken: np.float32) -> float:
 
 @device
 def _settle(partial: _Floats, sums: _Sums) -> None:
-    """Moves sums over the straight part and over the power part to the channels' sums."""
+    """Add the sums over the straight part and over the power part to the channels' sums."""
     for j in range(PERIOD):
         of_line, of_power = np.float64(partial[0, j]), np.float64(partial[1, j])
         sums[j % 3] += _OF_LINE * of_line + _OF_POWER * of_power

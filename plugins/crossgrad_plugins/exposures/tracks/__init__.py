@@ -1,1 +1,1 @@
-"""Exposure from SfM tracks: how bright photos are where they show the same points."""
+"""Exposure from SfM tracks: the brightness of photos at the points that they share."""

@@ -1,11 +1,11 @@
 """Relative brightness of the photos of a scene, by a robust fit to SfM tracks.
 
-Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. Iteratively
-reweighted least squares; the points are eliminated. In what is left each photo stands beside those
-with common points. Where these are few, as along a strip of hundreds of photos, the gains are found
-directly: iterations would go on for long. Where they are many, iterations (conjugate gradients) are
-few, and the direct way is the long one. Where photos hang together in several parts that share no
-point, each part has a mean of 0.
+Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. It is solved by
+iteratively reweighted least squares, with the points eliminated. The remaining matrix couples each
+photo with the photos that share points with it. If these are few, as in a strip of hundreds of
+photos, the matrix is solved directly, because conjugate gradients would need many iterations. If
+they are many, conjugate gradients need few iterations and the direct solution is slow. If the
+photos form several parts that share no point, each part has a mean of 0.
 """
 
 from collections.abc import Sequence
@@ -24,48 +24,50 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 
-#: Usable observations without which tracks tell nothing about a photo.
+#: Minimum number of usable observations for the gain of a photo.
 LEAST = 8
-#: Rule by which tracks say that photos differ in exposure: standard deviation of the gains in
-#: stops, that deviation over its own standard error, and share of the distance of observations from
-#: their points that the gains take away. Measured on scenes with and without (docs/exposure.md).
+#: The rule by which photos differ in exposure: minimum standard deviation of the gains in stops,
+#: minimum ratio of that deviation to its own standard error, and minimum share of the deviation of
+#: observations from their points that the gains remove. Results: docs/exposure.md.
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
-#: Photos from which on no single one decides: all points of one may lie on what others hide.
+#: From this number of photos on, the photo farthest from the mean is ignored, because all its
+#: points may be on an object that the other photos hide.
 _ENOUGH = 5
-#: Photos that decide. Of more, runs of consecutive ones do, because these show the same points.
+#: Maximum number of photos for the decision. Of more photos, runs of consecutive ones are used,
+#: because consecutive photos show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
-# A run asks more than once, and a scene does not change.
+# Cached, because a run requests the gains several times and a scene does not change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 _DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
-#: Huber's constant, in standard deviations: 95 % efficient where errors are normal.
+#: Huber's constant, in standard deviations: 95 % efficient for normal errors.
 _HUBER = 1.345
-#: Standard deviations of a normal law in one median absolute deviation.
+#: Standard deviations of a normal distribution in one median absolute deviation.
 _NORMAL = 1.4826
 _ROUNDS = 12
-#: Photos that share points with each one, in the mean, up to which the direct way is the quick one,
-#: and photos in all up to which iterations cross any strip.
+#: The direct solution is used up to this mean number of photos that share points with a photo, and
+#: above this total number of photos; with fewer photos, iterations converge quickly.
 _FEW, _SHORT = 64, 64
-#: What gains may be off by after iterations, in stops; rounding allows less.
+#: Maximum error of the gains after iterations, in stops; rounding allows less.
 _TOLERANCE = 1e-5
-#: Photos up to which standard errors are worked out: their matrix is dense.
+#: Maximum number of photos for standard errors, because their matrix is dense.
 _DENSE = 512
-#: Eigenvalues below this share of the largest one belong to the level of a part, which is free.
+#: Eigenvalues below this share of the largest one belong to the free mean of a part.
 _RANK = 1e-9
-#: Residuals below it, in stops, are rounding of 8-bit values.
+#: Residuals below this value, in stops, are rounding of 8-bit values.
 _SMALLEST = 1e-3
 _Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """How bright photos are beside each other.
+    """The relative brightness of photos.
 
     Attributes:
-        gains: [V] stops of each photo above their mean; 0 where it has no observation.
+        gains: [V] stops of each photo above their mean; 0 without observations.
         before: Mean distance of the observations from the means of their points, stops. A point
-            counts by the variance of the gains of the photos that show it, because only points
-            that join photos of different gains test these.
-        after: The same once the gains are taken out.
+            is weighted by the variance of the gains of the photos that show it, because only
+            points that join photos of different gains test these gains.
+        after: Like `before`, after the gains are removed.
         errors: [V] standard errors of the gains, stops; NaN for more photos than `_DENSE`.
     """
 
@@ -76,18 +78,18 @@ class Fit:
 
     @property
     def reduction(self) -> float:
-        """Which share of the deviation the gains take away."""
+        """The share of the deviation that the gains remove."""
         return 1.0 - self.after / self.before if self.before > 0.0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class TrackGains:
-    """How bright photos are beside each other where they show the same points.
+    """The relative brightness of photos at points that they share.
 
     Attributes:
-        gains: [V] stops above the mean of the photos; 0 where tracks tell nothing.
+        gains: [V] stops above the mean of the photos; 0 without enough observations.
         counts: [V] usable observations.
-        fit: How well the gains explain the observations.
+        fit: The fit of the gains to the observations.
     """
 
     gains: NDArray[np.float64]
@@ -96,7 +98,7 @@ class TrackGains:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """[V] about which photos tracks tell something."""
+        """[V] True for photos with enough usable observations."""
         return self.counts >= LEAST
 
     @property
@@ -112,13 +114,13 @@ class TrackGains:
 
     @property
     def differ(self) -> bool:
-        """Whether the photos differ in exposure, by the rule."""
+        """True if the photos differ in exposure, by the rule."""
         sure = self.spread >= LEAST_RATIO * self.error
         return sure and self._lasting >= LEAST_SPREAD and self.fit.reduction >= LEAST_REDUCTION
 
     @property
     def _lasting(self) -> float:
-        """The spread without the photo farthest from the mean, if there are photos enough."""
+        """The spread without the photo farthest from the mean, if there are enough photos."""
         known = self.gains[self.known]
         if len(known) < _ENOUGH:
             return self.spread
@@ -126,7 +128,7 @@ class TrackGains:
 
     @property
     def evidence(self) -> str:
-        """What the rule goes by, in words."""
+        """The figures of the rule, as text."""
         known = self.gains[self.known]
         if not len(known):
             return "no SfM tracks tell how bright the photos are beside each other"
@@ -141,7 +143,7 @@ class TrackGains:
 
 
 def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
-    """The gains of the photos of some views."""
+    """Fit the gains of the photos of some views."""
     observations = observations_of(scene, views)
     fit = fitted(observations, len(views))
     counts = np.bincount(observations.photos, minlength=len(views))
@@ -151,7 +153,7 @@ def track_gains(scene: Scene, views: Sequence[View]) -> TrackGains:
 
 
 def training_gains(scene: Scene) -> TrackGains:
-    """The gains of all training photos, worked out once for a scene."""
+    """Return the gains of all training photos; computed once per scene."""
     found = _OF_TRAINING.get(scene)
     if found is None:
         found = _OF_TRAINING[scene] = track_gains(scene, scene.train_views)
@@ -159,7 +161,7 @@ def training_gains(scene: Scene) -> TrackGains:
 
 
 def deciding_gains(scene: Scene) -> TrackGains:
-    """The gains that decide whether the training photos differ, worked out once for a scene."""
+    """Return the gains that decide whether the training photos differ; computed once per scene."""
     views = scene.train_views
     if len(views) <= MOST_DECIDING:
         return training_gains(scene)
@@ -172,7 +174,7 @@ def deciding_gains(scene: Scene) -> TrackGains:
 
 
 def fitted(observations: Observations, photos: int) -> Fit:
-    """The gains of `photos` photos."""
+    """Fit the gains of `photos` photos."""
     o = observations
     if not o.count:
         return Fit(np.zeros(photos), 0.0, 0.0, np.zeros(photos))
@@ -197,9 +199,9 @@ def fitted(observations: Observations, photos: int) -> Fit:
 
 
 def _variances(o: Observations, gains: _Floats) -> _Floats:
-    """[N] variance of the gains of the photos that show the point of each observation.
+    """Return the variance [N] of the gains of the photos that show each observation's point.
 
-    All are 1 if no point joins photos of different gains.
+    All variances are 1 if no point joins photos of different gains.
     """
     even = np.ones(o.count)
     above = gains[o.photos] - _means(o.points, gains[o.photos], even)[o.points]
@@ -210,9 +212,9 @@ def _variances(o: Observations, gains: _Floats) -> _Floats:
 def _errors(
     o: Observations, weights: _Floats, residuals: _Floats, parts: NDArray[np.int64]
 ) -> _Floats:
-    """[V] standard errors of the gains by weighted least squares.
+    """Return the standard errors [V] of the gains by weighted least squares.
 
-    Groups of photos that few points join have large ones, however many observations there are.
+    Groups of photos that few points join have large errors, even with many observations.
     """
     photos = len(parts)
     if photos > _DENSE:
@@ -225,24 +227,24 @@ def _errors(
 
 
 def _parts(o: Observations, photos: int) -> NDArray[np.int64]:
-    """[V] the part that each photo belongs to: those of one part hang together by points."""
+    """Return the part [V] of each photo; the photos of a part are connected by common points."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     size = photos + int(o.points.max()) + 1
-    # Graphs of older scipy have indices of 32 bits alone.
+    # Graphs in older versions of scipy require 32-bit indices.
     ends = o.photos.astype(np.int32), (photos + o.points).astype(np.int32)
     edges = coo_array((np.ones(o.count), ends), shape=(size, size))
     return np.asarray(connected_components(edges, directed=False)[1][:photos], dtype=np.int64)
 
 
 def _means(points: NDArray[np.int64], values: _Floats, weights: _Floats) -> _Floats:
-    """[N] weighted mean of the values of each point."""
+    """Return the weighted mean of each observation's point [N]."""
     return np.asarray(np.bincount(points, values * weights) / np.bincount(points, weights))
 
 
 def _neighbours(o: Observations, photos: int) -> float:
-    """How many photos share points with each one, itself included, in the mean."""
+    """Return the mean number of photos that share points with a photo, itself included."""
     from scipy.sparse import coo_array
 
     shape = photos, int(o.points.max()) + 1
@@ -251,7 +253,7 @@ def _neighbours(o: Observations, photos: int) -> float:
 
 
 def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Floats:
-    """The gains that minimise the weighted squares; 0 of the first photo of each part."""
+    """Return the gains of least weighted squares, by a direct solver; first photo of a part: 0."""
     from scipy.sparse.linalg import spsolve
 
     gains, count = np.zeros(len(parts)), len(parts)
@@ -267,7 +269,7 @@ def _direct(o: Observations, weights: _Floats, parts: NDArray[np.int64]) -> _Flo
 
 
 def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array":
-    """[V, V] the matrix of the normal equations of the gains, the points eliminated."""
+    """Return the matrix [V, V] of the normal equations of the gains, the points eliminated."""
     from scipy.sparse import coo_array
 
     of_points = np.bincount(o.points, weights)
@@ -278,13 +280,13 @@ def _normal_matrix(o: Observations, weights: _Floats, count: int) -> "csc_array"
 
 
 def _iterated(o: Observations, weights: _Floats, start: _Floats) -> _Floats:
-    """The gains that minimise the weighted squares, by conjugate gradients (Jacobi)."""
+    """Return the gains of least weighted squares, by conjugate gradients (Jacobi)."""
     count = len(start)
     diagonal = np.bincount(o.photos, weights, count)
     scale = 1.0 / np.maximum(diagonal, _SMALLEST)
 
     def deviations(values: _Floats) -> _Floats:
-        """Sum over each photo of what its observations are above the means of their points."""
+        """Sum each photo's weighted deviations from the means of its points."""
         above = values - _means(o.points, values, weights)[o.points]
         return np.asarray(np.bincount(o.photos, weights * above, count))
 

@@ -13,11 +13,11 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Scene, UserError, View
 from crossgrad_plugins.exposures.srgb import decoded
 
-#: Observations that are looked at; of more, every so many points are left out.
+#: Maximum number of observations; with more, only every n-th point is used.
 _MOST = 400_000
-#: Photos that are decoded at once; more of them would take memory.
+#: Number of photos decoded in parallel; more would need too much memory.
 _AT_ONCE = 2
-#: Linear light in [0, 1] that a photo tells: below it is noise, above it is cut off.
+#: Usable range of linear light in [0, 1]: below it is noise, above it values are clipped.
 DARKEST, BRIGHTEST = 0.02, 0.98
 _NEIGHBOURS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 
@@ -27,10 +27,10 @@ class Observations:
     """Usable observations of points that at least two of the photos show.
 
     Attributes:
-        photos: [O] position of the photo among those that were looked at.
+        photos: [O] index of the photo among the given views.
         points: [O] numbers of the points, from 0 on without gaps.
         stops: [O] log2 of the brightness in linear light.
-        rows: [N] the row of each number among the points of the scene.
+        rows: [N] row of each numbered point among the points of the scene.
     """
 
     photos: NDArray[np.int64]
@@ -40,16 +40,16 @@ class Observations:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of observations."""
         return len(self.stops)
 
 
 def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
-    """The observations of the scene's points in the photos of some views.
+    """Measure the brightness of the scene's points in the photos of some views.
 
-    A photo is looked at where its pose puts the points that it observed, 3 x 3 pixels for each.
+    A photo is sampled at the projections of the points that it observed, 3 x 3 pixels for each.
     Photos without such points are not decoded. A photo that cannot be decoded has no observations:
-    the run reports it when it needs the photo.
+    the run reports the error when it needs the photo.
     """
     shared = _shared_points(scene, views)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -57,7 +57,7 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     photos = np.repeat(np.arange(len(views)), [len(rows) for rows, _ in found])
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(rows for rows, _ in found)])
     stops = np.concatenate([np.zeros(0), *(stops for _, stops in found)])
-    # What is too dark or cut off in all photos but one tells nothing about that one.
+    # A point that is usable in one photo only gives no information about that photo.
     _, numbers, times = np.unique(rows, return_inverse=True, return_counts=True)
     kept = times[numbers] > 1
     known, numbers = np.unique(rows[kept], return_inverse=True)
@@ -65,7 +65,7 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
 
 
 def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
-    """[P] which points are looked at: those that two views observed, and of many a part."""
+    """Return which points [P] are used: points seen by two views; only a part of very many."""
     times = np.zeros(len(scene.points), dtype=np.int64)
     for view in views:
         times[view.seen] += 1
@@ -80,7 +80,7 @@ def _shared_points(scene: Scene, views: Sequence[View]) -> NDArray[np.bool_]:
 def _observed(
     scene: Scene, view: View, shared: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows of the points that a photo shows in usable brightness, and its stops."""
+    """Return the rows of the points that a photo shows in usable brightness, and their stops."""
     seen = view.seen[shared[view.seen]]
     if not len(seen):
         return seen, np.zeros(0)
@@ -99,7 +99,7 @@ class Light:
     """The brightness of an image at some points.
 
     Attributes:
-        rows: [S] which of the points that were asked for lie in the image.
+        rows: [S] indices of the given points that are inside the image.
         brightness: [S] linear light, mean over 3 x 3 pixels and the channels; 1 is white.
     """
 
@@ -108,24 +108,25 @@ class Light:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """[S] where the brightness is neither too dark nor cut off."""
+        """[S] True if the brightness is neither too dark nor clipped."""
         return (self.brightness > DARKEST) & (self.brightness < BRIGHTEST)
 
 
 def light_at(
     image: Tensor, mask: Tensor | None, camera: Camera, points: NDArray[np.float64]
 ) -> Light:
-    """The light of an image where it shows points.
+    """Measure the light of an image at points.
 
     Args:
         image: [H, W, 3] sRGB values, uint8 or floating point, on the CPU.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
-        camera: Its camera.
-        points: [P, 3] points that it shows, local frame.
+        mask: [H, W] bool, True if the pixel counts; None if every pixel counts.
+        camera: The camera of the image.
+        points: [P, 3] points in the local frame.
     """
     pixels, depths = camera.project(points)
     height, width = image.shape[:2]
-    # The neighbours lie in the image, too; numbers too large for an index are sorted out before.
+    # The neighbours must also be inside the image. This test also removes numbers too large for an
+    # index.
     inside = (pixels >= 1.0).all(axis=1) & (pixels < [width - 1, height - 1]).all(axis=1)
     rows = np.flatnonzero(inside & (depths > 0.0))
     right, down = (pixels[rows, axis].astype(np.int64) for axis in (0, 1))
@@ -139,7 +140,7 @@ def light_at(
 
 
 def _linear(values: NDArray[np.generic]) -> NDArray[np.float64]:
-    """[S, 3] sRGB values in linear light."""
+    """Return sRGB values in linear light [S, 3]."""
     if values.dtype == np.uint8:
         return np.asarray(_of_eight_bits()[values])
     return np.asarray(decoded(torch.from_numpy(values.astype(np.float64))))
@@ -147,5 +148,5 @@ def _linear(values: NDArray[np.generic]) -> NDArray[np.float64]:
 
 @cache
 def _of_eight_bits() -> NDArray[np.float64]:
-    """[256] linear light of each 8-bit value."""
+    """Return the linear light [256] of each 8-bit value."""
     return np.asarray(decoded(torch.arange(256, dtype=torch.float64) / 255.0))

@@ -1,4 +1,4 @@
-"""Who carries out runs: this machine, a Ray cluster, or Slurm; each is one function.
+"""Engines that carry out runs: this machine, a Ray cluster, or Slurm; each is one function.
 
 An engine is imported when a sweep names it.
 """
@@ -14,7 +14,7 @@ from crossgrad_plugins.sweep.attempt import COMMAND, Worker
 from crossgrad_plugins.sweep.job import Job
 from crossgrad_plugins.sweep.machine import Machine
 
-#: Name -> module that holds its `carry_out`.
+#: Name -> module with its function `carry_out`.
 ENGINES: Final = {
     "local": "crossgrad_plugins.sweep.engines.local",
     "ray": "crossgrad_plugins.sweep.engines.ray",
@@ -24,10 +24,10 @@ ENGINES: Final = {
 
 @dataclass
 class Stop:
-    """How often the user has asked the sweep to stop.
+    """The stop requests of the user.
 
     Attributes:
-        count: So often.
+        count: Number of requests.
     """
 
     count: int = 0
@@ -38,16 +38,16 @@ class Work:
     """The arguments of an engine.
 
     Attributes:
-        jobs: The runs in their order.
-        out: Folder of the sweep, which all machines see.
-        folder: Working folder of the runs, likewise.
-        threads: Threads of a run.
-        workers: Number of runs at a time; None leaves it to the engine.
-        memory: GiB that a run may take; None leaves it to the engine.
+        jobs: The runs, in order.
+        out: Folder of the sweep, visible on all machines.
+        folder: Working folder of the runs, visible on all machines.
+        threads: Threads per run.
+        workers: Number of runs in parallel; None leaves it to the engine.
+        memory: Maximum memory of a run, GiB; None leaves it to the engine.
         options: Options of the engine as the user gave them.
-        machine: How this machine is divided; None for an engine that runs elsewhere.
-        stop: Whether to stop.
-        command: What trains a run; the numbers of cores and arguments of `crossgrad` follow.
+        machine: The division of this machine; None for an engine that runs elsewhere.
+        stop: The stop requests of the user.
+        command: The command that trains a run; core numbers and arguments of `crossgrad` follow.
     """
 
     jobs: Sequence[Job]
@@ -62,12 +62,12 @@ class Work:
     command: tuple[str, ...] = COMMAND
 
     def worker(self, name: str, cores: tuple[int, ...] = (), memory: int | None = None) -> Worker:
-        """Somebody who carries out runs of this work.
+        """Return a worker that carries out runs of this work.
 
         Args:
-            name: His name.
-            cores: Numbers of his cores; any where there are none.
-            memory: Bytes that a run of his may take; by default what the user named.
+            name: Name of the worker.
+            cores: Numbers of its cores; empty for any cores.
+            memory: Maximum memory of a run in bytes; None for the limit of the user.
         """
         if memory is None and self.memory is not None:
             memory = int(self.memory * 2**30)
@@ -78,23 +78,23 @@ class Engine(Protocol):
     """The function `carry_out` of an engine's module."""
 
     def __call__(self, work: Work) -> Iterator[None]:
-        """Carries out runs; what becomes of them stands in their folders and in the records.
+        """Carry out runs; their folders and records hold the results.
 
-        Yields several times a second, so that the sweep can show how far they are. A run whose
-        process or machine dies is tried again; one that fails is not. Once `work.stop.count` is
-        above zero, nothing new begins and runs under way stop with a checkpoint.
+        Yields several times a second, so that the sweep can show its progress. A run whose process
+        or machine dies is tried again; a run that fails is not. Once `work.stop.count` is above
+        zero, no run is started, and active runs stop with a checkpoint.
 
         Raises:
-            UserError: The engine, an option of it, or its cluster is not there; nothing was begun.
+            UserError: The engine, one of its options, or its cluster is missing; no run started.
         """
         ...
 
 
 def check_options(name: str, options: Iterable[str]) -> None:
-    """Refuses options that an engine does not have.
+    """Refuse options that an engine does not have.
 
     Raises:
-        UserError: Names them, and those that it has.
+        UserError: An option is unknown; the message lists unknown and known options.
     """
     known: tuple[str, ...] = import_module(ENGINES[name]).OPTIONS
     if unknown := sorted(set(options) - set(known)):
@@ -110,6 +110,6 @@ def check_options(name: str, options: Iterable[str]) -> None:
 
 
 def engine(name: str) -> Engine:
-    """The engine of that name; imports its module."""
+    """Import the engine with the given name."""
     found: Engine = import_module(ENGINES[name]).carry_out
     return found

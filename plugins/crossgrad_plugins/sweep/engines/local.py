@@ -1,4 +1,4 @@
-"""The cores of this machine."""
+"""The engine that uses the cores of this machine."""
 
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ OPTIONS: Final = ()
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carries out runs, each in a process of its own that is pinned to its worker's cores."""
+    """Carry out runs, each in its own process that is pinned to its worker's cores."""
     crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
@@ -25,7 +25,7 @@ class _WorkerPool:
     """The workers of this machine.
 
     Args:
-        work: What is to be done.
+        work: The arguments of the engine.
     """
 
     def __init__(self, work: Work) -> None:
@@ -37,11 +37,11 @@ class _WorkerPool:
         self._asked = Counter[Attempt]()
 
     def is_busy(self) -> bool:
-        """Whether anything is under way or to be begun."""
+        """Return True if runs are active or must still be started."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Takes leave of what has ended, and begins what can begin."""
+        """Handle ended runs, and start runs on free workers."""
         for attempt in list(self._under_way):
             while self._asked[attempt] < self._work.stop.count:
                 self._asked[attempt] += 1
@@ -61,7 +61,7 @@ class _WorkerPool:
             self._under_way.append(Attempt(job, self._free.pop()))
 
     def _next(self) -> Job | None:
-        """The first run that no process of an earlier sweep still writes to."""
+        """Return the first run whose folder no process of an earlier sweep uses."""
         worker = self._free[-1]
         return next((job for job in self._waiting if is_free(job, worker)), None)
 

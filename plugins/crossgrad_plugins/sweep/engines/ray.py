@@ -1,4 +1,4 @@
-"""The machines of a Ray cluster: a task for each run; a machine that is lost costs only time.
+"""The engine for a Ray cluster: a task for each run; a lost machine only costs time.
 
 Options: `address` of the cluster (default: RAY_ADDRESS, else this machine).
 """
@@ -17,14 +17,14 @@ from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
 OPTIONS: Final = ("address",)
-#: Seconds between two looks.
+#: Maximum seconds to wait for ended tasks.
 _PAUSE = 0.25
-#: Seconds in which a cluster has to answer.
+#: Seconds in which a cluster must answer.
 _PATIENCE = 10.0
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carries out runs as tasks; Ray repeats those of a machine that it has lost."""
+    """Carry out runs as tasks; Ray repeats the tasks of a machine that it has lost."""
     ray = _connected(work)
     try:
         crew = _WorkerPool(work, ray)
@@ -39,7 +39,7 @@ class _WorkerPool:
     """The tasks of a sweep.
 
     Args:
-        work: What is to be done.
+        work: The arguments of the engine.
         ray: The library, connected.
     """
 
@@ -55,11 +55,11 @@ class _WorkerPool:
         self._task = ray.remote(scheduling_strategy="SPREAD", **needs)(_carried_out)
 
     def is_busy(self) -> bool:
-        """Whether anything is under way or to be begun."""
+        """Return True if runs are active or must still be started."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Hands out runs, and takes what has ended."""
+        """Submit runs, and handle ended runs."""
         work, most = self._work, self._work.workers
         while self._waiting and not work.stop.count and len(self._under_way) < (most or 10**6):
             job = self._waiting.popleft()
@@ -85,7 +85,7 @@ class _WorkerPool:
 
 
 def _carried_out(job: Job, worker: Worker) -> Outcome:
-    """The task: its worker is called after its machine and process."""
+    """Carry out a run as a task; the worker is named after its machine and process."""
     import os
 
     import ray
@@ -116,14 +116,14 @@ def _connected(work: Work) -> ModuleType:
             found=" ".join(str(error).split()),
             todo="start it with `ray start --head`, and name the address that it prints",
         ) from error
-    for number, handler in handlers.items():  # Ray puts its own in their place.
+    for number, handler in handlers.items():  # Ray installs its own handlers.
         signal.signal(number, handler)
     found: ModuleType = ray
     return found
 
 
 def _ping(address: str | None) -> None:
-    """Raises an OSError within seconds where nobody answers; Ray would wait for minutes."""
+    """Raise an OSError within seconds if the cluster does not answer; Ray waits for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=_PATIENCE).close()

@@ -1,7 +1,7 @@
-"""A Slurm cluster, through submitit: a job for each run.
+"""The engine for a Slurm cluster, through submitit: a job for each run.
 
-Options: `cluster` (slurm, or local to try it out on this machine), `time` in minutes (1440), and
-those of sbatch: `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
+Options: `cluster` (slurm, or local to test it on this machine), `time` in minutes (1440), and these
+options of sbatch: `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
 `comment`.
 """
 
@@ -16,22 +16,22 @@ from crossgrad_plugins.sweep.attempt import Outcome, Retries, Worker, carried_ou
 from crossgrad_plugins.sweep.engines import Work
 from crossgrad_plugins.sweep.job import Job
 
-#: Options that sbatch is given as they are.
+#: Options that are passed to sbatch unchanged.
 SBATCH: Final = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "comment"),
 )
 OPTIONS: Final = ("cluster", "time", *SBATCH)
 _NAME: Final = "crossgrad"
-#: Minutes that a job may take, where the user does not say.
+#: Default time limit of a job, minutes.
 _TIME: Final = 1440
-#: Seconds between two looks.
+#: Seconds between two checks of the jobs.
 _PAUSE: Final = 0.5
-#: Jobs of one array that run at a time, where the user does not say.
+#: Default number of parallel jobs of one array.
 _MOST: Final = 256
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carries out runs as jobs; one that Slurm preempts goes on when it is started again."""
+    """Carry out runs as jobs; a preempted job continues when Slurm starts it again."""
     crew = _WorkerPool(work)
     while crew.is_busy():
         crew.look()
@@ -40,7 +40,7 @@ def carry_out(work: Work) -> Iterator[None]:
 
 
 def script(work: Work) -> str:
-    """What sbatch would be given for the whole sweep."""
+    """Return the sbatch script of the whole sweep."""
     _submitit()
     from submitit.slurm.slurm import _convert_mem, _make_sbatch_string
 
@@ -64,24 +64,24 @@ def script(work: Work) -> str:
 
 
 class Task:
-    """A run as a job of Slurm; submitit hands it in again where Slurm preempts it.
+    """A run as a Slurm job; submitit submits it again if Slurm preempts it.
 
     Args:
         job: The run.
-        worker: Who carries it out.
+        worker: The worker that carries it out.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
         self.job, self.worker = job, worker
 
     def __call__(self) -> Outcome:
-        """Carries out the run."""
+        """Carry out the run."""
         import submitit
 
         return carried_out(self.job, self.worker, f"slurm-{submitit.JobEnvironment().job_id}")
 
     def checkpoint(self) -> object:
-        """The job that goes on; the run finds its own checkpoint."""
+        """Return the job that continues after preemption; the run finds its own checkpoint."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(self)
@@ -91,14 +91,14 @@ class _WorkerPool:
     """The jobs of a sweep.
 
     Args:
-        work: What is to be done.
+        work: The arguments of the engine.
     """
 
     def __init__(self, work: Work) -> None:
         self._work = work
         self._submitit = _submitit()
         self._executor = _executor(work, self._submitit)
-        # Only Slurm has a queue; elsewhere everything that is handed in begins at once.
+        # Only Slurm has a queue; other clusters start all submitted jobs at once.
         queued = self._executor.cluster == "slurm"
         self._most = len(work.jobs) if queued else work.workers or 1
         self._waiting = deque(work.jobs)
@@ -107,11 +107,11 @@ class _WorkerPool:
         self._asked = 0
 
     def is_busy(self) -> bool:
-        """Whether anything is under way or to be begun."""
+        """Return True if runs are active or must still be started."""
         return bool(self._under_way) or bool(self._waiting and not self._work.stop.count)
 
     def look(self) -> None:
-        """Hands in runs, and takes what has ended."""
+        """Submit runs, and handle ended runs."""
         stop = self._work.stop
         if self._waiting and not stop.count:
             self._hand_in()
@@ -165,7 +165,7 @@ def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an exe
 
 
 def _general(work: Work) -> dict[str, Any]:
-    """Parameters that every executor of submitit knows."""
+    """Return the parameters that every executor of submitit accepts."""
     found: dict[str, Any] = {
         "name": _NAME,
         "timeout_min": _minutes(work),
@@ -188,7 +188,7 @@ def _minutes(work: Work) -> int:
 
 
 def _submitit() -> ModuleType:
-    """The library."""
+    """Import the library submitit."""
     try:
         import submitit
     except ImportError as error:
