@@ -27,7 +27,7 @@ def in_frustum(
     """Write a mask of the anchors that pass; the formulas equal those of the plain filter.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         positions: [P, 3].
         log_scales: [P, 3 or more].
         pose: [3, 4] world to camera.

@@ -47,7 +47,7 @@ def rectify_back(
     """Set the gradient to 0, in place, for hidden values that are 0.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         anchors: n.
         column: Column of `hidden` that corresponds to the gradient's first column.
@@ -102,7 +102,7 @@ def gather(
     """Write the values of the Gaussians with positive opacity.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         covariances: [n, 7 k] raw.
         colors: [n, 3 k] raw.
@@ -169,7 +169,7 @@ def scatter(
     """Compute the gradients of all inputs from the gradients of all outputs.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         anchors: n.
         rows: [A].
