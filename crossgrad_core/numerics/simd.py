@@ -429,7 +429,7 @@ lowest_bit: Callable[[np.uint64], int] = emitted(
 count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
-#: Returns value * 2**n where the second vector is n + 1.5 * 2**23: its lowest bits then hold n.
+#: Returns value * 2**n if the second vector is n + 1.5 * 2**23, whose lowest bits hold n.
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
 #: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
 sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = emitted(

@@ -133,7 +133,7 @@ def shrink(
     Args:
         image: [H, W C], contiguous.
         along_columns: [R + 1] weights of the Gaussian along the columns, the middle one first.
-        along_rows: [S + 1] likewise along the rows.
+        along_rows: [S + 1] weights of the Gaussian along the rows, the middle one first.
         small: [h, w, C], h <= H and w <= W.
     """
     rows, columns, channels = small.shape

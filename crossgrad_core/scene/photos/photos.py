@@ -92,7 +92,7 @@ class PhotoSource:
         files = [self.path] if self.mask is None else [self.path, self.mask]
         try:
             facts = [os.stat(path) for path in files]
-        except OSError:  # Decoding says what is wrong.
+        except OSError:  # Decoding reports the error later.
             return None
         marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
         return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"

@@ -36,8 +36,8 @@ _MOST_BAD: Final = 0.6
 _BAD: Final = 0.33
 #: A pose is wrong if less than this share of its observed points is in frame.
 _IN_FRAME: Final = 0.5
-#: Below this share of the correlation of the better photos, a photo is tested with other poses.
-#: Another photo fits its pose if its score is higher by this difference.
+#: Below this share of the correlation of the better photos, a photo is tested as a suspect.
+#: A change or another photo fits a pose if its score is higher by this difference.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
 #: Photos used for comparison if most photos disagree, and suspects that are tested.
@@ -302,7 +302,7 @@ class _Group:
         return tuple(self.views[rows].tolist())
 
     def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
-        """Find a change that repairs most photos, or a turn of some; return it and those rows."""
+        """Find a change that repairs most photos, or a turn of some; return it and their rows."""
         none = np.zeros(0, dtype=np.int64)
         if not len(rows):
             return None, none

@@ -36,7 +36,7 @@ VIEW_COUNTS = range(1, 7)
 
 
 class ContractError(AssertionError):
-    """A component breaks the contract of its slot; the text says how."""
+    """A broken contract of a component; the text describes the violation."""
 
 
 def require(holds: object, otherwise: str) -> None:

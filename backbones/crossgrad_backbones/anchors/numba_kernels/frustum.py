@@ -24,7 +24,7 @@ def in_frustum(
     reach: np.float32,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Write a mask of the anchors that pass; the formulas equal those of the plain filter.
+    """Write a mask of the anchors that pass, with the same formulas as the plain filter.
 
     Args:
         jobs: From `parallel` or `serial`.
