@@ -88,7 +88,7 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # NaN is not
+        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # also False for NaN
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,

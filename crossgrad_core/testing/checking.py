@@ -47,7 +47,7 @@ def check_entry(entry: registry.Entry) -> list[Result]:
     taken = _taken(entry)
     names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
     if taken and entry.slot == COMMANDS:
-        return names  # Nothing ever calls it.
+        return names  # The command can never be called.
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:

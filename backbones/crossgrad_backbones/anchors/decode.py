@@ -151,7 +151,7 @@ def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:
     ]
 
 
-#: What `forward` returns; the first five are differentiable.
+#: Names of the outputs of `forward`; the first five are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")
 _DIFFERENTIABLE = 5
 

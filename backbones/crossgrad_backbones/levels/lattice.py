@@ -10,7 +10,7 @@ from torch import Tensor
 
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size
 
-#: More levels than any scene needs.
+#: Upper limit of the number of levels: more than any scene needs.
 MOST_LEVELS = 16
 #: Least edge of a cell, as a share of the largest coordinate: float32 rounds positions to 2^-24.
 RESOLUTION = 2.0**-20

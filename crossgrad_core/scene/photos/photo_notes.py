@@ -25,7 +25,7 @@ Sources = Mapping[str, PhotoSource]
 #: Files of crossgrad: a folder with one of the first set was written by a run or by `prepare`.
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
-#: Folders with a note of their own.
+#: Largest number of groups of unused files with a separate note.
 _MOST: Final = 8
 
 

@@ -63,7 +63,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
             "the file is not a photo", where=path, found=found, todo="replace or remove it"
         ) from error
     except Exception as error:
-        # Decoders raise whatever a damaged file leads them into: KeyError, struct.error ...
+        # For damaged files, decoders raise any exception: KeyError, struct.error ...
         raise UserError(
             what,
             where=path,
