@@ -12,12 +12,12 @@ from crossgrad_backbones.vanilla import Vanilla
 from crossgrad_backbones.visibility import NEAR
 from crossgrad_core.plugin import Camera, Gaussians, Phase, Response
 
-#: Variance of a window of one pixel, px^2: what integrating over it adds to a Gaussian's own.
+#: Variance of a one-pixel window, px^2: integration over the window adds it to a Gaussian's.
 PIXEL_VARIANCE = 1.0 / 12.0
 
 
 class AnalyticSplatting(Vanilla):
-    """The 3DGS representation, drawn with the response `analytic`; no dilation.
+    """The 3DGS representation, rendered with the response `analytic` and without dilation.
 
     Source: Analytic-Splatting, methods of section 4; its optional filters are left out.
     """

@@ -1,4 +1,4 @@
-"""Gaussians of another pixel response as plain ones, for files that viewers draw the 3DGS way."""
+"""Conversion of Gaussians of another pixel response to plain ones, for files and 3DGS viewers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,9 +10,9 @@ from crossgrad_backbones.visibility import columns_of, depths_in_view, finest_pi
 from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.plugin import Camera, Gaussians
 
-#: What viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
+#: Value that viewers add to both diagonal entries of the 2-D covariance, px^2 (3DGS).
 FILE_DILATION = 0.3
-#: A variance keeps at least this share of itself.
+#: A variance keeps at least this share of its value.
 FLOOR = 1e-4
 
 
@@ -20,16 +20,17 @@ FLOOR = 1e-4
 def as_plain(
     gaussians: Gaussians, cameras: Sequence[Camera], blur: float, near: float
 ) -> Gaussians:
-    """Gaussians that look, drawn plainly, as the given ones do with their own response.
+    """Convert Gaussians so that plain rendering gives the same image as their own response.
 
-    A response adds the variance `blur` to the 2-D covariance S and keeps the volume, that is
-    opacity times sqrt(det S). Of the dilation of a viewer, the surplus over `blur` is taken off the
-    3-D variances beforehand; at depth z a pixel is z / f local units wide. With S' for what is left
-    of S, the opacity is multiplied by the ratio of footprints, sqrt(det S / det(S' + dilation)).
+    A response adds the variance `blur` to the 2-D covariance S and preserves the volume, that is
+    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. The difference is
+    subtracted from the 3-D variances beforehand; at depth z a pixel is z / f local units wide. With
+    S' for the reduced S, the opacity is multiplied by sqrt(det S / det(S' + dilation)), the ratio
+    of footprints.
 
-    Of several cameras the one that sees a Gaussian finest decides about its size, and the one that
-    it covers most densely about its opacity: means over the cameras would thin out and fade what is
-    near to some and far from others. What no camera sees stays as it is.
+    The size uses the camera with the finest pixels at a Gaussian. The opacity uses the camera with
+    the largest ratio. Means over the cameras would make Gaussians too thin and too faint if they
+    are near some cameras and far from others. A Gaussian that no camera sees is unchanged.
 
     Args:
         gaussians: Gaussians of another response.
@@ -60,7 +61,7 @@ def as_plain(
 
 
 def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixels right and down [N, 3] per local unit along each of the main axes [N, 3, 3]."""
+    """Return pixels right and down [N, 3] per local unit along the main axes [N, 3, 3]."""
     pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3])[:, :, None].unbind(1)
     row_u = camera.fx / z * (pose[0, :3] - x / z * pose[2, :3])
@@ -69,7 +70,7 @@ def _projected(axes: Tensor, means: Tensor, camera: Camera) -> tuple[Tensor, Ten
 
 
 def _determinant(u: Tensor, v: Tensor, scales: Tensor, dilation: float) -> Tensor:
-    """[N] determinant of the 2-D covariance with `dilation` added to its diagonal, px^4."""
+    """Return determinants [N] of the 2-D covariance with `dilation` on its diagonal, px^4."""
     u, v = u * scales, v * scales
     trace = u.square().sum(1) + v.square().sum(1)
     det: Tensor = torch.linalg.cross(u, v).square().sum(1) + dilation * trace + dilation**2

@@ -1,4 +1,4 @@
-"""Attributes that depend on how far the camera is: an extension of vanilla."""
+"""A backbone that extends vanilla by attributes that depend on the camera distance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,21 +25,21 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Distances are at least this, local units: the mean itself has no logarithm.
+#: Least distance, local units: a camera at the mean centre has no logarithmic distance.
 NEAREST = 1e-3
-#: Where the logarithms of all distances differ by less than this (standard deviation), the
-#: distances are taken as equal.
+#: If the logarithms of all distances have a smaller standard deviation, all distances count as
+#: equal.
 LEAST_SPREAD = 1e-6
 
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A tensor of vanilla that depends on the distance.
+    """A tensor of vanilla that depends on the camera distance.
 
     Attributes:
         weights: Name of its weights [N, ..., 2].
-        base: The block that they add to.
-        shape: Shape of a primitive's weights; the product with D broadcasts to that of the base.
+        base: The block to which the weights add.
+        shape: Shape of a primitive's weights; the product with D broadcasts to the base's shape.
     """
 
     weights: str
@@ -53,9 +53,9 @@ COLORS = Conditioned("distance_f_dc", "f_dc", (1, 3, 2))
 
 
 def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
-    """[7] float64: mean centre, mean and 1 / standard deviation of log r, least and largest z.
+    """Return [7] float64: mean centre, mean and 1 / standard deviation of log r, range of z.
 
-    The last three are 0 where there is one camera, or all distances are equal.
+    The last three values are 0 for one camera and for equal distances.
     """
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
@@ -67,15 +67,15 @@ def fitted_scale(cameras: Sequence[Camera]) -> Tensor:
 
 
 def distinguished(scale: Tensor) -> bool:
-    """Whether distances differ on a scale of `fitted_scale`."""
+    """Return True if distances differ on a scale of `fitted_scale`."""
     return bool(scale[4] > 0)
 
 
 def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """[2] the encoding D = (z, z^2), the mean over the cameras.
+    """Return the encoding D = (z, z^2) [2], averaged over the cameras.
 
-    z is the standardised log r of a camera, kept in the range of the training cameras: outside it
-    a quadratic says nothing.
+    z is the standardised log r of a camera, clamped to the range of the training cameras, because a
+    quadratic does not extrapolate.
     """
     centers = torch.stack([camera.center for camera in cameras]).to(scale, non_blocking=True)
     z = (_log_distances(centers, scale[:3]) - scale[3]) * scale[4]
@@ -84,19 +84,19 @@ def encoded(scale: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def added(weights: Tensor, encoding: Tensor) -> Tensor:
-    """[N, ...] what weights [N, ..., 2] add at an encoding [2].
+    """Return the sum [N, ...] that weights [N, ..., 2] add at an encoding [2].
 
-    No matrix product: its rounding depends on the number of threads.
+    This avoids a matrix product, because its rounding depends on the number of threads.
     """
     products: Tensor = weights * encoding
     return products.sum(-1)
 
 
 def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
-    """[N] the most that weights [N, 2] add, w_1 z + w_2 z^2, within the range of z."""
+    """Return the maximum [N] of w_1 z + w_2 z^2 for weights [N, 2] within the range of z."""
     first, second = weights.unbind(1)
     least, most = scale[5:].to(weights)
-    # A parabola is largest at an end of the range, or at its vertex where it opens downwards.
+    # A parabola is largest at an end of the range, or at its vertex if it opens downwards.
     vertex = torch.where(second < 0, -first / (2 * second), least)
     vertex = torch.minimum(torch.maximum(vertex, least), most)
     sums: Tensor = torch.stack([z * first + z * z * second for z in (least, vertex, most)])
@@ -104,11 +104,11 @@ def largest_addition(scale: Tensor, weights: Tensor) -> Tensor:
 
 
 def penalty(weights: Tensor, l2: float, smoothness: float) -> Tensor:
-    """Penalty on weights [N, ..., 2]: sums over the weights of a Gaussian, mean over Gaussians.
+    """Compute the penalty on weights [N, ..., 2]: sum per Gaussian, mean over the Gaussians.
 
-    `l2` times the squares, and `smoothness` times the squared derivative of w_1 z + w_2 z^2 by z,
-    the mean over the training cameras. There z has mean 0 and variance 1, so that the mean of
-    (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
+    The penalty is `l2` times the squared weights, plus `smoothness` times the squared derivative of
+    w_1 z + w_2 z^2 by z, averaged over the training cameras. Over these cameras z has mean 0 and
+    variance 1, so the mean of (w_1 + 2 w_2 z)^2 is w_1^2 + 4 w_2^2.
     """
     factors = torch.tensor([l2 + smoothness, l2 + 4 * smoothness]).to(weights, non_blocking=True)
     total: Tensor = (weights.square() @ factors).sum()
@@ -120,20 +120,21 @@ def _log_distances(centers: Tensor, middle: Tensor) -> Tensor:
     return distances.clamp(min=NEAREST).log()
 
 
-#: Tensor of the scale that distances are measured on.
+#: Name of the tensor from `fitted_scale`.
 SCALE = "distances"
 
 
 class DistanceConditioned(Vanilla):
     """The 3DGS representation with scales, opacities and colours linear in D = (z, z^2).
 
-    z is the logarithm of the camera's distance from the mean training camera, standardised. To each
-    log scale of a Gaussian (the same to all three), to its opacity logit and to each coefficient of
-    SH band 0 it adds w . D with weights w of its own, zero at first: then it is vanilla bit for
-    bit. Two penalties on the weights grow linearly over the run: their squared length, and the
-    squared derivative of what they modulate by z. Blocks: those of vanilla, `distance_scales`
-    [N, 1, 2], `distance_opacities` [N, 2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7].
-    Source: the paper, Distance-Conditioned Attributes; encoding and figures are ours.
+    z is the logarithm of the camera's distance from the mean training camera, standardised. Each
+    Gaussian adds w . D to its log scales (the same to all three), to its opacity logit and to each
+    coefficient of SH band 0, with separate weights w. The weights start at 0, so that the model
+    equals vanilla bit for bit. Two penalties on the weights grow linearly over the run: their
+    squared length, and the squared derivative by z of the terms that they add. Blocks: the blocks
+    of vanilla, `distance_scales` [N, 1, 2], `distance_opacities` [N, 2], `distance_f_dc`
+    [N, 1, 3, 2], and `distances` [7]. Source: the paper, Distance-Conditioned Attributes; encoding
+    and default values are ours.
     """
 
     plain: ClassVar[bool] = False
@@ -177,7 +178,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple[Vanilla, tuple[str, ...]]:
-        """Leaves conditions out where all training cameras are equally far from their mean."""
+        """Leave out the conditions if all training cameras are equally far from their mean."""
         backbone, notes = super().fitted_to(scene)
         if distinguished(_scale_of(scene)):
             return backbone, notes
@@ -214,7 +215,7 @@ class DistanceConditioned(Vanilla):
     def _seen_from(
         self, parameters: Mapping[str, Tensor], cameras: Sequence[Camera]
     ) -> dict[str, Tensor]:
-        """Vanilla's parameters for the mean encoding of these cameras."""
+        """Return vanilla's parameters for the mean encoding of these cameras."""
         encoding = encoded(parameters[SCALE], cameras).to(parameters["means"])
         sums = {
             each.base: parameters[each.base] + added(parameters[each.weights], encoding)
@@ -224,7 +225,7 @@ class DistanceConditioned(Vanilla):
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
-        """Both penalties on the weights, once per step."""
+        """Return both penalties on the weights, once per step."""
         names = [each.weights for each in self._conditioned()]
         if context.gaussians is not None or not names:
             return None
@@ -238,7 +239,7 @@ class DistanceConditioned(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """Caps the opacity at the distance where it is largest."""
+        """Cap the opacity at the distance of its maximum."""
         if not self.condition_opacities:
             return super().capped_opacities(parameters, cap)
         most = largest_addition(parameters[SCALE], parameters[OPACITIES.weights].detach())

@@ -32,23 +32,23 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Variance of the filter in squared pixels of the camera that sees a Gaussian finest.
+#: Variance of the filter in squared pixels of the camera with the finest pixels at a Gaussian.
 VARIANCE = 0.2
 
 
 @torch.no_grad()
 def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, parity: bool) -> Tensor:
-    """[N] standard deviation of each Gaussian's filter, local units.
+    """Return the standard deviation [N] of each Gaussian's filter, local units.
 
-    sqrt(VARIANCE) z / f, the least over the cameras that see the mean; Gaussians that none sees
-    get the largest width of the others (0 where there are no others).
+    The value is sqrt(VARIANCE) z / f, the minimum over the cameras that see the mean. Gaussians
+    that no camera sees get the largest width of all other Gaussians (0 without other Gaussians).
 
     Args:
         means: [N, 3] local units.
         cameras: The training cameras.
         near: Near plane, local units.
-        parity: Divide the least depth by the longest focal length of all cameras, whichever sees
-            the Gaussian, as the published code does.
+        parity: Divide the least depth by the longest focal length of all cameras, even if another
+            camera sees the Gaussian, as the published code does.
     """
     focal = max(camera.fx for camera in cameras) if parity else None
     finest = finest_pixels(means, cameras, near, focal)
@@ -58,16 +58,16 @@ def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, pari
 
 
 def kept_opacity(log_scales: Tensor, widths: Tensor) -> Tensor:
-    """[N] what the filter leaves of an opacity, for log scales [N, 3] and widths [N], detached."""
+    """Return the filter's opacity factor [N] for log scales [N, 3] and widths [N], detached."""
     scales, filters = _finite_scales(log_scales.detach()), _per_axis(widths)
     return (scales / torch.hypot(scales, filters)).prod(1)
 
 
 def smoothed(log_scales: Tensor, logits: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
-    """Scales sqrt(s^2 + w^2) [N, 3] and opacities o sqrt(prod s^2 / prod (s^2 + w^2)) [N].
+    """Return scales sqrt(s^2 + w^2) [N, 3], opacities o sqrt(prod s^2 / prod (s^2 + w^2)) [N].
 
-    Computed as ratios of lengths, which neither overflow nor underflow before their product does.
-    The backward pass is written by hand, because autograd takes twice as long.
+    The opacity factor is computed from ratios of lengths, which do not overflow or underflow before
+    their product does. The backward pass is hand-written, because autograd takes twice as long.
 
     Args:
         log_scales: [N, 3] logarithms of s.
@@ -105,13 +105,13 @@ class _Smoothed(torch.autograd.Function):
 
 
 def _finite_scales(log_scales: Tensor) -> Tensor:
-    """exp, kept inside the range of the number type so that no quotient of two is undefined."""
+    """Return exp, clamped to the range of the number type so that every quotient is defined."""
     limits = torch.finfo(log_scales.dtype)
     return log_scales.exp().clamp_(limits.tiny, limits.max)
 
 
 def _per_axis(values: Tensor) -> Tensor:
-    """[N, 3] contiguous: element-wise work on an expanded view is slower."""
+    """Repeat to a contiguous [N, 3]: element-wise work on an expanded view is slower."""
     return values[:, None].expand(-1, 3).contiguous()
 
 
@@ -120,11 +120,11 @@ DILATION = 0.1
 
 
 class MipSplatting(Vanilla):
-    """The 3DGS representation, widened so that no Gaussian is finer than the photos resolve.
+    """The 3DGS representation, filtered so that no Gaussian is finer than the photos resolve.
 
-    Blocks: those of vanilla, and `filter` [N], the standard deviation of each Gaussian's 3-D
-    filter, which is derived from the training cameras and gets no gradient. Density control works
-    on the raw scales and opacities. Source: Mip-Splatting, methods of section 4.
+    Blocks: the blocks of vanilla, and `filter` [N], the standard deviation of each Gaussian's 3-D
+    filter, which is derived from the training cameras and has no gradient. Density control uses the
+    raw scales and opacities. Source: Mip-Splatting, methods of section 4.
     """
 
     response: ClassVar[Response] = "antialiased"
@@ -164,7 +164,7 @@ class MipSplatting(Vanilla):
 
     @hookimpl
     def crossgrad_after_step(self, context: AfterStepContext) -> DensifyResult | None:
-        """Renews the filter while nothing else does."""
+        """Recompute the filter after steps without an edit."""
         if context.edited or not renews(context.schedule, context.step):
             return None
         widths = self._widths(context.parameters, context.scene)
@@ -185,9 +185,9 @@ class MipSplatting(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """The filtered opacity is capped and what the filter takes divided out again."""
+        """Cap the filtered opacity, and divide the filter's factor out again."""
         kept = kept_opacity(parameters["scales"], parameters["filter"])
-        # Where even an opacity of 1 stays below the cap the logit is infinite: no limit.
+        # If an opacity of 1 stays below the cap, the logit is infinite, so there is no limit.
         limit = torch.logit((cap / kept).clamp(max=1.0))
         return torch.minimum(parameters["opacities"].detach(), limit)
 
@@ -199,9 +199,9 @@ class MipSplatting(Vanilla):
 
 
 def renews(schedule: Schedule, step: int) -> bool:
-    """Whether the filter is renewed after a step without an edit.
+    """Return True if the filter is recomputed after a step without an edit.
 
-    As published: every 100 of 30,000 steps once density control is over, until 100 before the end.
+    As published: every 100 of 30,000 steps after density control ends, until 100 before the end.
     """
     every = max(1, schedule.lr_until // 300)
     last = schedule.counted(schedule.total) - every

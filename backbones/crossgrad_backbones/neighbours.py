@@ -1,4 +1,4 @@
-"""Distances to nearest neighbours."""
+"""Initial scales from distances to nearest neighbours."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,14 +8,14 @@ SQUARED_DISTANCE_FLOOR = 1e-7
 
 
 def nearest_neighbour_scales(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Isotropic initial scale of each point (3DGS, section 5.1).
+    """Return the isotropic initial scale of each point (3DGS, section 5.1).
 
     Args:
         points: [P, 3].
 
     Returns:
-        [P] sqrt of the mean of the squared distances to the 3 nearest other points, floored so
-        that duplicates get a size too; with fewer than 4 points those that there are.
+        [P] square root of the mean squared distance to the 3 nearest other points (all other points
+        if there are fewer), with a floor so that duplicates get a size too.
     """
     from scipy.spatial import cKDTree
 

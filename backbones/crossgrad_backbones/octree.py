@@ -29,10 +29,10 @@ from crossgrad_core.plugin import (
 
 
 def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
-    """The steps at which `count` further levels open, the last one at `span`.
+    """Return the steps at which `count` further levels open, the last at `span`.
 
-    The time between two openings shrinks by `factor` from one to the next: a geometric series with
-    the first term span (1 - q) / (1 - q^count), q = 1 / factor.
+    The time between openings shrinks by `factor` each time: a geometric series with the first term
+    span (1 - q) / (1 - q^count), q = 1 / factor.
     """
     q = 1.0 / factor
     terms = [q**i for i in range(count)]
@@ -41,7 +41,7 @@ def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
 
 
 def allowed_top(step: int, openings: tuple[float, ...], initial: int) -> int:
-    """The finest level that may be trained at a step."""
+    """Return the finest level that may be trained at a step."""
     return initial + sum(step >= opening for opening in openings)
 
 
@@ -60,23 +60,22 @@ class Planted:
     spacings: Tensor
 
     def kept(self, mask: Tensor) -> "Planted":
-        """Those of a mask [A]."""
+        """Return the anchors selected by a mask [A]."""
         return Planted(self.positions[mask], self.levels[mask], self.spacings[mask])
 
 
 def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: bool) -> Planted:
-    """Anchors of every level: the points, rounded to the level's lattice, each site once.
+    """Create anchors of every level: the points rounded to the level's lattice, without duplicates.
 
-    Initial scales come from the neighbouring sites of the same level, whether or not an anchor is
-    planted there. The published code takes neighbours of any level, so that coarse anchors start as
-    small as the fine ones around them; a camera that is far away sees coarse ones only, with gaps
-    between them.
+    Initial scales come from the neighbouring sites of the same level, with or without an anchor.
+    The published code uses neighbours of any level, so that coarse anchors start as small as the
+    fine anchors around them. A distant camera, which sees only coarse anchors, then sees gaps.
 
     Args:
         points: [P, 3] local units.
         lattice: The lattices.
-        everywhere: Whether a site counts also where the points of the coarser site that it belongs
-            to are all on it: its anchor repeats that of the coarser level.
+        everywhere: True to create an anchor at every site. False leaves out a site if it holds all
+            points of its coarser site, because its anchor would repeat the coarser anchor.
     """
     origin = lattice.origin.numpy()
     levels = torch.arange(lattice.count)
@@ -98,41 +97,41 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
 
 
 def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[P] whether the points that share a point's coarser site are on several of the finer ones.
+    """Return a mask [P]: True if the points of a point's coarser site are on several finer sites.
 
     Args:
-        coarser: [P] number of each point's site on the level before.
-        site: [P] number of its site.
+        coarser: [P] index of each point's site on the level before.
+        site: [P] index of its site on this level.
     """
     pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
     return np.bincount(pairs[:, 0])[coarser] > 1
 
 
 def visible_share(shares: Tensor, asked: float) -> float:
-    """The share of the cameras that must see an anchor's level, and more, for it to stay.
+    """Return the pruning threshold: anchors seen by a larger share of the cameras stay.
 
     Args:
         shares: [A] share of the cameras that see the level of each anchor.
-        asked: The option; a negative one asks for the mean share of all anchors.
+        asked: The option; a negative value selects the mean share of all anchors.
     """
     return float(shares.mean()) if asked < 0.0 else asked
 
 
 Rounding = Literal["round", "floor", "ceil", "progressive"]
-#: How many levels beyond L* are used (see `Lattice.lead`).
+#: Number of levels beyond L* that are used (see `Lattice.lead`).
 _LEADS: Mapping[Rounding, float] = {"round": 0.5, "floor": 0.0, "ceil": 1.0, "progressive": 1.0}
 
 
 class Octree(AnchorBackbone):
-    """Anchors on nested lattices; the nearer a camera, the finer the levels that it uses of them.
+    """Anchors on nested lattices; nearer cameras use finer levels.
 
-    What differs from Scaffold-GS is where anchors start, and which of them a camera uses: those
-    whose level is at most L* = log_fork(D / distance) + extra level, rounded, where D is about the
-    largest distance of a camera from a point. In the first quarter of a run fine levels open one
-    after the other.
+    Octree-GS differs from Scaffold-GS in the initial anchors and in the anchors that a camera uses.
+    A camera uses anchors whose level is at most L* = log_fork(D / distance) + extra level, rounded.
+    D is about the largest distance between a camera and a point. In the first quarter of a run,
+    fine levels open one after another.
 
     Further blocks, all frozen: levels [P] int64; extra_levels [P]; lattice [9] float64 (see
-    `Lattice`). Learning rates decay over the run as those of Scaffold-GS do. Source: Octree-GS
+    `Lattice`). Learning rates decay over the run as in Scaffold-GS. Source: Octree-GS
     (Ren et al. 2024); methods of section 6.
     """
 
@@ -186,7 +185,7 @@ class Octree(AnchorBackbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Octree", tuple[str, ...]]:
-        """Says that anchors which repeat a coarser one are left out."""
+        """Note that anchors that repeat a coarser anchor are left out."""
         if self.plant_everywhere:
             return self, ()
         note = (
@@ -239,7 +238,7 @@ class Octree(AnchorBackbone):
         return Used(mask, lattice.faded(distances, levels, extra))
 
     def _top(self, parameters: Mapping[str, Tensor], phase: Phase) -> int | None:
-        """The finest level that is open; None where all are."""
+        """Return the finest open level; None if all levels are open."""
         span = phase.schedule.coarse_until
         if not (self.progressive and phase.training and phase.count < span):
             return None
@@ -252,7 +251,7 @@ class Octree(AnchorBackbone):
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        """As of its family, without the anchors whose level none of the cameras uses."""
+        """Bake like the base class, without the anchors whose level no camera uses."""
         used = torch.stack([self.used(parameters, c, phase).mask for c in cameras]).any(0)
         names = {name for block in self.blocks() if block.per_primitive for name in block.tensors}
         rows = {n: t[used] if n in names else t for n, t in parameters.items()}

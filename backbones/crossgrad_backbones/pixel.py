@@ -7,9 +7,9 @@ from crossgrad_backbones.vanilla import Vanilla
 
 
 class PixelGS(Vanilla):
-    """The 3DGS representation; densifier `pixel` unless another one is named.
+    """The 3DGS representation with the densifier `pixel` by default.
 
-    Source: Pixel-GS, which changes nothing but the densification statistic.
+    Source: Pixel-GS, which changes only the densification statistic.
     """
 
     default_densifier: ClassVar[str] = "pixel"

@@ -14,7 +14,7 @@ from crossgrad_core.plugin import Camera, Parameters, Phase, Scene
 
 
 class Scaffold(AnchorBackbone):
-    """Anchors in the voxels that hold SfM points; a camera uses all that are in its frustum."""
+    """Anchors in the voxels that contain SfM points; a camera uses all anchors in its frustum."""
 
     voxel_size: float | None = Field(
         None, gt=0, description="edge of a voxel, extents; None: twice the points' median distance"

@@ -70,7 +70,7 @@ class Vanilla(Backbone):
         return (*rows, rest)
 
     def _scales_lr(self) -> LearningRate:
-        # Measured by us (docs/schedules.md).
+        # Measured for crossgrad (docs/schedules.md).
         return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:
@@ -78,10 +78,10 @@ class Vanilla(Backbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Vanilla", tuple[str, ...]]:
-        """Leaves out spherical-harmonics bands that the number of views cannot support.
+        """Leave out spherical-harmonics bands that the number of views cannot support.
 
-        A Gaussian is seen from at most as many directions as there are training views; a band
-        pays only where there are at least as many views as coefficients.
+        A Gaussian is seen from at most as many directions as there are training views. A band
+        improves the result only if there are at least as many views as coefficients.
         """
         if "sh_degree" in self.model_fields_set:
             return self, ()
@@ -114,7 +114,7 @@ class Vanilla(Backbone):
         return self._with_rest(tensors, count)
 
     def _first_opacities(self, scene: Scene) -> NDArray[np.float64]:
-        """[P] logits."""
+        """Return the initial opacity logits [P]."""
         opacities = np.full(len(scene.points), self.initial_opacity)
         if scene.point_opacities is not None:
             known = ~np.isnan(scene.point_opacities)
@@ -151,7 +151,7 @@ class Vanilla(Backbone):
         return self.splats(parameters, phase.schedule.sh_degree(phase.step, self.sh_degree))
 
     def splats(self, parameters: Mapping[str, Tensor], degree: int) -> Gaussians:
-        """The Gaussians with spherical harmonics up to `degree`, differentiable."""
+        """Return the Gaussians with spherical harmonics up to `degree`, differentiable."""
         return Gaussians(
             means=parameters["means"],
             quats=parameters["quats"],
@@ -170,7 +170,7 @@ class Vanilla(Backbone):
 
 
 def _sizes(scene: Scene) -> NDArray[np.float64]:
-    """[P] standard deviations of the first Gaussians; points of known size are no neighbours."""
+    """Return initial standard deviations [P]; points of known size do not count as neighbours."""
     if scene.point_sizes is None:
         return nearest_neighbour_scales(scene.points)
     sizes = scene.point_sizes.copy()

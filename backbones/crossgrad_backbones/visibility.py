@@ -1,4 +1,4 @@
-"""Which Gaussians cameras see, by their centres, and how finely."""
+"""Visibility of Gaussians in cameras by their centres, and the size of a pixel there."""
 
 from collections.abc import Sequence
 
@@ -7,14 +7,14 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Camera
 
-#: A centre counts as seen in the image and this share of its extent beyond each border.
+#: A centre counts as seen inside the image and this share of its size beyond each border,
 MARGIN = 0.15
-#: ... and if it is farther from the camera than this, local units: the rasterizers' default.
+#: and only if it is farther from the camera than this, local units: the rasterizers' default.
 NEAR = 1e-3
 
 
 def columns_of(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z [N] of means [N, 3], each contiguous, without a graph."""
+    """Return x, y and z [N] of means [N, 3], each contiguous, without a graph."""
     x, y, z = means.detach().T.contiguous().unbind(0)
     return x, y, z
 
@@ -22,10 +22,10 @@ def columns_of(means: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def depths_in_view(
     columns: tuple[Tensor, Tensor, Tensor], camera: Camera, near: float
 ) -> tuple[Tensor, Tensor]:
-    """Camera depth of each centre, and whether the camera sees it.
+    """Return the camera depth of each centre, and a mask of the centres that the camera sees.
 
     Args:
-        columns: x, y and z [N], local frame, of `columns_of`.
+        columns: x, y and z [N] from `columns_of`, local frame.
         camera: The camera.
         near: Centres must be farther than this depth, local units.
 
@@ -45,10 +45,10 @@ def depths_in_view(
 
 
 def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
-    """[N] one coordinate of moved points.
+    """Return one coordinate [N] of transformed points.
 
-    Element by element: a matrix product may round a row differently at another place, and what is
-    derived from a primitive must not change when others come and go.
+    It is computed element by element. A matrix product may round a row differently at another
+    position, and values of a primitive must not change if other primitives are added or removed.
     """
     x, y, z = columns
     a, b, c, d = row.tolist()
@@ -59,9 +59,10 @@ def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
 def finest_pixels(
     means: Tensor, cameras: Sequence[Camera], near: float, focal: float | None = None
 ) -> Tensor:
-    """[N] z / f of the camera that sees each of means [N, 3] finest, local units per pixel.
+    """Return the least z / f [N] over the cameras that see means [N, 3], local units per pixel.
 
-    Infinite where no camera sees a mean. f is each camera's own fx, or `focal` for all of them.
+    The value is infinite if no camera sees a mean. f is each camera's own fx, or `focal` for all
+    cameras.
     """
     columns = columns_of(means)
     finest = torch.full_like(columns[0], torch.inf)

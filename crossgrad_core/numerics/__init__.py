@@ -1,1 +1,1 @@
-"""The kit for kernels: compilation, SIMD, threads, element-wise functions, rotations."""
+"""Tools for kernels: compilation, SIMD, threads, element-wise functions, rotations."""

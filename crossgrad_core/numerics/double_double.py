@@ -1,8 +1,8 @@
 """Arithmetic with unevaluated sums of two float64 numbers: about 32 digits.
 
-A number is a pair (high, low) with |low| at most half a unit in the last place of high. The sums
-and products of float64 numbers are exact (Knuth 1969, Dekker 1971), those of pairs right to a few
-times 2^-104.
+A number is a pair (high, low) with |low| at most half a unit in the last place of high. Sums and
+products of float64 numbers are exact (Knuth 1969, Dekker 1971). Results for pairs are accurate to a
+few times 2^-104.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ _SPLITTER = 134217729.0
 
 @strict_device
 def two_sum(a: float, b: float) -> tuple[float, float]:
-    """The sum and what rounding took from it."""
+    """Return the sum and its rounding error."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
@@ -23,14 +23,14 @@ def two_sum(a: float, b: float) -> tuple[float, float]:
 
 @strict_device
 def quick_two_sum(a: float, b: float) -> tuple[float, float]:
-    """The same where |a| >= |b|."""
+    """Return the sum and its rounding error, for |a| >= |b|."""
     total = a + b
     return total, b - (total - a)
 
 
 @strict_device
 def two_product(a: float, b: float) -> tuple[float, float]:
-    """The product and what rounding took from it; magnitudes below 1e150."""
+    """Return the product and its rounding error; magnitudes below 1e150."""
     product = a * b
     scaled = _SPLITTER * a
     a_high = scaled - (scaled - a)
@@ -44,7 +44,7 @@ def two_product(a: float, b: float) -> tuple[float, float]:
 
 @strict_device
 def add(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
-    """(a + a_low) + (b + b_low)."""
+    """Return (a + a_low) + (b + b_low)."""
     high, low = two_sum(a, b)
     more, less = two_sum(a_low, b_low)
     high, low = quick_two_sum(high, low + more)
@@ -53,14 +53,14 @@ def add(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
 
 @strict_device
 def multiply(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
-    """(a + a_low) (b + b_low)."""
+    """Return (a + a_low) (b + b_low)."""
     high, low = two_product(a, b)
     return quick_two_sum(high, low + (a * b_low + a_low * b))
 
 
 @strict_part
 def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float]:
-    """(a + a_low) / (b + b_low)."""
+    """Return (a + a_low) / (b + b_low)."""
     first = a / b
     high, low = multiply(b, b_low, first, 0.0)
     rest, rest_low = add(a, a_low, -high, -low)
@@ -73,7 +73,7 @@ def divide(a: float, a_low: float, b: float, b_low: float) -> tuple[float, float
 
 @strict_part
 def square_root(a: float, a_low: float) -> tuple[float, float]:
-    """The root of a + a_low >= 0."""
+    """Return the square root of a + a_low >= 0."""
     if a <= 0.0:
         return 0.0, 0.0
     root = np.sqrt(a)

@@ -1,9 +1,9 @@
 """Element-wise functions with the same bits on any number of threads.
 
-torch shares long tensors out among its threads, and what is left over at the end of each share goes
-through scalar code that rounds differently from the vectorised one. For the functions that the
-vector library computes (exp, tanh) this makes no difference, for the sigmoid it does: a few
-numbers then depend on the number of threads, and a whole training run with them.
+torch divides long tensors among its threads. Scalar code processes the remainder of each part and
+rounds differently from the vectorised code. For functions of the vector library (exp, tanh) the
+results are equal. For the sigmoid they differ: a few numbers, and with them a whole training run,
+then depend on the number of threads.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from torch import Tensor
 from torch.nn import functional
 from typing_extensions import override
 
-#: Elements that torch never shares out.
+#: Number of elements up to which torch never divides a tensor among threads.
 BLOCK = 2**14
 
 
 def sigmoid(values: Tensor) -> Tensor:
-    """1 / (1 + exp(-x)) of a floating-point tensor of any shape."""
+    """Return 1 / (1 + exp(-x)) of a floating-point tensor of any shape."""
     if _is_whole(values):
         return torch.sigmoid(values)
     found: Tensor = _Sigmoid.apply(values)  # type: ignore[no-untyped-call]
@@ -27,7 +27,7 @@ def sigmoid(values: Tensor) -> Tensor:
 
 
 class _Sigmoid(torch.autograd.Function):
-    """`sigmoid_` with a gradient, which needs no blocks: it has the same bits from all threads."""
+    """`sigmoid_` with a gradient, whose bits do not depend on the threads even without blocks."""
 
     @staticmethod
     @override
@@ -45,19 +45,19 @@ class _Sigmoid(torch.autograd.Function):
 
 
 def logsigmoid(values: Tensor) -> Tensor:
-    """The logarithm of `sigmoid`, accurate where that is 0."""
+    """Return the logarithm of `sigmoid`, accurate even if `sigmoid` rounds to 0."""
     return _in_blocks(functional.logsigmoid, values)
 
 
 def sigmoid_(values: Tensor) -> Tensor:
-    """`sigmoid` in place, for a contiguous tensor without a gradient."""
+    """Compute `sigmoid` in place, for a contiguous tensor without a gradient."""
     for part in torch.split(values.view(-1), BLOCK):
         part.sigmoid_()
     return values
 
 
 def _is_whole(values: Tensor) -> bool:
-    """Whether torch does not share it out among threads."""
+    """Return True if torch does not divide the tensor among threads."""
     return values.numel() <= BLOCK or values.device.type != "cpu"
 
 

@@ -1,8 +1,8 @@
-"""Numbers that look drawn by lot and are the same in every run."""
+"""Pseudo-random numbers that are the same in every run."""
 
 
 def hash32(number: int) -> int:
-    """A number of 32 bits that looks drawn by lot (the finalizer of MurmurHash3)."""
+    """Return a pseudo-random number of 32 bits (the finalizer of MurmurHash3)."""
     number = (number ^ number >> 16) * 0x85EBCA6B % 2**32
     number = (number ^ number >> 13) * 0xC2B2AE35 % 2**32
     return number ^ number >> 16

@@ -1,4 +1,4 @@
-"""How kernels are compiled: cached on disk, without the interpreter lock."""
+"""Compilation of kernels: cached on disk, without the interpreter lock."""
 
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, cast
@@ -12,69 +12,69 @@ R = TypeVar("R")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _COMPILE = cast("Callable[..., Any]", njit)
-#: Fused multiply-add may be formed and the sign of zero is free; apart from that arithmetic is IEEE
-#: in the order written, so NaN and infinity stay visible.
+#: Fused multiply-add is allowed and the sign of zero is free. Otherwise arithmetic is IEEE in the
+#: written order, so NaN and infinity stay visible.
 _FLAGS = {"contract", "nsz"}
 
 
 def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
-    """Compiles an entry point with options of Numba's `njit`; cached on disk."""
+    """Compile an entry point with options of Numba's `njit`; cached on disk."""
     dispatcher = _COMPILE(**_OPTIONS, **options)(function)
     dispatcher._cache = cache_for(function)  # noqa: SLF001 (Numba has no public way)
     return cast("Callable[P, R]", dispatcher)
 
 
 def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
-    """Compiles a function that kernels call; becomes part of the caller."""
-    # Entry points for Python and C, which would not be used, take a quarter of the compilation.
+    """Compile a function that kernels call; it becomes part of the caller."""
+    # Entry points for Python and C are not needed; they would take a quarter of the compilation.
     whole = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast("Callable[P, R]", _COMPILE(**whole, **options, **_OPTIONS)(function))
 
 
 def strict_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function that runs on one thread: IEEE arithmetic as it is written."""
+    """Compile a function that runs on one thread with IEEE arithmetic in the written order."""
     return compiled(function)
 
 
 def strict_device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function that strict kernels call; becomes part of the caller."""
+    """Compile a function that strict kernels call; it becomes part of the caller."""
     return inlined(function)
 
 
 def strict_section(function: Callable[P, R]) -> Callable[P, R]:
-    """A section of one strict kernel: its code stands in the caller before that is compiled.
+    """Mark a section of one strict kernel; its code is inserted before the caller is compiled.
 
-    Parts and devices are optimised by themselves and again in each caller, which for large ones
-    takes seconds at every level.
+    Parts and devices are optimised alone and again in each caller. For large functions this takes
+    seconds at every level.
     """
     return cast("Callable[P, R]", _COMPILE(inline="always", **_OPTIONS)(function))
 
 
 def strict_part(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of its own that only strict kernels call."""
+    """Compile a separate function that only strict kernels call."""
     return compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function that runs on one thread; multiplications and additions may be fused."""
+    """Compile a function that runs on one thread; multiplications and additions may be fused."""
     return compiled(function, fastmath=_FLAGS)
 
 
 def part(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of its own that only such kernels call."""
+    """Compile a separate function that only functions from `kernel` call."""
     return compiled(function, fastmath=_FLAGS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function that such kernels call; becomes part of the caller."""
+    """Compile a function that functions from `kernel` call; it becomes part of the caller."""
     return inlined(function, fastmath=_FLAGS)
 
 
 def sum_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """As `kernel`; sums may be split over vector lanes (the order is fixed by the machine code)."""
+    """Compile like `kernel`; sums may use vector lanes, in an order that the machine code fixes."""
     return compiled(function, fastmath={*_FLAGS, "reassoc"})
 
 
 def sum_device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles sums that kernels call, which may be split over vector lanes; signs of zero stay."""
+    """Compile sums that kernels call; they may use vector lanes and keep signs of zero."""
     return inlined(function, fastmath={"reassoc", "contract"})

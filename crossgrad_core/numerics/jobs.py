@@ -1,21 +1,20 @@
-"""Jobs that threads share: each takes the next one when it is done.
+"""Dynamic distribution of jobs over threads: each thread takes the next job when it is done.
 
-A kernel takes jobs until there are none left,
+A kernel takes jobs until none is left,
 
-    job = take(jobs, count)
+    job = next_job(jobs, count)
     while job < count:
         ...
-        job = take(jobs, count)
+        job = next_job(jobs, count)
 
-and `share` calls it on all threads at once. Numba's own `prange` divides the work into equal runs
-beforehand and waits for every thread; with a busy or a slow core that takes longer than one thread
-alone. Here a helper that did not get to run in time is simply not needed any more, and threads that
-have nothing to do sleep.
+and `parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into
+equal parts in advance and waits for every thread. If a core is busy or slow, this takes longer than
+one thread alone. Here, a helper thread that starts too late is skipped, and idle threads sleep.
 
-A thread begins with a run of jobs of its own and goes on with those that others have left: what it
-wrote in one kernel, which its core still has at hand, it reads in the next one.
+A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
+So it reads in one kernel the data that it wrote in the kernel before, which its core still caches.
 
-What a job computes must not depend on who does it; then no bit depends on the threads.
+The result of a job must not depend on the thread that runs it. Then no bit depends on the threads.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
@@ -50,17 +49,17 @@ def _add(typing: Any, jobs: Any, place: Any) -> Any:
     return types.int64(jobs, types.intp), generate
 
 
-#: Adds 1 to a number that threads share; returns what it was.
+#: Adds 1 to a shared number atomically; returns the former value.
 _next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
 
 
 @device
 def next_job(jobs: Jobs, count: int) -> int:
-    """Returns the number of a job that nobody has taken, or `count`; only in kernels.
+    """Return the number of a free job, or `count` if none is left; only in kernels.
 
     Args:
-        jobs: From `share`.
-        count: Number of jobs, the same whenever a kernel asks.
+        jobs: From `parallel` or `serial`.
+        count: Number of jobs, the same in every call of a kernel.
     """
     threads = jobs[0]
     mine = jobs.shape[0] - 1 - threads
@@ -75,9 +74,9 @@ def next_job(jobs: Jobs, count: int) -> int:
 
 
 def _jobs(threads: int) -> list[Jobs]:
-    """For each thread the number of threads and of the jobs taken of each one's run.
+    """Return for each thread: the number of threads, and the jobs taken from each thread's range.
 
-    They lie in the same memory; a thread knows its own number from the length of what it has.
+    The arrays share one memory block. A thread derives its own number from its array's length.
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
@@ -87,18 +86,18 @@ def _jobs(threads: int) -> list[Jobs]:
 def parallel(
     kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
 ) -> None:
-    """Calls a kernel on as many threads as Numba is set to; returns when all jobs are done."""
+    """Run a kernel on Numba's number of threads; returns when all jobs are done."""
     Begun(kernel, *args, **kwargs).end()
 
 
 class Begun:
-    """A kernel that the other threads have begun with, while this one does something else.
+    """A kernel that runs on the other threads while this thread does something else.
 
-    Nobody may touch what the kernel reads or writes until `end`. One thread alone does all of it at
-    once.
+    Nothing else may use the data of the kernel until `end`. With one thread, the kernel runs to its
+    end immediately.
 
     Args:
-        kernel: As for `share`, like its arguments.
+        kernel: The kernel, as for `parallel`; its arguments follow.
     """
 
     def __init__(
@@ -113,16 +112,16 @@ class Begun:
             self.end()
 
     def end(self) -> None:
-        """Does what is left, on this thread, too; returns when all jobs are done.
+        """Do the remaining jobs on this thread as well; returns when all jobs are done.
 
-        It holds nothing any more then, and can be ended again.
+        The object then holds no more references, and can be ended again.
         """
         if self._own is None:
             return
         try:
             self._own()
         finally:
-            # Whatever happens, nobody works on the arrays any more when this returns.
+            # Even after an error, no thread uses the arrays after this method returns.
             self.leave()
         for call in self._calls:
             if call.error is not None:
@@ -130,21 +129,21 @@ class Begun:
         self._own, self._calls = None, []
 
     def leave(self) -> None:
-        """Returns when nobody works on it any more, whether or not all jobs are done."""
+        """Return when no helper works on the kernel any more, even if jobs are left."""
         for call in self._calls:
             call.end()
 
 
 class _Call:
-    """A call that a helper makes, unless it is not needed any more by then.
+    """A call for a helper, skipped if it is no longer needed when the helper starts.
 
-    A bare lock: a `Future` makes conditions anew for each call and for each wait.
+    It uses a bare lock, because a `Future` creates conditions for each call and for each wait.
 
     Args:
-        call: What to call.
+        call: The function to call.
 
     Attributes:
-        error: What the call raised.
+        error: The exception of the call, if any.
     """
 
     def __init__(self, call: Callable[[], None]) -> None:
@@ -154,7 +153,7 @@ class _Call:
         self._under_way = threading.Lock()
 
     def make(self) -> None:
-        """Makes the call; by the helper."""
+        """Make the call; called by the helper."""
         with self._under_way:
             if not self._needed:
                 return
@@ -164,29 +163,29 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Returns when the call has been made, or never will be; may be repeated."""
+        """Return when the call has finished or is cancelled; may be repeated."""
         self._needed = False
         with self._under_way:
             pass
 
 
 class _Helpers:
-    """The helpers of a process, which run on other cores than the thread that asks them.
+    """The helper threads of a process, on other cores than the calling thread.
 
-    Linux leaves a thread that is woken on the core of the one that woke it until it looks for cores
-    with nothing to do, which takes longer than most kernels.
+    Linux starts a woken thread on the core of the waking thread and moves it later to an idle core.
+    This takes longer than most kernels.
     """
 
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        # One for each thread: the same jobs are to go to the same core.
+        # One queue per thread, so that the same jobs go to the same core.
         self._helpers: list[tuple[SimpleQueue[_Call | None], threading.Thread]] = []
-        # A thread that is in a library while the interpreter ends would end the process.
+        # A thread inside a library at interpreter exit would abort the process.
         atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
-        """Asks as many helpers to make a call each."""
+        """Give one call each to as many helpers as there are calls."""
         core = current_core()
         if core != self._core:
             self._core = core
@@ -202,15 +201,15 @@ class _Helpers:
             queue.put(call)
 
     def _help(self, queue: "SimpleQueue[_Call | None]") -> None:
-        """Makes calls until there is none."""
+        """Make calls until the queue returns None."""
         self._threads.append(threading.get_native_id())
         keep_off(self._core, self._threads[-1:])
         while (call := queue.get()) is not None:
             call.make()
-            del call  # Its arrays are not kept until the next one comes.
+            del call  # This frees the call's arrays before the next call arrives.
 
     def _dismiss(self) -> None:
-        """Ends the helpers."""
+        """Stop the helpers."""
         for queue, thread in self._helpers:
             queue.put(None)
             thread.join()
@@ -219,11 +218,11 @@ class _Helpers:
 
 @cache
 def _helpers(process: int) -> _Helpers:
-    """The helpers of a process; one that was forked off has none of its parent's threads."""
+    """Return the helpers of a process; a forked process does not inherit its parent's threads."""
     return _Helpers()
 
 
 def serial(kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs) -> None:
-    """Calls a kernel on this thread only, for work too small to wake others for; the same bits."""
+    """Run a kernel on this thread only, for little work; the bits are the same."""
     (jobs,) = _jobs(1)
     kernel(jobs, *args, **kwargs)

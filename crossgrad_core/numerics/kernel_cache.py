@@ -1,8 +1,8 @@
-"""Compiled kernels on disk: named by all that they were made from, checked before they are used.
+"""Disk cache of compiled kernels: files are named by all of their sources and checked before use.
 
 One file holds one kernel for one signature: the SHA-256 of the rest, then the key and Numba's
-result. There is no index that two processes could write over, a file appears complete or not at
-all, and one that is damaged counts as missing.
+result. There is no index that two processes could overwrite. A file is written completely or not at
+all, and a damaged file counts as missing.
 """
 
 import ast
@@ -28,15 +28,15 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: What is said before and after a kernel is compiled; `system/startup.py` counts on the words.
+#: Log messages before and after the compilation of a kernel; `system/startup.py` relies on them.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
 class Listener(Protocol):
-    """Is called before a kernel is compiled."""
+    """A callback before the compilation of a kernel."""
 
     def __call__(self, *, kept: bool) -> None:
-        """`kept` says whether it will be on disk then."""
+        """Handle the event; `kept` is True if the compiled kernel will be stored on disk."""
         ...
 
 
@@ -45,7 +45,7 @@ _LISTENERS: list[Listener] = []
 
 @contextmanager
 def notes_on_missing(listener: Listener) -> Iterator[None]:
-    """Calls the listener before each kernel that is not on disk, and is compiled."""
+    """Call the listener before each compilation of a kernel that is not on disk."""
     _LISTENERS.append(listener)
     try:
         yield
@@ -54,21 +54,21 @@ def notes_on_missing(listener: Listener) -> Iterator[None]:
 
 
 def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's caches are untyped
-    """The cache of a kernel: on disk where there is a place to write to, else none.
+    """Return the cache of a kernel: on disk if a folder is writable, else none.
 
-    The place is `NUMBA_CACHE_DIR` where set, else `__pycache__` beside the kernel, else the user's
-    cache folder.
+    The folder is `NUMBA_CACHE_DIR` if set, else `__pycache__` next to the kernel's file, else the
+    user's cache folder.
     """
     try:
         return _DiskCache(function)
-    except RuntimeError:  # Numba found no folder that it may write to.
+    except RuntimeError:  # Numba found no writable folder.
         _tell_uncached(str(Path(function.__code__.co_filename).parent))
         return _NoCache(function)
 
 
 @cache
 def _tell_uncached(folder: str) -> None:
-    """Says once per folder that its kernels cannot be kept."""
+    """Warn once per folder that its kernels cannot be stored."""
     _LOG.warning(
         "compiled kernels cannot be kept, every start compiles them again: neither %s nor the "
         "user's cache folder can be written to; NUMBA_CACHE_DIR=FOLDER names another one",
@@ -87,24 +87,24 @@ def _tell_compiling(name: str, *, kept: bool) -> None:
 
 
 class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
-    """Keeps nothing."""
+    """A cache that stores nothing."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._name = _name(function)
 
     @override
     def load_overload(self, sig: object, target_context: object) -> None:
-        """Finds nothing."""
+        """Return None: nothing is stored."""
         _tell_compiling(self._name, kept=False)
 
     @override
     def save_overload(self, sig: object, cres: object) -> None:
-        """Keeps nothing."""
+        """Store nothing; log that the kernel was compiled."""
         _LOG.info(_COMPILED, self._name)
 
 
 class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
-    """Numba's cache of functions with files of our own."""
+    """Numba's function cache with the file format of this module."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -113,9 +113,9 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
     @override
     def load_overload(self, sig: object, target_context: object) -> object | None:
-        """The compiled function; None where it is to be compiled."""
+        """Return the compiled function; None if it must be compiled."""
         found = None
-        # Whatever is wrong with a file: the kernel can always be compiled.
+        # Any error of a file is ignored, because the kernel can always be compiled.
         with suppress(Exception):
             found = super().load_overload(sig, target_context)
         if found is None:
@@ -124,11 +124,11 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
     @override
     def save_overload(self, sig: object, data: object) -> None:
-        """Keeps a compiled function where that is possible."""
+        """Store a compiled function if possible."""
         _LOG.info(_COMPILED, _name(self._py_func))
         try:
             super().save_overload(sig, data)
-        except OSError as error:  # A full disk, say: the function itself is there.
+        except OSError as error:  # For example a full disk: the function itself is valid.
             self.disable()
             _tell_unwritten(str(self._cache_path), str(error))
 
@@ -144,12 +144,12 @@ def _tell_unwritten(folder: str, error: str) -> None:
 
 
 class _Files:
-    """The files of one kernel.
+    """The cache files of one kernel.
 
     Args:
-        folder: Where they are.
-        base: What their names begin with.
-        source: The file that the kernel stands in.
+        folder: Their folder.
+        base: Prefix of their names.
+        source: The source file of the kernel.
     """
 
     def __init__(self, folder: Path, base: str, source: Path) -> None:
@@ -158,7 +158,7 @@ class _Files:
         self._source = source
 
     def load(self, key: object) -> object | None:
-        """What was saved under the key; None where nothing whole is."""
+        """Return the data stored under the key; None if there is no valid file."""
         try:
             content = self._path(key).read_bytes()
         except OSError:
@@ -170,7 +170,7 @@ class _Files:
         return cast("object", data) if stored == key else None
 
     def save(self, key: object, data: object) -> None:
-        """Saves under the key, and deletes what older sources were compiled to."""
+        """Store data under the key, and delete kernels compiled from older sources."""
         payload = _DUMPS((key, data))
         path = self._path(key)
         temporary = path.with_suffix(f".{os.getpid()}.tmp")
@@ -182,7 +182,7 @@ class _Files:
         self._drop_older()
 
     def flush(self) -> None:
-        """Deletes all files of the kernel."""
+        """Delete all files of the kernel."""
         for path in self._folder.glob(f"{self._base}.*"):
             path.unlink(missing_ok=True)
 
@@ -203,11 +203,11 @@ class _Files:
 
 @cache
 def fingerprint(source: Path) -> str:
-    """SHA-256 over all files whose constants and functions a kernel in `source` may hold.
+    """Return the SHA-256 of all files whose constants and functions a kernel in `source` may use.
 
-    Numba itself notices changes of the file that holds a kernel, but not of the files that hold
-    what the kernel inlines. Those are: all files of its folder; what these import from their own
-    package or from the core; and, where that lies in a folder of kernels, what it imports in turn.
+    Numba notices changes of the kernel's own file, but not of files that contain inlined functions.
+    The hash covers all files of the kernel's folder, and their imports from their own package or
+    from the core. If an imported file is in a folder of kernels, its imports are included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):
@@ -228,9 +228,9 @@ def _sources(source: Path) -> set[Path]:
 
 @cache
 def _imported(path: Path) -> frozenset[Path]:
-    """The files of modules that a file imports from its own package or from the core.
+    """Return the files of modules that a file imports from its own package or from the core.
 
-    Cached: most kernels' files have most of what they import in common.
+    The result is cached, because most kernel files share most of their imports.
     """
     packages, found = {_CORE, _package_of(path)}, set[Path]()
     for node in ast.walk(ast.parse(path.read_bytes())):
@@ -244,7 +244,7 @@ def _imported(path: Path) -> frozenset[Path]:
 
 
 def _package_of(path: Path) -> str:
-    """The name of the outermost package that holds a file."""
+    """Return the name of the outermost package that contains a file."""
     folder = path.parent
     while (folder.parent / "__init__.py").is_file():
         folder = folder.parent

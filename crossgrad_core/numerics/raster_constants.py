@@ -1,8 +1,8 @@
-"""Constants of the rule set of rasterizers (docs/rasterizers.md) and of harmonics."""
+"""Constants of the rasterization rules (docs/rasterizers.md) and of spherical harmonics."""
 
 from typing import Final
 
-#: A Gaussian touches a pixel where its alpha reaches this value.
+#: A Gaussian touches a pixel if its alpha there reaches this value.
 ALPHA_THRESHOLD: Final = 1.0 / 255.0
 #: Compositing stops before a blend that would bring the transmittance below this value.
 TRANSMITTANCE_STOP: Final = 1e-4

@@ -1,4 +1,4 @@
-"""Rotation matrices of quaternions."""
+"""Conversion of quaternions to rotation matrices."""
 
 from typing import TypeVar
 
@@ -10,7 +10,7 @@ T = TypeVar("T", float, Tensor)
 
 
 def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
-    """The rows of the rotation matrix of a quaternion of unit length."""
+    """Return the rows of the rotation matrix of a unit quaternion."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -19,11 +19,11 @@ def matrix_rows(w: T, x: T, y: T, z: T) -> tuple[tuple[T, T, T], ...]:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotations of quaternions [N, 4], wxyz of any length; the identity of a zero one."""
+    """Return rotations [N, 3, 3] of quaternions [N, 4] wxyz; a zero one gives the identity."""
     length = quats.norm(dim=-1, keepdim=True)
     return unit_rotation_matrices(quats / torch.where(length > 0, length, 1.0))
 
 
 def unit_rotation_matrices(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotations of quaternions [N, 4], wxyz of unit length."""
+    """Return rotations [N, 3, 3] of unit quaternions [N, 4] wxyz."""
     return torch.stack([torch.stack(row, -1) for row in matrix_rows(*quats.unbind(-1))], -2)

@@ -1,15 +1,16 @@
-"""Eight or sixteen float32 lanes as a value of their own inside compiled kernels.
+"""Vectors of eight or sixteen float32 lanes inside compiled kernels.
 
-Numba leaves vectorisation to LLVM's loop vectoriser, which gives up on the compositing loops as
-soon as they carry state. Here a vector is a type: `Lanes` holds eight float32 numbers and `Mask`
-eight truth values, so a kernel written with them is SIMD code by construction (one AVX register
-each; LLVM splits them where a machine has narrower ones). Functions whose names end in `_wide` make
-vectors of sixteen, which take half the instructions where registers are that wide (AVX-512) and two
-each elsewhere; all other functions take either. Operations are never reordered, and `fma` fuses on
-every machine that can, so the same expression in two kernels gives the same bits.
+Numba leaves vectorisation to LLVM's loop vectoriser, which fails on the compositing loops because
+they carry state. Here a vector is a type: `Lanes` holds eight float32 numbers and `Mask` eight
+truth values. A kernel written with them is SIMD code by construction. Each vector uses one AVX
+register; LLVM splits it on machines with narrower registers. Functions with names that end in
+`_wide` make vectors of sixteen lanes. These need half the instructions on machines with AVX-512,
+and two instructions each on other machines. All other functions accept both widths. Operations are
+never reordered, and `fma` fuses on every machine that supports it, so the same expression in two
+kernels gives the same bits.
 
-Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. `emitted` and what
-it takes make more functions, for kernels that need lanes which no function here gives.
+Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
+needs other lane operations can define them with `emitted` and the helpers of this module.
 """
 # ruff: noqa: ANN401, ARG005 - Numba's objects have no types, and it fixes the arguments.
 
@@ -29,7 +30,7 @@ LANES = 8
 WIDE = 2 * LANES
 
 _FLOAT, _BYTE, _INT, _LONG = ir.FloatType(), ir.IntType(8), ir.IntType(32), ir.IntType(64)
-_ALIGNMENT = 4  # bytes; arrays of float32 promise no more
+_ALIGNMENT = 4  # bytes; float32 arrays guarantee no larger alignment
 _SIGN_BIT, _MANTISSA_BITS = -(2**31), 23
 
 
@@ -63,7 +64,7 @@ class _MaskType(types.Type):
         cast("Any", super()).__init__(name=f"Mask{width}")
 
 
-#: Called with a width they are the type of such a vector.
+#: Types of vectors; they are called with a width.
 _lanes, _mask = _LanesType, _MaskType
 
 
@@ -72,7 +73,7 @@ def _floats(width: int) -> ir.Type:
 
 
 def whole_type(a: Any) -> ir.Type:
-    """The type of as many whole numbers as a vector of LLVM has."""
+    """Return the integer vector type with as many elements as an LLVM vector."""
     return ir.VectorType(_INT, a.type.count)
 
 
@@ -97,7 +98,7 @@ class _MaskModel(models.PrimitiveModel):
 
 
 class Site(NamedTuple):
-    """Where a function is called: Numba's context, LLVM's builder, the operands' Numba types."""
+    """The call site of a function: Numba's context, LLVM's builder, the operands' Numba types."""
 
     context: Any
     builder: Any
@@ -105,13 +106,13 @@ class Site(NamedTuple):
 
 
 def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
-    """Makes a function for kernels.
+    """Make a function for kernels.
 
     Args:
-        emit: Emits its instructions, given the `Site` and the operands' LLVM values.
-        result: Numba type of the result, such as `SIXTEEN`; `_lanes` and `_mask` stand for a vector
-            as wide as those among the operands.
-        operands: Numba types of the operands, likewise; None stands for any array.
+        emit: Emits its instructions from the `Site` and the operands' LLVM values.
+        result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` stand for a vector
+            of the same width as the operands' vectors.
+        operands: Numba types of the operands, in the same form; None stands for any array.
     """
 
     def define(*given: Any) -> Any:
@@ -130,7 +131,7 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
         return typed(result, None)(*kinds), generate
 
-    # Numba reads the number of operands off the function.
+    # Numba reads the number of operands from the function's signature.
     by_count: dict[int, Callable[..., Any]] = {
         0: lambda typing: define(),
         1: lambda typing, a: define(a),
@@ -143,10 +144,10 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
 
 def _define(sign: Callable[[Any, Any], Any], emit: Callable[..., Any], kind: Any, to: Any) -> None:
-    """Gives a Python operator its meaning between two values of one kind."""
+    """Define a Python operator for two values of one kind."""
     implementation = emitted(emit, to, kind, kind)
 
-    @overload(sign, strict=False)  # the annotations are no part of the signature
+    @overload(sign, strict=False)  # the annotations are not part of the signature
     def _overloaded(a: Any, b: Any) -> Any:
         if isinstance(a, kind) and a == b:
             return lambda a, b: implementation(a, b)  # noqa: PLW0108 - Numba compiles the lambda
@@ -164,7 +165,7 @@ _define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 
 
 def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
-    """Emits a call of an LLVM intrinsic; on vectors, where it does not say what results."""
+    """Emit a call of an LLVM intrinsic; a vector intrinsic if no result type is given."""
 
     def emit(at: Site, *args: Any) -> Any:
         full = name if result else f"{name}.v{args[0].type.count}f32"
@@ -178,13 +179,13 @@ def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
 
 
 def _element(at: Site, array: Any, index: Any, kind: ir.Type) -> Any:
-    """Returns the address of an array's element; no check, no counting from the end."""
+    """Return the address of an array's element; without bounds check or negative indices."""
     data = at.context.make_array(at.operands[0])(at.context, at.builder, array).data
     return at.builder.bitcast(at.builder.gep(data, [index]), kind.as_pointer())
 
 
 def shuffled(at: Site, a: Any, b: Any, order: Sequence[int]) -> Any:
-    """Picks lanes of `a` (from 0 on) and then of `b`."""
+    """Pick lanes of `a` (from 0 on) and of `b` (after the lanes of `a`)."""
     places = ir.Constant(ir.VectorType(_INT, len(order)), list(order))
     return at.builder.shuffle_vector(a, b, places)
 
@@ -221,10 +222,10 @@ def _broadcast_four(width: int) -> Callable[..., Any]:
 
 
 def picking(order: Sequence[int]) -> Callable[[Lanes, Lanes], Lanes]:
-    """Makes a function that returns lanes of two vectors of sixteen in a fixed order.
+    """Make a function that returns lanes of two vectors of sixteen in a fixed order.
 
     Args:
-        order: Sixteen numbers of lanes; those of the second vector count from 16 on.
+        order: Sixteen lane numbers; lanes of the second vector start at 16.
     """
     pick = emitted(lambda at, a, b: shuffled(at, a, b, order), SIXTEEN, SIXTEEN, SIXTEEN)
     return cast("Callable[[Lanes, Lanes], Lanes]", pick)
@@ -266,14 +267,14 @@ def _store_triples(at: Site, array: Any, index: Any, x: Any, y: Any, z: Any) -> 
 
 
 def _parts(at: Site, array: Any, index: Any, count: int = 3) -> list[Any]:
-    """The addresses of vectors of eight, one after the other."""
+    """Return the addresses of consecutive vectors of eight."""
     places = [at.builder.add(index, ir.Constant(index.type, i * LANES)) for i in range(count)]
     return [_element(at, array, place, _floats(LANES)) for place in places]
 
 
 def _prefetch(at: Site, array: Any, index: Any, *, write: int) -> Any:
     address = _element(at, array, index, _BYTE)
-    # Keep in all levels of the cache (3); data, not instructions (1).
+    # Keep the line in all cache levels (3); it holds data, not instructions (1).
     _llvm("llvm.prefetch.p0", ir.VoidType())(at, address, _INT(write), _INT(3), _INT(1))
     return at.context.get_dummy_value()
 
@@ -309,7 +310,7 @@ def _scale_by_power(at: Site, value: Any, shifted: Any) -> Any:
 def _sums(at: Site, *args: Any) -> Any:
     rows = list(args)
     for width in (1, 2, 4):
-        # Folds groups of `width` lanes onto their neighbours, two vectors into one.
+        # Fold groups of `width` lanes onto their neighbours, two vectors into one.
         starts = [s + o for s in range(0, LANES, 2 * width) for o in (0, LANES)]
         low = [start + lane for start in starts for lane in range(width)]
         high = [lane + width for lane in low]
@@ -377,43 +378,43 @@ halves_added: Callable[[Lanes], Lanes] = emitted(_halves_added, _eight, SIXTEEN)
 #: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
 #: vectors, from a flat index on.
 load_triples: Callable[[_Array, int], _Three] = emitted(_load_triples, _triple, None, types.intp)
-#: Returns eight consecutive fours, such as quaternions, likewise.
+#: Returns eight consecutive groups of four, such as quaternions, as four vectors.
 load_fours: Callable[[_Array, int], _Four] = emitted(_load_fours, _four, None, types.intp)
-#: Writes eight consecutive triples likewise.
+#: Writes eight consecutive triples from three vectors, from a flat index on.
 store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = emitted(
     _store_triples, types.void, None, types.intp, _eight, _eight, _eight
 )
 #: Writes consecutive numbers to a flat float32 array, from an index on.
 store: Callable[[_Array, int, Lanes], None] = emitted(_store, types.void, None, types.intp, _lanes)
-#: Asks for the cache line of an element of a contiguous array (a flat index) to be brought near.
+#: Prefetches the cache line of an element of a contiguous array, given a flat index.
 prefetch: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=0), types.void, None, types.intp
 )
-#: As `prefetch`, for an element that will be written.
+#: Like `prefetch`, for an element that will be written.
 prefetch_write: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
 )
-#: Returns a b + c, rounded once where the machine can.
+#: Returns a b + c, rounded once if the machine supports it.
 fma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(
     _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
-#: Returns c - a b, rounded once where the machine can.
+#: Returns c - a b, rounded once if the machine supports it.
 fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(_negated_fma, _lanes, _lanes, _lanes, _lanes)
 #: Returns the square roots.
 square_root: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.sqrt"), _lanes, _lanes)
-#: Returns the smallest whole numbers that are not smaller.
+#: Rounds up to whole numbers.
 round_up: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.ceil"), _lanes, _lanes)
-#: Returns the largest whole numbers that are not larger.
+#: Rounds down to whole numbers.
 round_down: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.floor"), _lanes, _lanes)
 #: Returns the absolute values.
 magnitude: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.fabs"), _lanes, _lanes)
 #: Returns minus the absolute values.
 as_negative: Callable[[Lanes], Lanes] = emitted(_as_negative, _lanes, _lanes)
-#: Returns the smaller of each two numbers, the second where they do not compare.
+#: Returns the smaller of each two numbers, the second number if one is NaN.
 smaller: Callable[[Lanes, Lanes], Lanes] = emitted(_pick("<"), _lanes, _lanes, _lanes)
-#: Returns the larger of each two numbers, the second where they do not compare.
+#: Returns the larger of each two numbers, the second number if one is NaN.
 larger: Callable[[Lanes, Lanes], Lanes] = emitted(_pick(">"), _lanes, _lanes, _lanes)
-#: Returns the first number where the mask is true and the second elsewhere.
+#: Returns the first number if the mask is true, else the second.
 where: Callable[[Mask, Lanes, Lanes], Lanes] = emitted(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
 )
@@ -428,7 +429,7 @@ lowest_bit: Callable[[np.uint64], int] = emitted(
 count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
-#: Returns value * 2**n where the second vector is n + 1.5 * 2**23: its lowest bits then hold n.
+#: Returns value * 2**n if the second vector is n + 1.5 * 2**23, whose lowest bits hold n.
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
 #: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
 sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = emitted(
@@ -440,7 +441,7 @@ total: Callable[[Lanes], np.float32] = emitted(_total, types.float32, _eight)
 
 @strict_device
 def aligned(count: int) -> NDArray[np.float32]:
-    """Returns room for so many numbers that begins a cache line: no vector lies across two."""
+    """Return an array of `count` numbers aligned to cache lines, so no vector spans two lines."""
     room = np.empty(count + WIDE, np.float32)
     shift = (-(room.ctypes.data // room.itemsize)) % WIDE
     return room[shift : shift + count]

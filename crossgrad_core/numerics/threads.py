@@ -1,4 +1,4 @@
-"""How many threads run, decided in one place for Numba and torch."""
+"""The number of threads, set in one place for Numba and torch."""
 
 import os
 from collections.abc import Iterator
@@ -12,24 +12,24 @@ from crossgrad_core.system.cores import available_cores
 
 
 def configure_threads(n: int | None = None) -> int:
-    """Gives Numba's kernels and torch's operators the same number of threads.
+    """Set the same number of threads for Numba's kernels and torch's operators.
 
-    Kernels share their jobs (`jobs.share`); for the `prange` loops of plugins Numba's threading
-    layer is set to OpenMP where it can be loaded, else TBB, else Numba's own "workqueue", unless
-    the environment names one (`NUMBA_THREADING_LAYER`, `NUMBA_THREADING_LAYER_PRIORITY`) or a
-    parallel kernel has run already. Numba's number of threads belongs to the calling thread: a
-    second thread that runs kernels has to call this function too. Freed memory stays in the process
-    from now on (`keep_freed_memory`).
+    Kernels divide their work with `jobs.parallel`. For the `prange` loops of plugins, Numba's
+    threading layer is set to OpenMP if it can be loaded, else TBB, else Numba's own "workqueue".
+    The layer is not changed if the environment names one (`NUMBA_THREADING_LAYER`,
+    `NUMBA_THREADING_LAYER_PRIORITY`) or if a parallel kernel has already run. Numba's number of
+    threads belongs to the calling thread, so every other thread that runs kernels must also call
+    this function. After the call, freed memory stays in the process (`keep_freed_memory`).
 
     Args:
-        n: Number of threads; None takes NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else
-            the cores that this process may use (its affinity and, in a container, its CPU quota).
+        n: Number of threads; None uses NUMBA_NUM_THREADS or OMP_NUM_THREADS if one is set, else
+            the cores available to this process (its affinity and, in a container, CPU quota).
 
     Returns:
-        The number of threads in force.
+        The number of threads that was set.
 
     Raises:
-        UserError: If `n` is below 1 or above what Numba was started with.
+        UserError: If `n` is below 1 or above Numba's limit at its start.
     """
     import numba
 
@@ -52,7 +52,7 @@ def configure_threads(n: int | None = None) -> int:
 
 
 def _prefer_openmp() -> None:
-    """Puts OpenMP first among the threading layers; no effect once a layer runs."""
+    """Put OpenMP first among the threading layers; no effect after a layer has started."""
     import numba
 
     if not {"NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER_PRIORITY"} & os.environ.keys():
@@ -70,7 +70,7 @@ def _default_threads() -> int:
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Numba and torch on one thread inside, for work too small to wake others for."""
+    """Run Numba and torch on one thread inside the block, for little work."""
     import numba
 
     before = numba.get_num_threads(), torch.get_num_threads()

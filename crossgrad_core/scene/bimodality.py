@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: The coefficient of a uniform sample, cut off: what lies below has one mode.
+#: The coefficient of a uniform sample, rounded down: samples below it have one mode.
 ONE_MODE: Final = 0.555
 #: Smallest sample with a finite-sample kurtosis.
 _SMALLEST = 4
-#: In smaller ones two equal points stay below a uniform law in the finite-sample form
+#: In smaller samples two equal points stay below the uniform value in the finite-sample form
 #: (docs/groupings.md).
 _SMALLEST_SAMPLE = 10
 
@@ -28,7 +28,7 @@ class Bimodality:
         sample: Finite-sample form with Fisher's G1 and G2; NaN where undefined.
         population: Form with plain moments, (g1^2 + 1) / (g2 + 3); NaN where undefined.
         size: n.
-        reason: Why a form is NaN; empty where both are defined.
+        reason: Why a form is NaN; empty if both forms are defined.
     """
 
     sample: float
@@ -38,12 +38,12 @@ class Bimodality:
 
     @property
     def deciding(self) -> float:
-        """The form that decides: the finite-sample one, of small samples that of plain moments."""
+        """The form used for decisions: finite-sample, or plain moments for small samples."""
         return self.sample if self.size >= _SMALLEST_SAMPLE else self.population
 
 
 def bimodality(values: NDArray[np.float64]) -> Bimodality:
-    """Sarle's coefficient of the values [n] in both forms.
+    """Compute Sarle's coefficient of the values [n] in both forms.
 
     Source: SAS/STAT user's guide, CLUSTER procedure (Sarle); Pfister et al. 2013.
     """
@@ -53,7 +53,7 @@ def bimodality(values: NDArray[np.float64]) -> Bimodality:
         return Bimodality(float("nan"), float("nan"), size, reason)
     deviations = values - values.mean()
     spread = float(np.abs(deviations).max())
-    # Rounding of the mean leaves deviations of its own size where all values are equal.
+    # If all values are equal, rounding of the mean leaves deviations of the rounding error's size.
     if spread <= 4.0 * np.finfo(np.float64).eps * float(np.abs(values).max()):
         return Bimodality(float("nan"), float("nan"), size, "all values are equal")
     scaled = deviations / spread

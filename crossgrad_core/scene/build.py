@@ -1,4 +1,4 @@
-"""From what a reader found to a `Scene`: checks, photos, split, local frame, regimes."""
+"""Conversion of a reader's raw scene to a `Scene`: checks, photos, split, frame, regimes."""
 
 import logging
 from collections import Counter
@@ -36,17 +36,17 @@ from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: A photo of whose stored pixels at least this share counts keeps some whatever is done to it.
-#: Undistorting and resizing could take the last ones of others, so these are decoded.
+#: If at least this share of the stored pixels counts, some pixels count after every later step.
+#: Below this share, undistorting and resizing could remove all of them, so the photo is decoded.
 _SURE = 0.05
 _HALF = 128
 
 
 def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root: Path) -> Split:
-    """The split without training photos that are masked as a whole; a note names them.
+    """Return the split without training photos that are masked completely; a note names them.
 
-    Masks are read for it, and photos with transparency decoded. Held-out photos stay: their
-    figures say that they have no pixel.
+    This reads masks and decodes photos with transparency. Held-out photos stay in the split: their
+    metrics report that no pixel counts.
 
     Raises:
         UserError: No training photo has a pixel that counts.
@@ -76,7 +76,7 @@ def _is_blank(source: PhotoSource) -> bool:
 
 
 def _counting_shares(source: PhotoSource) -> list[float]:
-    """Shares of the stored pixels that count, by the mask and by transparency."""
+    """Return the shares of the stored pixels that count by the mask and by transparency."""
     shares = [1.0]
     if source.mask is not None:
         shares.append(float((decode_mask(source.mask) > 0).mean()))
@@ -97,15 +97,15 @@ def _all_blank(names: Sequence[str], root: Path) -> UserError:
 
 
 def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
-    """The scene with the points of a file; no photo is known to have observed any of them.
+    """Replace the points of a scene by the points of a file, without observations by photos.
 
     Args:
-        raw: The scene as a reader found it.
-        option: The file, as it is or within the scene; None keeps the points of the reader.
+        raw: The scene from the reader.
+        option: The file, as given or relative to the scene; None keeps the points of the reader.
 
     Raises:
-        UserError: The file is not there, cannot be read, holds Gaussians, or stands in another
-            frame than the cameras.
+        UserError: The file does not exist, cannot be read, contains Gaussians, or is in another
+            coordinate frame than the cameras.
     """
     if option is None:
         return raw
@@ -139,14 +139,14 @@ def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
 
 
 NEAR, FAR = "near", "far"
-# Label of the photos that lie directly in the image folder, beside folders.
+# Label of the photos directly in the image folder, if other photos are in subfolders.
 _TOP = "images"
-# Label of all views where nothing tells near from far.
+# Label of all views if near and far views cannot be distinguished.
 _ONLY = "all"
 
 
 def label_by_folder(names: Sequence[str]) -> tuple[str, ...] | None:
-    """The first folder in which the names differ; None where all are in one folder."""
+    """Label names by the first folder in which they differ; None if all are in one folder."""
     folders = [PurePosixPath(name).parent.parts for name in names]
     shared = 0
     while len({parts[: shared + 1] for parts in folders}) == 1:
@@ -162,16 +162,16 @@ def label_by_footprint(
     points: NDArray[np.float64],
     train: Sequence[int],
 ) -> tuple[str, ...]:
-    """Near where the scene is drawn at least as large as in the median training view, else far.
+    """Label a view near if its footprint is at least the median of the training views, else far.
 
-    See `contract.scene.footprint`. A view without one takes that of the nearest camera that has
-    one. Without a footprint at all, every view is in one regime `all`.
+    See `contract.scene.footprint`. A view without a footprint uses the footprint of the nearest
+    camera with one. If no view has a footprint, every view gets the label `all`.
 
     Args:
         cameras: Cameras of all views, local frame.
         seen: Rows of `points` that each view observed.
         points: [P, 3], local frame.
-        train: Indices of the training views: the median is theirs.
+        train: Indices of the training views, over which the median is computed.
     """
     footprints = np.array(
         [footprint(camera, points, rows) for camera, rows in zip(cameras, seen, strict=True)]
@@ -189,14 +189,14 @@ def label_by_footprint(
 
 
 def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
-    """The scene that is trained on.
+    """Build the scene for training from a raw scene.
 
-    Views without a photo, or in neither split list, and training views that are masked as a whole
-    are left out. The local frame is that of the training cameras. Nothing is written to disk, and
-    no photo is decoded but those whose mask or transparency leaves it open whether a pixel counts.
+    Leaves out views without a photo, views in neither split list, and completely masked training
+    views. The local frame is computed from the training cameras. Nothing is written to disk. A
+    photo is decoded only if its mask or transparency leaves open whether any pixel counts.
 
     Raises:
-        UserError: The input cannot be trained on; says what is wrong, where, and what to do.
+        UserError: The input cannot be used for training. The message gives cause, place and remedy.
     """
     raw = with_photo_names(raw)
     check_views(raw)
@@ -256,7 +256,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
 
 
 def _labels(raw: RawScene, photos: ChosenPhotos, points: CheckedPoints) -> Label:
-    """Tells regimes before the split, when the local frame can only be that of all cameras."""
+    """Return a labeller that works before the split, in a local frame of all cameras."""
     views = sorted((v for v in raw.views if v.name in photos.sources), key=lambda view: view.name)
     names = [view.name for view in views]
 
@@ -307,7 +307,7 @@ def _note_regimes(regimes: Sequence[str], train: Sequence[int], how: str) -> str
 def _note_unmeasured(
     regimes: Sequence[str], train: Sequence[int], options: SceneOptions
 ) -> Iterator[str]:
-    """Name the regimes without a held-out photo, where other regimes have one."""
+    """Yield a note on the regimes without a held-out photo, if other regimes have one."""
     held_out = Counter(regimes) - Counter(regimes[i] for i in train)
     lacking = sorted(set(regimes) - set(held_out))
     if held_out and lacking:

@@ -1,4 +1,4 @@
-"""Camera calibrations in COLMAP's terms, and their undistortion through pycolmap."""
+"""Camera calibrations in COLMAP's terms, and their undistortion with pycolmap."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,15 +15,15 @@ from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 if TYPE_CHECKING:
     import pycolmap
 
-# A pinhole camera where every distortion parameter is 0. Fisheye models are not in the list: with
-# zero parameters they are equidistant, though pycolmap's `is_undistorted` says otherwise.
+# These models are pinhole cameras if all distortion parameters are 0. Fisheye models are not in the
+# list: with zero parameters they are equidistant, although pycolmap's `is_undistorted` is True.
 _PINHOLE_AT_ZERO = frozenset(
     {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
 )
 _PINHOLE = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
-# Photos that look into all directions.
+# Models of photos that cover all directions.
 _ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
-# Beyond these nothing can be computed with a camera in single precision.
+# Cameras beyond these limits cannot be computed in single precision.
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _WHITE = 255
@@ -36,8 +36,8 @@ class Calibration:
 
     Attributes:
         model: COLMAP's name of the model, such as `PINHOLE` or `OPENCV`.
-        width: Pixels of the photos it was calibrated on.
-        height: Likewise.
+        width: Width of the photos used for calibration, pixels.
+        height: Height of the same photos, pixels.
         params: In COLMAP's order for the model.
     """
 
@@ -47,11 +47,11 @@ class Calibration:
     params: tuple[float, ...]
 
     def check(self, where: object) -> None:
-        """Refuses what no photo can be taken with.
+        """Refuse a calibration that no photo can have.
 
         Raises:
             UserError: Unknown model, wrong number of parameters, empty size, a focal length that is
-                not positive, or anything that is not finite. Names `where`.
+                not positive, or a value that is not finite. The message names `where`.
         """
         if min(self.width, self.height) < 1 or max(self.width, self.height) > _LONGEST_SIDE:
             raise UserError(
@@ -88,7 +88,7 @@ class Calibration:
                 found=str(len(self.params)),
                 todo=_AGAIN,
             )
-        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # NaN is not
+        if not all(abs(value) <= _LARGEST_PARAMETER for value in self.params):  # also False for NaN
             raise UserError(
                 "a camera parameter is not a finite number",
                 where=where,
@@ -108,7 +108,7 @@ class Calibration:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether photos need no undistortion."""
+        """True if the photos need no undistortion."""
         if self.model in _PINHOLE:
             return True
         extra = [self.params[i] for i in self._camera.extra_params_idxs()]
@@ -116,11 +116,11 @@ class Calibration:
 
     @property
     def without_distortion(self) -> Pinhole:
-        """The focal lengths and the principal point alone."""
+        """The pinhole camera with the same focal lengths and principal point."""
         return self._read_pinhole(self._camera)
 
     def resized(self, width: int, height: int) -> "Calibration":
-        """The calibration of the same photos resampled to `width` x `height`."""
+        """Return the calibration of the same photos resampled to `width` x `height`."""
         if (width, height) == (self.width, self.height):
             return self
         if self.is_pinhole:
@@ -151,7 +151,7 @@ class Calibration:
 
     @cached_property
     def fills_frame(self) -> bool:
-        """Whether the distorted photo reaches every pixel of the undistorted one."""
+        """True if the distorted photo covers every pixel of the undistorted photo."""
         if self.is_pinhole:
             return True
         frame = self.pinhole
@@ -167,11 +167,11 @@ class Calibration:
 
     @cached_property
     def cost(self) -> LensCost | None:
-        """What undistortion loses; None for a pinhole."""
+        """The losses of undistortion; None for a pinhole camera."""
         return None if self.is_pinhole else cost_of(self._camera, self._reach, self.pinhole)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A photo in the pixels of `pinhole`, bilinear; black where nothing was seen.
+        """Undistort a photo to the pixels of `pinhole`, bilinear; pixels without source are black.
 
         Args:
             image: [H, W, 3] or [H, W], in the size of the calibration.
@@ -186,7 +186,7 @@ class Calibration:
         return np.asarray(bitmap.to_array())[top:bottom, left:right]
 
     def reached(self) -> NDArray[np.bool_]:
-        """[H, W] whether a pixel of `pinhole` shows the photo, and no ray beyond a fold."""
+        """Return a mask [H, W] of the `pinhole` pixels that the photo covers before any fold."""
         white = np.full((self.height, self.width), _WHITE, dtype=np.uint8)
         shown: NDArray[np.bool_] = self.undistort(white) == _WHITE
         return shown & self._reach.mask(self.pinhole) if self._reach.folds else shown
@@ -197,16 +197,16 @@ class Calibration:
 
     @cached_property
     def _options(self) -> "pycolmap.UndistortCameraOptions":
-        """How pycolmap undistorts.
+        """The options for pycolmap's undistortion.
 
-        Borders of a photo that no ray below 90 degrees hits give the undistorted photo the smallest
-        size that pycolmap allows. It gets at least the size of the photo then.
+        If no ray below 90 degrees hits the border of a photo, pycolmap shrinks the undistorted
+        photo to the smallest allowed size. The options then require at least the photo's size.
         """
         guard_pycolmap()
         import pycolmap
 
         options = pycolmap.UndistortCameraOptions()
-        # This also refuses models without a pinhole, before their reach is asked for.
+        # This also refuses models without a pinhole equivalent, before `_reach` is computed.
         smallest = self._undistorted(options).width <= options.min_scale * self.width
         if smallest and (self._reach.folds or self._reach.wide):
             options.min_scale = 1.0
@@ -214,7 +214,7 @@ class Calibration:
 
     @cached_property
     def _whole(self) -> Pinhole:
-        """The undistorted calibration before it is cut."""
+        """The undistorted calibration before cropping."""
         return self._undistorted(self._options)
 
     def _undistorted(self, options: "pycolmap.UndistortCameraOptions") -> Pinhole:
@@ -235,7 +235,7 @@ class Calibration:
     def _box(self) -> tuple[int, int, int, int]:
         """Left, top, right and bottom border of `pinhole` in the pixels of `_whole`.
 
-        Where the model folds over inside the photo, pixels around all that counts are cut off.
+        If the model folds over inside the photo, the pixels outside the valid region are cropped.
         """
         whole = self._whole
         if not self._reach.folds:

@@ -25,9 +25,9 @@ from crossgrad_core.scene.wording import name_some
 FORMAT: Final = 1
 #: Bytes of a file that are read at its start and at its end.
 END = 64 * 2**10
-#: Decimals of pixels and local units that are written down: far more than tell cameras apart.
+#: Decimals stored for pixels and local units: far more than needed to distinguish cameras.
 DECIMALS = 6
-# Libraries of another machine may round the last digits otherwise.
+# Libraries on another machine may round the last digits differently.
 _TOLERANCE = 10.0 ** (1 - DECIMALS)
 
 
@@ -36,13 +36,13 @@ class _Mark(BaseModel):
 
 
 class FileMark(_Mark):
-    """A file.
+    """The size and digests of a file.
 
     Attributes:
-        bytes: Its size.
-        sha256: Digest of its first and last 64 KiB, by which runs of all versions know it.
-        whole: Digest of the whole file; None of a file that the other digest covers, and in a
-            fingerprint of an earlier version.
+        bytes: Size of the file in bytes.
+        sha256: Digest of its first and last 64 KiB; stored by runs of all versions.
+        whole: Digest of the whole file; None if `sha256` already covers the whole file, and in
+            fingerprints of earlier versions.
     """
 
     bytes: int
@@ -50,7 +50,7 @@ class FileMark(_Mark):
     whole: str | None = None
 
     def differs(self, other: "FileMark | None") -> bool:
-        """Return whether the other mark is that of another file."""
+        """Return True if the other mark belongs to a different file."""
         if other is None:
             return True
         ends = (self.bytes, self.sha256) != (other.bytes, other.sha256)
@@ -58,14 +58,14 @@ class FileMark(_Mark):
 
 
 class ViewMark(_Mark):
-    """A view.
+    """The split, camera and files of a view.
 
     Attributes:
-        trained: Whether it is trained on; else it is held out.
+        trained: True for a training view, False for a held-out view.
         camera: Width, height, fx, fy, cx, cy in pixels, then centre, right and forward axis in the
             local frame.
-        photo: Its file; None where it comes from none.
-        mask: Its mask's file; None where it has none.
+        photo: File of the photo; None if the photo comes from no file.
+        mask: File of the mask; None without a mask.
     """
 
     trained: bool
@@ -89,15 +89,15 @@ class PointsMark(_Mark):
 
 
 class Fingerprint(_Mark):
-    """A scene.
+    """The fingerprint of a scene.
 
     Attributes:
         format: Version of the layout.
         frame: The local frame.
         points: The SfM points.
-        lists: Name -> digest of the lists that split the views, where there are any.
-        files: Path below the scene's folder -> file, of the files besides photos and masks that the
-            reader used; None in a fingerprint of an earlier version.
+        lists: Name -> digest of the split lists, if any.
+        files: Path relative to the scene's folder -> file, for the files that the reader used,
+            except photos and masks; None in a fingerprint of an earlier version.
         views: Name -> view.
     """
 
@@ -110,7 +110,7 @@ class Fingerprint(_Mark):
 
 
 def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
-    """Return what a scene is known by; reads all of its files.
+    """Return the fingerprint of a scene; reads all of its files.
 
     Args:
         scene: The scene.
@@ -140,10 +140,10 @@ def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
 
 
 def mark_of(path: Path) -> FileMark:
-    """What a file is known by.
+    """Return the size and digests of a file.
 
     Raises:
-        UserError: It cannot be read.
+        UserError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -152,7 +152,7 @@ def mark_of(path: Path) -> FileMark:
             file.seek(max(END, size - END))
             digest.update(file.read(END))
             file.seek(0)
-            # The ends are all of a small file.
+            # The two ends cover a small file completely.
             whole = file_digest(file, "sha256").hexdigest() if size > 2 * END else None
     except OSError as error:
         raise UserError(
@@ -166,7 +166,7 @@ def mark_of(path: Path) -> FileMark:
 
 def _files_of(view: View) -> tuple[FileMark | None, FileMark | None]:
     photo = view.photo
-    if not isinstance(photo, FilePhoto):  # A third party's photos may come from anywhere.
+    if not isinstance(photo, FilePhoto):  # Photos of plugins may come from any source.
         return None, None
     mask = photo.source.mask
     return mark_of(photo.source.path), None if mask is None else mark_of(mask)
@@ -190,23 +190,23 @@ def _points_of(scene: Scene) -> PointsMark:
 
 
 class Weight(IntEnum):
-    """The weight of a difference for a model that was trained on the former scene."""
+    """The effect of a difference on a model that was trained on the former scene."""
 
-    #: Pixels or points are others; every camera and every parameter is where it was.
+    #: Pixels or points differ; every camera and every parameter is unchanged.
     CONTENT = 1
     #: Other views are held out.
     HELD_OUT = 2
-    #: Other views are trained on, or cameras stand elsewhere: parameters would be misplaced.
+    #: Other views are trained, or cameras moved: parameters would be misplaced.
     PLACE = 3
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference.
+    """One difference between two fingerprints.
 
     Attributes:
-        weight: What it means.
-        text: What it is.
+        weight: Its effect on a trained model.
+        text: Its description.
     """
 
     weight: Weight
@@ -214,16 +214,16 @@ class Difference:
 
 
 def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """How a scene differs from what it was; empty where it is the same.
+    """Return the differences between the former and the current scene; empty if they are equal.
 
-    Where other views are trained on, the local frame and all that is measured in it are others as a
-    consequence; only the cause is told then.
+    Other training views also change the local frame and everything measured in it. In this case
+    only the cause is reported.
     """
     found = _views(was, now)
     if not any(each.weight is Weight.PLACE for each in found):
         found += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     found += _files(was, now)
-    # What a file changed is told in its place, where it is known.
+    # Other changed files are reported only if no difference was found, else their effect is listed.
     return found or _others(was, now)
 
 
@@ -290,7 +290,7 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 
 def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Differences of the files besides photos and masks; none to a run that did not note them."""
+    """Return differences of files except photos and masks; none if a run did not record them."""
     if was.files is None or now.files is None:
         return []
     names = was.files.keys() | now.files.keys()

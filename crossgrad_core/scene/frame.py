@@ -1,4 +1,4 @@
-"""The local frame: the mean training camera is its origin, the cameras' extent its unit."""
+"""The local frame: its origin is the mean training camera, its unit the extent of the cameras."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,19 @@ from numpy.typing import NDArray
 
 from crossgrad_core.contract.scene import Similarity, stray_rows
 
-# 1.1 x the largest distance of a training camera from their mean (3DGS, scene extent).
+# 1.1 x the largest distance of a training camera from the mean of all (3DGS, scene extent).
 _MARGIN = 1.1
 
-# Cameras that stand closer together than this share of their distance to the scene give no unit.
+# If cameras are closer together than this share of their distance to the scene, they give no unit.
 _SAME_PLACE = 1e-6
 
-# And what is smaller than this, in units of the input, is no size: its inverse must be a number.
+# A smaller size, in input units, is treated as 0, because its inverse must be finite.
 _SMALLEST = 1e-30
 
-# Local coordinates are rounded to multiples of this, 1e-9 of the extent. One scene given in other
-# units or with another origin differs by a few units in the last place of float64; that is a
-# thousand to ten million times less than the grid, so nearly every coordinate comes out with the
-# same bits. The rounding itself is 60 times smaller than the step of float32 at 1.
+# Local coordinates are rounded to multiples of this, 1e-9 of the extent. If the same scene is given
+# in other units or with another origin, float64 results differ by a few units in the last place.
+# This difference is 1e3 to 1e7 times smaller than the grid, so nearly all coordinates are equal
+# after rounding. The rounding error is 60 times smaller than the step of float32 at 1.
 _GRID = 2.0**-30
 
 
@@ -30,7 +30,7 @@ class Frame:
     Attributes:
         similarity: Input frame -> local frame.
         note: One sentence for the run's log.
-        stray: [N] training cameras that did not count, because they are far from all others.
+        stray: [N] training cameras that were ignored, because they are far from all others.
     """
 
     similarity: Similarity
@@ -38,11 +38,11 @@ class Frame:
     stray: NDArray[np.bool_]
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the input frame in the local frame, on its grid."""
+        """Transform points [N, 3] from the input frame to the local frame, rounded to its grid."""
         return _snap(self.similarity.to_local(points))
 
     def pose(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[4, 4] pose from the local frame; the rotation is kept, the centre is on the grid."""
+        """Return the pose [4, 4] for the local frame: same rotation, centre rounded to the grid."""
         center = self.points(camera_centers(world_to_camera[None]))[0]
         pose = np.eye(4)
         pose[:3, :3] = world_to_camera[:3, :3]
@@ -51,16 +51,16 @@ class Frame:
 
 
 def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 3] camera centres of poses [N, 4, 4]."""
+    """Return the camera centres [N, 3] of poses [N, 4, 4]."""
     rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
     return np.asarray(-np.einsum("nij,ni->nj", rotation, translation))
 
 
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
-    """The local frame of a scene (3DGS: centre and extent of the training cameras).
+    """Choose the local frame of a scene (3DGS: centre and extent of the training cameras).
 
-    Stray cameras do not count. Where the training cameras stand in one place, the unit is their
-    median distance to the points, and without points one unit of the input.
+    Stray cameras are ignored. If all training cameras are in one place, the unit is their median
+    distance to the points, or one input unit if there are no points.
 
     Args:
         centers: [N, 3] centres of the training cameras, input frame; N >= 1.

@@ -12,15 +12,15 @@ from crossgrad_core.contract.scene import Pinhole
 if TYPE_CHECKING:
     import pycolmap
 
-#: Directions around the axis, and steps along each, for a first look and for a closer one.
+#: Directions around the axis, and steps along each direction, for a coarse and for a fine scan.
 _FIRST, _CLOSER = (72, 128), (180, 360)
-#: The largest angle from the axis that is looked at: a pinhole camera ends at 90 degrees.
+#: The largest scanned angle from the axis: a pinhole camera ends at 90 degrees.
 _WIDEST: Final = np.deg2rad(89.5)
-#: The last pixel before a fold is smeared over many undistorted ones, so that it does not count.
+#: The last pixel before a fold is smeared over many undistorted pixels, so it does not count.
 _RIM: Final = 1.0
-#: Cells along each side of a frame whose areas are added up, and rows that are masked at a time.
+#: Cells along each side of a frame for the sum of areas, and rows that are masked at a time.
 _CELLS, _ROWS = 64, 256
-#: Degree of the polynomial by which the radius goes on beyond 90 degrees.
+#: Degree of the polynomial that extrapolates the radius beyond 90 degrees.
 _DEGREE: Final = 13
 
 
@@ -28,16 +28,16 @@ _DEGREE: Final = 13
 class LensReach:
     """The rays that a lens maps to pixels one to one.
 
-    A distortion model folds over where the distorted radius stops growing with the undistorted one.
-    Rays beyond the fold hit pixels that nearer rays hit too, so that they show nothing.
+    A distortion model folds over if the distorted radius stops growing with the undistorted radius.
+    Rays beyond the fold hit pixels that inner rays also hit, so they carry no image content.
 
     Attributes:
         limits: [A] tangent of the largest angle from the axis before the fold. The directions are
             spread evenly over the circle, from the right side downwards.
-        folds: Whether the fold lies inside the photo in some direction.
-        wide: Whether the photo sees 90 degrees or more from the axis in some direction.
+        folds: True if the fold is inside the photo in some direction.
+        wide: True if the photo covers 90 degrees or more from the axis in some direction.
         box: Smallest and largest x, then y, of the rays inside the photo, at distance 1.
-        seen: Degrees that the photo sees along its longer side.
+        seen: Field of view along the longer side, degrees.
     """
 
     limits: NDArray[np.float64]
@@ -48,7 +48,7 @@ class LensReach:
 
     @classmethod
     def of(cls, camera: "pycolmap.Camera") -> "LensReach":
-        """The reach of a camera."""
+        """Compute the reach of a camera."""
         first = cls._looked_at(camera, *_FIRST)
         return cls._looked_at(camera, *_CLOSER) if first.folds or first.wide else first
 
@@ -82,14 +82,14 @@ class LensReach:
         )
 
     def beyond(self, plane: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[...] whether rays through points [..., 2] at distance 1 lie beyond the fold."""
+        """Return a mask [...] of points [..., 2] at distance 1: True for rays beyond the fold."""
         x, y = plane[..., 0], plane[..., 1]
         around = 2.0 * np.pi * np.arange(len(self.limits)) / len(self.limits)
         limits = np.interp(np.arctan2(y, x), around, self.limits, period=2.0 * np.pi)
         return np.asarray(np.hypot(x, y) > limits)
 
     def mask(self, frame: Pinhole) -> NDArray[np.bool_]:
-        """[H, W] whether a pixel of a pinhole camera lies before the fold."""
+        """Return a mask [H, W] of the pixels of a pinhole camera that are before the fold."""
         mask = np.empty((frame.height, frame.width), dtype=np.bool_)
         x = np.arange(frame.width) + 0.5
         for start in range(0, frame.height, _ROWS):
@@ -103,10 +103,10 @@ class LensCost:
     """The losses of undistortion to a pinhole camera.
 
     Attributes:
-        seen: Degrees that the photo sees along its longer side.
-        kept: Degrees of these that the undistorted photo shows.
-        lost: Share of the photo's pixels that the undistorted photo does not show.
-        beyond: Share of the undistorted photo's pixels that lie beyond the fold of the model.
+        seen: Field of view of the photo along its longer side, degrees.
+        kept: Part of this field of view in the undistorted photo, degrees.
+        lost: Share of the photo's pixels that are missing in the undistorted photo.
+        beyond: Share of the undistorted photo's pixels that are beyond the fold of the model.
     """
 
     seen: float
@@ -142,27 +142,27 @@ def cost_of(camera: "pycolmap.Camera", reach: LensReach, frame: Pinhole) -> Lens
 
 
 def source_pixels(camera: "pycolmap.Camera", plane: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 2] pixels of rays through points [N, 2] at distance 1; NaN where there are none."""
+    """Project rays through points [N, 2] at distance 1 to pixels [N, 2]; NaN without a pixel."""
     rays = np.column_stack([plane, np.ones(len(plane))])
     return np.asarray(camera.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
 
 
 def _plane(frame: Pinhole, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., 2] points at distance 1 that pixels of a pinhole camera show."""
+    """Return the points [..., 2] at distance 1 that pixels of a pinhole camera show."""
     return np.stack([(u - frame.cx) / frame.fx, (v - frame.cy) / frame.fy], axis=-1)
 
 
 def _is_inside(pixels: NDArray[np.float64], camera: "pycolmap.Camera") -> NDArray[np.bool_]:
-    """[...] whether pixels [..., 2] lie in the photo; NaN do not."""
+    """Return a mask [...] of the pixels [..., 2] inside the photo; False for NaN."""
     within = (pixels >= 0.0) & (pixels <= [camera.width, camera.height])
     return np.asarray(within.all(axis=-1))
 
 
 def _last_before_fold(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[A] the last step of each direction [A, N, 2] before the model folds over.
+    """Return the last step [A] of each direction [A, N, 2] before the model folds over.
 
-    Up to there the distance from the middle grows with every step, and neighbouring directions keep
-    their order (the Jacobian's determinant is positive).
+    Before the fold the distance from the centre grows with every step, and neighbouring directions
+    keep their order (the Jacobian's determinant is positive).
     """
     with np.errstate(invalid="ignore", over="ignore"):
         radius = np.linalg.norm(pixels - pixels[:, :1], axis=2)
@@ -179,10 +179,10 @@ def _seen(
     used: NDArray[np.bool_],
     degrees: NDArray[np.float64],
 ) -> float:
-    """Degrees that a photo sees along its longer side.
+    """Compute the field of view of a photo along its longer side, degrees.
 
-    Models answer below 90 degrees from the axis only. Beyond, a polynomial in the angle goes on,
-    which fits the fisheye models to rounding.
+    COLMAP's models are defined only below 90 degrees from the axis. A polynomial in the angle
+    extrapolates beyond; it fits the fisheye models up to rounding.
     """
     axis = 0 if camera.width >= camera.height else 1
     size = (camera.width, camera.height)[axis]

@@ -1,9 +1,9 @@
 """Point clouds from PLY, LAS or LAZ files, thinned to the density of SfM points.
 
-LAS and LAZ files, the formats of laser scanners, are read where the package laspy is installed.
+LAS and LAZ files, the formats of laser scanners, are read if the package laspy is installed.
 
-Source of the format: ASPRS, LAS specification 1.4. Positions are whole numbers times the scale plus
-the offset of the header, which laspy applies in float64.
+Source of the format: ASPRS, LAS specification 1.4. A position is an integer times the scale plus
+the offset from the header; laspy computes it in float64.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,47 +24,47 @@ if TYPE_CHECKING:
     import laspy
 
 
-#: What the names of such files end in.
+#: Suffixes of LAS and LAZ files.
 SUFFIXES: Final = (".las", ".laz")
-#: What the names of point clouds end in.
+#: Suffixes of all point clouds.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
 #: Colours have 16 bits if this percentile of them is at least `_LONG`.
 _MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-#: Properties that Gaussians have and points lack.
+#: Properties of Gaussians that points do not have.
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: Points that are read of a file, at most: of more, each second, third ... one.
+#: The most points that are read from a file; from a larger file, every second, third ... point.
 _MOST_IN_LAS: Final = 20_000_000
-#: Points that are kept by default: this many, or more if there are many photos. Structure from
-#: motion finds a few hundred points per photo.
+#: Points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more. Structure
+#: from motion finds a few hundred points per photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: Cubes of this many sizes are tried, until at least this share of the wanted points is left.
+#: The most cube sizes that are tried, and the share of the wanted points that ends the search.
 _TRIES, _ENOUGH = 12, 0.8
-#: Points that are looked at to find how large a cloud is.
+#: Sampled points from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
-#: Points on surfaces: their number falls with the square of the side.
+#: Points are on surfaces, so their number falls with the square of the side.
 _SURFACE: Final = 2.0
-#: Rows and layers of cubes, as odd factors of a hash.
+#: Odd factors that hash the integer coordinates of a cube.
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _FARTHEST: Final = 2.0**62
-#: Side of the cubes where all points are in one place, in input units.
+#: Side of the cubes if all points are in one place, in input units.
 _SMALLEST: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of the input.
+    """Points of the input, with their colours.
 
     Attributes:
         positions: [P, 3] float64.
         colors: [P, 3] uint8.
-        source: File that they come from; empty where there are none.
-        gaussians: Whether the file holds Gaussians, whose colours are not read.
+        source: File of the points; empty if there are no points.
+        gaussians: True if the file contains Gaussians, whose colours are not read.
     """
 
     positions: NDArray[np.float64]
@@ -74,7 +74,7 @@ class PointCloud:
 
     @property
     def note(self) -> str:
-        """Part of a note: how many there are, and from where."""
+        """Part of a note: the number of points and their file."""
         if not self.source:
             return "no points"
         return f"{len(self.positions)} points from {self.source}"
@@ -84,10 +84,10 @@ NO_POINTS: Final = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
 
 
 def read_cloud(path: Path, source: str) -> PointCloud:
-    """Positions and colours of a PLY, LAS or LAZ file; grey if it has no colours.
+    """Read positions and colours of a PLY, LAS or LAZ file; grey if it has no colours.
 
     Raises:
-        UserError: It is no such file, or laspy is missing for LAS and LAZ.
+        UserError: The file is not a point cloud, or laspy is missing for LAS and LAZ.
     """
     is_las = path.suffix.lower() in SUFFIXES
     columns = read_las(path) if is_las else read_vertices(path).columns
@@ -100,7 +100,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
             found=f"no {', '.join(missing)}",
             todo="export the points again",
         )
-    with np.errstate(invalid="ignore"):  # a signalling NaN; those are left out with a note
+    with np.errstate(invalid="ignore"):  # signalling NaN; these points are left out with a note
         positions = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return PointCloud(
         positions, _colors(columns, len(positions)), source, gaussians=columns.keys() >= _GAUSSIAN
@@ -108,7 +108,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
 
 
 def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[np.uint8]:
-    """[P, 3] from whole numbers to 255 or to 65,535, or from fractions to 1."""
+    """Convert colours to uint8 [P, 3] from integers up to 255 or 65,535, or fractions up to 1."""
     names = next((names for names in _COLORS if all(name in columns for name in names)), None)
     if names is None:
         return np.full((count, 3), _GREY, dtype=np.uint8)
@@ -117,8 +117,8 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
         return stored
     with np.errstate(invalid="ignore"):
         values = np.nan_to_num(stored.astype(np.float64))
-    # Text files hold no types: numbers above 1 are of the whole kind, and far above 255 of the
-    # longer one, as scanners write.
+    # Text files store no types: values above 1 are integers, and values far above 255 are 16-bit
+    # integers, as scanners write them.
     sizes = np.abs(values[np.isfinite(stored)])
     long = len(sizes) > 0 and np.percentile(sizes, _MOST) >= _LONG
     top = 1.0 if sizes.max(initial=0.0) <= 1.0 else 65_535.0 if long else 255.0
@@ -126,7 +126,7 @@ def _colors(columns: Mapping[str, NDArray[np.generic]], count: int) -> NDArray[n
 
 
 def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
-    """The columns x, y and z of the points, and red, green and blue where the file has colours.
+    """Read the columns x, y and z of the points, and red, green and blue if the file has colours.
 
     Raises:
         UserError: laspy is missing, or the file cannot be read.
@@ -138,7 +138,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
         with open_file(path) as file, laspy.open(file) as reader:
             rows = list(_rows(reader))
             expected, names = reader.header.point_count, _names(reader)
-    # Damaged files end in whatever numpy, struct or the decompressor raise.
+    # Damaged files raise any error of numpy, struct or the decompressor.
     except Exception as error:
         raise UserError(
             "the point cloud cannot be read",
@@ -162,7 +162,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
 
 
 def _rows(reader: "laspy.LasReader") -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """How many points a part of the file has, and the rows [n, 3 or 6] that are kept of them."""
+    """Yield for each part of the file its number of points and the kept rows [n, 3 or 6]."""
     names, start = _names(reader), 0
     stride = -(-reader.header.point_count // _MOST_IN_LAS) or 1
     for part in reader.chunk_iterator(_AT_ONCE):
@@ -190,9 +190,9 @@ def _require_laspy(path: Path) -> None:
 
 
 def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]:
-    """At most `most` of the points, one from each cube of a grid, and a note.
+    """Keep at most `most` of the points, one from each cube of a grid, and return them and a note.
 
-    The first point of the file in each cube is kept, so that equal input gives equal points.
+    The first point of each cube in file order is kept, so that equal input gives equal points.
     """
     count = len(points.xyz)
     if count <= most:
@@ -206,9 +206,9 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
 
 
 def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64], float]:
-    """Rows of the first point in each cube, at most `most`, and the side of the cubes.
+    """Return the rows of the first point in each cube, at most `most`, and the side of the cubes.
 
-    Where no cubes are that few, the points are evenly spread over the file, and the side is 0.
+    If no cube size gives few enough points, evenly spaced rows are returned, and the side is 0.
     """
     sample = xyz[:: -(-len(xyz) // _SAMPLED)]
     low, high = np.percentile(sample, [1.0, 99.0], axis=0)
@@ -232,7 +232,7 @@ def _one_per_cube(xyz: NDArray[np.float64], most: int) -> tuple[NDArray[np.int64
 
 
 def _first_in_cubes(places: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Rising rows of the first of the points [P, 3] in each unit cube."""
+    """Return ascending rows of the first of the points [P, 3] in each unit cube."""
     cubes = np.floor(places.clip(-_FARTHEST, _FARTHEST)).astype(np.int64).astype(np.uint64)
     keys = (cubes * _FACTORS).sum(axis=1, dtype=np.uint64)
     return np.sort(np.unique(keys, return_index=True)[1])

@@ -1,4 +1,4 @@
-"""Points that stand in another frame than the cameras are refused."""
+"""A check that refuses points in another coordinate frame than the cameras."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,26 +14,26 @@ from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
-#: Points and photos that are tried, and the share of points that some photo has to show.
+#: Points and photos that are tested, and the least share of points that must be in some photo.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
-#: The share of points that photos show after a change of the poses which is the likely cause.
+#: If a change of the poses brings this share of points into photos, it is the likely cause.
 _REPAIRED: Final = 0.5
 
 _Change: TypeAlias = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] the inverse of a rigid pose."""
+    """Return the inverse [4, 4] of a rigid pose."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
     inverse[:3, 3] = camera_centers(pose[None])[0]
     return inverse
 
 
-#: Turns the axes of a camera from OpenGL to OpenCV, and back.
+#: Converts the axes of a camera from OpenGL to OpenCV, and back.
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-#: Mistakes in poses that put all points behind the cameras or beside the photos.
+#: Mistakes in poses that put all points behind the cameras or outside the photos.
 _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
     ("cameras have the other axes (OpenGL: y up, z backward)", lambda pose: _FLIP @ pose),
     ("poses are inverse (camera to world, or world to camera)", _inverse),
@@ -51,16 +51,16 @@ _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
 def check_seen(
     points: PointCloud, views: Sequence[RawView], where: object, todo: str = "remove the file"
 ) -> None:
-    """Refuses points that hardly any photo shows: they stand in another frame than the cameras.
+    """Refuse points that almost no photo shows: they are in another frame than the cameras.
 
     Args:
-        points: Of the input.
-        views: Of the input.
-        where: Place of the poses, for the error.
-        todo: Another way out for this format.
+        points: Points of the input.
+        views: Views of the input.
+        where: Location of the poses, for the error message.
+        todo: Another remedy for this format.
 
     Raises:
-        UserError: Less than one in a hundred lies in the picture of a photo.
+        UserError: Less than one point in a hundred is inside a photo.
     """
     finite = points.positions[np.isfinite(points.positions).all(axis=1)]
     tried = finite[:: max(1, len(finite) // _TRIED)]
@@ -84,7 +84,7 @@ def check_seen(
 
 
 def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str | None:
-    """The mistake in the poses after whose repair most photos show points, and most points."""
+    """Return the mistake in the poses whose repair brings most points into photos, or None."""
     best, cause = _REPAIRED, None
     for text, change in _MISTAKES:
         shown = _shown_by(points, views, change)
@@ -97,7 +97,7 @@ def _likely_cause(points: NDArray[np.float64], views: Sequence[RawView]) -> str 
 def _shown_by(
     points: NDArray[np.float64], views: Sequence[RawView], change: _Change
 ) -> NDArray[np.bool_]:
-    """[V, N] whether a point lies in a photo after a change of the poses."""
+    """Return a mask [V, N] of the points inside each photo after a change of the poses."""
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return np.stack(
             [
@@ -108,7 +108,7 @@ def _shown_by(
 
 
 def _shown(points: NDArray[np.float64], view: RawView) -> NDArray[np.bool_]:
-    """[N] whether a point lies in a photo, up to the distortion of its lens."""
+    """Return a mask [N] of the points inside a photo, without the distortion of its lens."""
     lens, pose = view.calibration.without_distortion, torch.from_numpy(view.world_to_camera)
     pixels, depth = Camera(**vars(lens), world_to_camera=pose).project(points)
     inside = (pixels >= 0.0) & (pixels <= [lens.width, lens.height])

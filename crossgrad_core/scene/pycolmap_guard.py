@@ -1,4 +1,4 @@
-"""Imports pycolmap without its side effects on the process."""
+"""Import of pycolmap without its side effects on the process."""
 
 import signal
 import sys
@@ -6,12 +6,12 @@ import threading
 
 
 def guard_pycolmap() -> None:
-    """Imports pycolmap such that the rest of the process works as before; call before importing it.
+    """Import pycolmap without side effects on the process; call this before importing it.
 
-    pycolmap 4.2.1 exports the symbols of a zlib of its own. If it is what brings the system's zlib
-    into the process, Pillow later mixes the two, and writing a PNG aborts; so zlib goes first. It
-    also installs a handler of SIGTERM that prints a stack trace and ends the process, past any
-    handler of Python.
+    pycolmap 4.2.1 exports the symbols of its own zlib. If pycolmap loads before the system's zlib,
+    Pillow later mixes the two libraries, and writing a PNG aborts. Therefore zlib is imported
+    first. pycolmap also installs a SIGTERM handler that prints a stack trace and ends the process
+    without calling Python's handler. Therefore the former handler is restored.
     """
     if "pycolmap" in sys.modules:
         return

@@ -1,4 +1,4 @@
-"""The raw scene: a reader's findings before split and local frame, and checks on them."""
+"""The raw scene: the output of a reader before split and local frame, and checks of it."""
 
 import os
 import re
@@ -15,14 +15,14 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.frame import Frame, camera_centers
 from crossgrad_core.scene.wording import count, name_some
 
-#: Coordinates beyond this, in units of the input, are none: their squares must stay within float64.
+#: Larger coordinates, in input units, are invalid: their squares must stay within float64.
 FARTHEST = 1e30
-#: And beyond this in local units: their squares must stay within float32.
+#: Largest coordinate in local units: its square must stay within float32.
 FARTHEST_LOCAL = 1e15
-#: Bytes of a file or folder, on every usual file system, and of a whole name.
+#: Bytes of a file or folder name, and of a whole path, allowed on every usual file system.
 LONGEST_PART, LONGEST_NAME = 255, 1024
 _NO_SIGNS = {"Cc", "Cs"}  # control characters, and bytes that are not UTF-8
-# Rotations written with six digits pass; a pose with a scale in it does not.
+# Rotations written with six digits pass; a pose that contains a scale fails.
 _RIGID = 1e-4
 
 
@@ -35,8 +35,8 @@ class RawView:
         calibration: Camera model, before undistortion and resizing.
         world_to_camera: [4, 4] float64, rigid, input frame to camera frame (OpenCV axes).
         seen: [S] int64 rows of the scene's points that the view observed; may be empty.
-        mask: Its mask where the input names it; an option for the mask folder comes first.
-        place: Path whose folders tell the regime; None for the name's own folders.
+        mask: Its mask if the input names one; an option for the mask folder has priority.
+        place: Path whose folders give the regime; None uses the folders of `name`.
     """
 
     name: str
@@ -52,16 +52,16 @@ class RawScene:
     """A scene as the input describes it; `crossgrad_core.scene.build` turns it into a `Scene`.
 
     Attributes:
-        root: The scene's folder: split lists and the default mask folder are looked for in it, and
-            it gives the scene its name.
-        images: The folder of the photos; the siblings `<images>_2`, `_4` and `_8` may hold smaller
-            copies.
+        root: The scene's folder. It may contain split lists and the default mask folder, and its
+            name is the scene's name.
+        images: The folder of the photos; the siblings `<images>_2`, `_4` and `_8` may contain
+            smaller copies.
         views: The posed photos, in any order.
         points: [P, 3] float64 SfM points, input frame; may be empty.
         point_colors: [P, 3] uint8 RGB.
-        notes: What the reader did to the input.
-        split: Names of the training and of the test views where the input itself prescribes them.
-        background: RGB in [0, 1] to put behind photos with an alpha channel; None where pixels with
+        notes: Changes that the reader made to the input.
+        split: Names of the training and of the test views, if the input prescribes a split.
+        background: RGB in [0, 1] to put behind photos with an alpha channel; None if pixels with
             alpha below a half do not count.
         files: Files that the reader used, except photos and masks.
     """
@@ -84,7 +84,7 @@ class CheckedPoints:
     Attributes:
         xyz: [P, 3] float64, input frame.
         colors: [P, 3] uint8.
-        new_row: [Q] int64, row among the finite points of each point of the input, -1 for none.
+        new_row: [Q] int64, row among the finite points for each input point; -1 if it was removed.
     """
 
     xyz: NDArray[np.float64]
@@ -92,18 +92,18 @@ class CheckedPoints:
     new_row: NDArray[np.int64]
 
     def rows(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """[S'] sorted, distinct rows of the finite points, from rows of the input's points."""
+        """Convert rows of the input's points to sorted, distinct rows [S'] of the finite points."""
         kept = np.unique(self.new_row[rows])
         return kept[kept >= 0]
 
     def selected(self, chosen: NDArray[np.bool_]) -> "CheckedPoints":
-        """Those that are marked in `chosen` [P]."""
+        """Return the points that are marked in `chosen` [P]."""
         numbers = np.append(np.where(chosen, np.cumsum(chosen) - 1, -1), -1)
         return CheckedPoints(self.xyz[chosen], self.colors[chosen], numbers[self.new_row])
 
 
 def is_possible_name(text: str) -> bool:
-    """Whether a file can have a name, with folders, on every usual file system."""
+    """Return True if a path is a valid file name on every usual file system."""
     if any(unicodedata.category(sign) in _NO_SIGNS for sign in text):
         return False
     longest = max(len(os.fsencode(part)) for part in re.split(r"[/\\]", text))
@@ -111,10 +111,10 @@ def is_possible_name(text: str) -> bool:
 
 
 def check_views(raw: RawScene) -> None:
-    """Refuses scenes with no view, and views that cannot be told apart or placed.
+    """Refuse scenes without views, and views with ambiguous names or invalid poses.
 
     Raises:
-        UserError: See above; names the views.
+        UserError: The scene or a view is refused; the message names the views.
     """
     if not raw.views:
         raise UserError(
@@ -138,7 +138,7 @@ def check_views(raw: RawScene) -> None:
 
 
 def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
-    """Leaves out points that are not finite, and says so."""
+    """Leave out points that are not finite, and note their number."""
     finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
     broken = int((~finite).sum())
     notes = [f"points: {count(broken, 'point')} left out: not finite"] if broken else []
@@ -149,7 +149,7 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
 def check_distances(
     raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
-    """Leaves out points too far from the training cameras for single precision, and says so.
+    """Leave out points too far from the training cameras for single precision, and note this.
 
     Raises:
         UserError: A camera is too far away.

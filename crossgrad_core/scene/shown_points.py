@@ -1,4 +1,4 @@
-"""How many training photos show the points of a scene."""
+"""The number of training photos that show a point of a scene."""
 
 from typing import Final
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from crossgrad_core.contract.scene import Scene, is_in_image
 
-#: Points that are looked at, spread over all.
+#: Sampled points, spread over all points.
 _POINTS: Final = 1000
 
 
 def photos_per_point(scene: Scene) -> float:
-    """In how many training photos an SfM point lies, seen or hidden: the median; 0 without any."""
+    """Return the median number of training photos that contain an SfM point; 0 without any."""
     points = scene.points[:: -(-len(scene.points) // _POINTS) or 1]
     counts = np.zeros(len(points), np.int64)
     for view in scene.train_views:

@@ -1,4 +1,4 @@
-"""Which views are trained on and which are held out."""
+"""The split of the views into training and held-out views."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -15,12 +15,12 @@ from crossgrad_core.system.input_files import read_file
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
-#: Names of training views -> regime of every view; where no folder tells, the median is theirs.
+#: Names of training views -> regime of every view; without folders, their median is the threshold.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
 _LINES: Final = {b"\n": 150}  # bytes of a name in memory
 
-#: A mean over fewer held-out views says little about a regime.
+#: A mean over fewer held-out views does not describe a regime.
 _FEWEST: Final = 2
 
 
@@ -29,10 +29,10 @@ class Split:
     """Names of the training and of the held-out views, both sorted, and how they were chosen.
 
     Attributes:
-        train: Trained on.
-        test: Held out.
+        train: Training views.
+        test: Held-out views.
         notes: How they were chosen.
-        regimes: Regime of every view, where the views were chosen by it.
+        regimes: Regime of every view, if the views were chosen by regime.
     """
 
     train: tuple[str, ...]
@@ -48,17 +48,18 @@ def split_views(
     given: tuple[frozenset[str], frozenset[str]] | None = None,
     label: Label = lambda _: {},
 ) -> Split:
-    """Splits views by the option `split`; there is always at least one training view.
+    """Split views by the option `split`; there is always at least one training view.
 
-    By itself it takes each n-th photo of each folder, or each n-th of each regime where only that
-    holds out two photos or more of one.
+    `auto` uses lists or the given split first. Otherwise it holds out each n-th photo of each
+    folder. If only a split by regime holds out two or more photos of some regime, it holds out each
+    n-th photo of each regime.
 
     Args:
         names: Names of all usable views.
-        options: Says how.
+        options: The options `split` and `test_every`.
         root: Folder with `train_list.txt` and `test_list.txt`, if any.
-        given: Training and test names that the input itself prescribes; lists come first.
-        label: Tells the regimes; by default there are none.
+        given: Training and test names that the input prescribes; lists have priority.
+        label: Returns the regimes; by default there are none.
 
     Raises:
         UserError: The lists contradict each other, match no view or leave no training view.
@@ -74,7 +75,7 @@ def split_views(
 
 
 def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label: Label) -> Split:
-    """The stratified split, or by itself `every` where the other gains no regime a second view."""
+    """Return the stratified split if the option or a regime with too few test views needs it."""
     regimes = label(names)
     stratified = _split_stratified(names, options.test_every, regimes)
     if options.split == "stratified":
@@ -89,14 +90,14 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
 
 
 def _split_every(names: Sequence[str], every: int) -> Split:
-    """Each n-th view by name of each folder."""
+    """Hold out each n-th view by name of each folder."""
     folders = {name: str(PurePosixPath(name).parent) for name in names}
     how = " of each folder" if len(set(folders.values())) > 1 else ""
     return _split_each(folders, every, how)
 
 
 def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
-    """Each n-th view by name of each regime; the regimes are those of all views."""
+    """Hold out each n-th view by name of each regime; `regimes` covers all views."""
     return replace(
         _split_each({name: regimes.get(name, "") for name in names}, every, " of each regime"),
         regimes=regimes,
@@ -104,7 +105,7 @@ def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, st
 
 
 def _split_each(groups: Mapping[str, str], every: int, how: str) -> Split:
-    """Each n-th view by name of each group; groups of a single view are taken together."""
+    """Hold out each n-th view by name of each group; groups of one view are merged."""
     members = defaultdict(list)
     for name in sorted(groups):
         members[groups[name]].append(name)
@@ -119,7 +120,7 @@ def _split_each(groups: Mapping[str, str], every: int, how: str) -> Split:
 
 
 def _held_out(split: Split, regimes: Mapping[str, str]) -> Counter[str]:
-    """Regime -> its held-out views."""
+    """Return the number of held-out views of each regime."""
     return Counter(regimes[name] for name in split.test if name in regimes)
 
 
@@ -129,7 +130,7 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # What the input itself prescribes is in no list of ours.
+    # A split prescribed by the input is in no list file.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:
@@ -169,12 +170,12 @@ def _matches_nothing(
 
 
 def has_lists(root: Path) -> bool:
-    """Whether there is a list of training or of held-out views in a scene's folder."""
+    """Return True if a scene's folder contains a list of training or of held-out views."""
     return any((root / name).is_file() for name in (TRAIN_LIST, TEST_LIST))
 
 
 def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], frozenset[str]] | None:
-    """The lists that are there; where there is only one, the other is the rest of the views."""
+    """Read the existing lists; if there is only one, all other views form the other list."""
     train, test = (_read_list(root / file, names) for file in (TRAIN_LIST, TEST_LIST))
     if train is None and test is None:
         return None
@@ -185,7 +186,7 @@ def _read_lists(root: Path, names: Sequence[str]) -> tuple[frozenset[str], froze
 
 
 def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
-    """The names in a list, if it is there; those that stand for a view as the view's name."""
+    """Read the names in a list, with view names for names that match a view; None if missing."""
     if not path.is_file():
         return None
     try:

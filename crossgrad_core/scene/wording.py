@@ -1,4 +1,4 @@
-"""How notes and errors name many things."""
+"""Wording of many names and of sizes in notes and errors."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ _SHOWN = 3
 
 
 def name_some(names: Sequence[str]) -> str:
-    """The first few of many names, and how many more there are."""
+    """Return the first few of many names, and the number of the others."""
     shown = showable(", ".join(names[:_SHOWN]).replace("\n", r"\n"))
     return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 
 
 def megapixels(pixels: int) -> str:
-    """`201.3 megapixels`."""
+    """Format a number of pixels like `201.3 megapixels`."""
     return f"{pixels / 1e6:,.1f} megapixels"

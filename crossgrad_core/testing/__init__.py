@@ -1,1 +1,1 @@
-"""Helpers for tests: contract checks for every slot, and tiny scenes."""
+"""Helpers for tests: contract checks for every slot, and small scenes."""

@@ -27,24 +27,24 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.wording import listed
 
-#: Steps at which decoding is looked at: before the first, early, the last.
+#: Steps at which decoding is checked: before the first step, early, and at the end.
 _STEPS = (0, 1, 30_000)
-#: How far parameters are moved away from their initial values at most.
+#: Largest change of parameters from their initial values.
 _STEP = 0.02
-#: Difference of two renders of Gaussians whose float32 numbers are worked out in two ways: a few
-#: of them begin or end to be drawn in a pixel at its edge, where alpha is 1/255.
+#: Largest and mean difference of two renders whose float32 values were computed in two ways. A few
+#: Gaussians then appear in or disappear from a pixel at their edge, where alpha is 1/255.
 _PIXEL, _MEAN = 0.02, 2e-4
 
 
 def created(backbone: Backbone, seed: int = 0) -> Parameters:
-    """Parameters for the sample scene, ready for the first step."""
+    """Create parameters for the sample scene, ready for the first step."""
     scene = sample_scene()
     parameters = backbone.create(scene, np.random.default_rng(seed))
     return backbone.prepare(parameters, scene, sample_phase(0))
 
 
 def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
-    """Every trained tensor is in exactly one block, per-primitive ones have a row per primitive."""
+    """Every trained tensor is in exactly one block; each per-primitive tensor has N rows."""
     backbone = make()
     blocks, parameters = backbone.blocks(), created(backbone)
     names = [block.name for block in blocks]
@@ -75,7 +75,7 @@ def the_default_densifier_is_there(make: Make[Backbone]) -> None:
 
 
 def created_from_the_scene(make: Make[Backbone]) -> None:
-    """Parameters are finite float32 leaves on the CPU, the same for the same seed."""
+    """Parameters are finite float32 leaves on the CPU, and equal for equal seeds."""
     with global_randomness_untouched():
         one, other = created(make()), created(make())
     require(primitives_of(make().blocks(), one) > 0, "create() makes no primitives")
@@ -87,7 +87,7 @@ def created_from_the_scene(make: Make[Backbone]) -> None:
 
 
 def decoding_has_the_shape(make: Make[Backbone]) -> None:
-    """Decoding gives valid Gaussians at every step, in training and out of it."""
+    """Decoding gives valid Gaussians at every step, in training and in evaluation."""
     backbone = make()
     parameters = created(backbone)
     rows = primitives_of(backbone.blocks(), parameters)
@@ -125,7 +125,7 @@ def _require_valid(gaussians: Gaussians, primitives: int) -> None:
 
 
 def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`positions` is empty or names a tensor [N, 3] that has a row for each primitive."""
+    """`positions` is empty or names a tensor [N, 3] with a row for each primitive."""
     backbone = make()
     parameters = created(backbone)
     held = [name for block in backbone.blocks() if block.per_primitive for name in block.tensors]
@@ -135,7 +135,7 @@ def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
 
 
 def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`axes` is empty or names tensors [N, 3] and [N, 4] of primitives that have positions."""
+    """`axes` is empty or names primitive tensors [N, 3] and [N, 4] of a backbone with positions."""
     backbone = make()
     parameters = created(backbone)
     held = {name for block in backbone.blocks() if block.per_primitive for name in block.tensors}
@@ -145,7 +145,7 @@ def axes_are_those_of_primitives(make: Make[Backbone]) -> None:
 
 
 def gradients_reach_every_block(make: Make[Backbone]) -> None:
-    """What is decoded over all views depends on every block that is trained."""
+    """The Gaussians decoded over all views depend on every trained block."""
     backbone = make()
     parameters = created(backbone)
     for view in sample_scene().train_views:
@@ -162,7 +162,7 @@ def gradients_reach_every_block(make: Make[Backbone]) -> None:
 
 
 def _weighted(gaussians: Gaussians) -> Tensor:
-    """A sum over everything decoded in which no two numbers count alike."""
+    """Return a sum over all decoded values in which every value has a different weight."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
     tensors = [getattr(gaussians, name) for name in names]
     given = [tensor.flatten() for tensor in tensors if tensor is not None]
@@ -172,7 +172,7 @@ def _weighted(gaussians: Gaussians) -> Tensor:
 
 
 def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
-    """Parameters that were written and read decode to the same bits, and nothing is random."""
+    """Parameters that were saved and loaded decode to the same bits, without randomness."""
     backbone = make()
     parameters = created(backbone)
     written = save({name: tensor.detach().contiguous() for name, tensor in parameters.items()})
@@ -187,11 +187,11 @@ def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
 
 
 def edits_keep_rows_together(make: Make[Backbone]) -> None:
-    """After an edit every row of every per-primitive tensor is still the same primitive's."""
+    """After an edit, every row of every per-primitive tensor still belongs to its primitive."""
     backbone = make()
     before = created(backbone)
     rows = primitives_of(backbone.blocks(), before)
-    # Drops the last two primitives, repeats the first two at the end, turns the rest around.
+    # Drops the last two primitives, repeats the first two at the end, and reverses the rest.
     source = torch.cat([torch.arange(rows - 3, -1, -1), torch.tensor([0, 1])])
     after = _edited(backbone, before, source)
     for block in backbone.blocks():
@@ -202,7 +202,7 @@ def edits_keep_rows_together(make: Make[Backbone]) -> None:
 
 
 def few_primitives_are_no_error(make: Make[Backbone]) -> None:
-    """One primitive, and none, can be prepared and decoded: density control may go so far."""
+    """One primitive and zero primitives can be prepared and decoded, as after density control."""
     backbone = make()
     parameters = created(backbone)
     for rows in (1, 0):
@@ -216,7 +216,7 @@ def _edited(backbone: Backbone, parameters: Parameters, source: Tensor) -> Param
 
 
 def parameters_stay_untouched(make: Make[Backbone]) -> None:
-    """Decoding and baking change no parameter."""
+    """Decoding and baking do not change any parameter."""
     backbone = make()
     parameters = created(backbone)
     copies = {name: tensor.detach().clone() for name, tensor in parameters.items()}
@@ -231,7 +231,7 @@ def _require_equal(parameters: Mapping[str, Tensor], copies: Mapping[str, Tensor
 
 
 def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
-    """What is written to a PLY are Gaussians with spherical harmonics, without a graph."""
+    """Baking for a PLY file gives Gaussians with spherical harmonics, without a graph."""
     backbone = make()
     baked = backbone.bake(created(backbone), sample_phase(training=False), [sample_camera()])
     require(baked.sh_dc is not None and baked.colors is None, "bake() does not give sh_dc")
@@ -242,7 +242,7 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
 
 
 def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
-    """With `plain`, the baked Gaussians give every camera the picture that decoding gives it."""
+    """With `plain`, baked Gaussians give every camera the same image as decoding."""
     backbone = make()
     if not backbone.plain:
         raise cannot_tell("it does not say that a standard PLY loses nothing (plain)")
@@ -266,9 +266,10 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
 
 
 def _grown(parameters: Parameters) -> Parameters:
-    """The parameters a little away from where they begin, so that none of them is a round number.
+    """Move the parameters away from their initial values, so that none is a round number.
 
-    All of them grow: colours stay above 0, where harmonics would be clamped and colours would not.
+    All parameters increase. So colours stay above 0, because harmonics are clamped there and
+    colours are not.
     """
     rng = np.random.default_rng(5)
 
@@ -280,7 +281,7 @@ def _grown(parameters: Parameters) -> Parameters:
 
 
 def fitting_respects_the_user(make: Make[Backbone]) -> None:
-    """`fitted_to` says what it left out and changes no option that the user set."""
+    """`fitted_to` reports the options that it changed, and keeps every option set by the user."""
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())
     told = fitted == backbone or len(notes) > 0
@@ -292,7 +293,7 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
 
 
 def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
-    """A tensor of `passthrough` reaches the Gaussians as it is; `decode` does not read it."""
+    """A tensor of `passthrough` reaches the Gaussians unchanged; `decode` does not read it."""
     backbone = make()
     parameters = created(backbone)
     for name in parameters.keys() & set(backbone.passthrough.values()):

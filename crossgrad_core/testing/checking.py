@@ -1,4 +1,4 @@
-"""Running the contract checks of a slot on an installed plugin and collecting what they find."""
+"""Runner of a slot's contract checks on an installed plugin, with their results."""
 
 import sys
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from crossgrad_core.registry.signatures import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
 from crossgrad_core.wording import in_one_line, listed, singular
 
-#: `check(make)`, see `crossgrad_core.testing.support.contract`; of any slot.
+#: `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
 AnyCheck: TypeAlias = Callable[[Any], None]
 
 
@@ -24,9 +24,9 @@ class Result:
 
     Attributes:
         check: Name of the check.
-        failure: Why it failed; None where it passed.
-        skipped: Why it does not apply; None where it does.
-        where: `file:line` of the plugin where it failed, or how its package announces it.
+        failure: Why it failed; None if it passed.
+        skipped: Why it does not apply; None if it applies.
+        where: `file:line` in the plugin of the failure, or how its package registers it.
     """
 
     check: str
@@ -36,18 +36,18 @@ class Result:
 
 
 def checks_of(slot: str) -> tuple[AnyCheck, ...]:
-    """The contract checks of a slot; imports no other slot's."""
+    """Return the contract checks of a slot; imports only this slot's checks."""
     module = import_module(f"crossgrad_core.testing.{slot}")
     checks: tuple[AnyCheck, ...] = getattr(module, f"{singular(slot).upper()}_CHECKS")
     return checks
 
 
 def check_entry(entry: registry.Entry) -> list[Result]:
-    """Loads a plugin and runs every check of its slot; stops early where it cannot be loaded."""
+    """Load a plugin and run every check of its slot; stop early if it cannot be loaded."""
     taken = _taken(entry)
     names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
     if taken and entry.slot == COMMANDS:
-        return names  # Nothing ever calls it.
+        return names  # The command can never be called.
     try:
         loaded = load_command(entry) if entry.slot == COMMANDS else registry.load_entry(entry)
     except UserError as error:
@@ -67,7 +67,7 @@ def check_entry(entry: registry.Entry) -> list[Result]:
 
 
 def _taken(entry: registry.Entry) -> str:
-    """Why users cannot choose the plugin by its name; empty where they can."""
+    """Return why users cannot choose the plugin by its name; empty if they can."""
     if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
         return f"the core has a command {entry.name}, which is called instead"
     try:
@@ -78,17 +78,17 @@ def _taken(entry: registry.Entry) -> str:
 
 
 def _announced_at(entry: registry.Entry) -> str:
-    """Where the object is that an entry point names, as far as it can be found."""
+    """Return the location of the object that an entry point names, as far as it can be found."""
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)
-    # What was named may be of another package, and its place no help.
+    # The object may belong to another package; its location would not help then.
     own = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
     return own or getattr(loaded, "__file__", None) or entry.origin
 
 
 def _failed(check: str, error: BaseException, package: str, where: str) -> Result:
-    """A failure at the innermost line of the package, or else at `where`."""
+    """Return a failure at the innermost line of the package, or else at `where`."""
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
         return Result(check, str(error) or "an assertion without a text failed", where=where)

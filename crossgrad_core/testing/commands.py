@@ -1,6 +1,7 @@
-"""Contract checks of commands, for what an entry point in `crossgrad.commands` names.
+"""Contract checks of commands, for the object that an entry point in `crossgrad.commands` names.
 
-Here a check takes the command itself, `check(my_command)`: a function cannot be made anew.
+These checks take the command itself, `check(my_command)`, because a function cannot be created
+anew.
 """
 
 import subprocess
@@ -16,7 +17,7 @@ from crossgrad_core.registry.commands import Command, as_group_member
 from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
-#: Libraries that take long to import; a command imports them when it has said that it started.
+#: Libraries with a long import time; a command imports them after it has reported its start.
 HEAVY: Final = ("matplotlib", "numba", "numpy", "pydantic", "scipy", "torch")
 _IMPORTED = """
 import sys
@@ -27,7 +28,7 @@ print(*[name for name in {heavy!r} if name in sys.modules])
 
 
 def help_has_a_first_line(command: Command) -> None:
-    """`crossgrad --help` can say what the command does."""
+    """`crossgrad --help` can describe the command."""
     text = as_group_member(command, "command").get_short_help_str()
     require(text, "the command has no help: write a docstring, or `typer.Typer(help=...)`")
 
@@ -41,10 +42,10 @@ def help_can_be_shown(command: Command) -> None:
 
 
 def importing_it_is_quick(command: Command) -> None:
-    """The module of the command imports nothing that takes long.
+    """The module of the command imports no library with a long import time.
 
-    A user sees within two seconds that a command has started; what it needs is imported
-    inside its function.
+    A user must see within two seconds that a command has started. Therefore slow imports belong
+    inside the command's function.
     """
     module = _module(command)
     program = _IMPORTED.format(path=sys.path, module=module, heavy=HEAVY)
@@ -60,7 +61,7 @@ def importing_it_is_quick(command: Command) -> None:
 
 
 def _module(command: Command) -> str:
-    """The module that defines the command."""
+    """Return the module that defines the command."""
     if not isinstance(command, typer.Typer):
         return command.__module__
     registered = [each.callback for each in (*command.registered_commands,)]

@@ -1,4 +1,4 @@
-"""Contract checks of densifiers, on a real backbone with made-up screen statistics."""
+"""Contract checks of densifiers, on a real backbone with artificial screen statistics."""
 
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -49,20 +49,20 @@ from crossgrad_core.wording import listed
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
 _EDIT = 600
 _ROOM = 10_000
-#: Of the primitives that are there, the share that one edit leaves at least.
+#: Least share of the present primitives that remains after one edit.
 _LEFT = 0.1
-#: Typical gradient by the projected mean, per pixel: the published threshold in NDC units is
-#: reached by 2e-5 in an image as small as the sample scene's.
+#: Typical gradient of the projected mean, per pixel: for images of the sample scene's size, 2e-5
+#: corresponds to the published threshold in NDC units.
 _GRADIENT = 5e-5
 
 
 @dataclass
 class DensifierRun:
-    """Calls a densifier step by step and applies its edits, as a training run does.
+    """A densifier that is called step by step and whose edits are applied, as in a training run.
 
     Attributes:
         densifier: The densifier.
-        backbone: A backbone that it can work on.
+        backbone: A backbone with the tensors that the densifier edits.
         parameters: The parameters.
         state: The densifier's state.
         rng: The generator of the hook.
@@ -76,7 +76,7 @@ class DensifierRun:
 
     @classmethod
     def of(cls, densifier: Densifier) -> "DensifierRun":
-        """A run at its start.
+        """Make a run at its start.
 
         Raises:
             SkipTest: No installed backbone has the tensors that the densifier edits.
@@ -86,11 +86,11 @@ class DensifierRun:
 
     @property
     def primitives(self) -> int:
-        """How many there are now."""
+        """The present number of primitives."""
         return primitives_of(self.backbone.blocks(), self.parameters)
 
     def context(self, step: int, room: int = _ROOM) -> DensifyContext:
-        """What the densifier is offered at a step in which two views were rendered."""
+        """Return the densifier's context for a step in which two views were rendered."""
         fields = {**step_fields(step), "rng": self.rng}
         rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
         return DensifyContext(
@@ -107,7 +107,7 @@ class DensifierRun:
         )
 
     def take_step(self, step: int, room: int = _ROOM) -> Edit:
-        """The answer of a step, applied."""
+        """Call the densifier for a step, apply its edit and return it."""
         edit, state = self.densifier.densify(self.context(step, room), self.state)
         require(isinstance(edit, Edit), f"the answer is {edit!r}, not an Edit or NO_EDIT")
         require(isinstance(state, PluginState), f"the new state is {state!r}, not a PluginState")
@@ -143,7 +143,7 @@ class DensifierRun:
 
 
 def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Screen:
-    """Statistics of which a third is invisible and most of the rest are worth densifying."""
+    """Make statistics: a third of the Gaussians is invisible, most others need densification."""
     rng = np.random.default_rng(seed)
     radii = torch.from_numpy(rng.integers(0, 3, gaussians) * 4).int()
     seen = (radii > 0).float()
@@ -160,7 +160,7 @@ def _screen(gaussians: int, needs: frozenset[str], seed: tuple[int, int]) -> Scr
 
 
 def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Tensor:
-    """Up to four pixels in each bin; their gradients' sizes add up to twice `gradient`."""
+    """Make up to four pixels in each bin; their absolute gradients sum to twice `gradient`."""
     shape = (radii.shape[0], 6, 4)
     angles = torch.from_numpy(rng.uniform(0.0, 2.0 * np.pi, shape)).float()
     there = torch.from_numpy(rng.random(shape) < 0.5).float()  # noqa: PLR2004 - every other one
@@ -172,9 +172,9 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 
 
 def _backbone_for(densifier: Densifier) -> Backbone:
-    """An installed backbone that takes this densifier by default, or has the tensors it edits."""
+    """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # Of backbones that fit equally well the first is taken: crossgrad's own.
+    # Of equally good backbones the first is used: crossgrad's own.
     known = sorted(entries("backbones").values(), key=lambda each: each.distribution != "crossgrad")
     for entry in sorted(known, key=lambda each: each.name != BACKBONE):
         try:
@@ -193,7 +193,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 
 
 def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
-    """Requires of an edit that it can be applied, and that its values are finite."""
+    """Require that an edit can be applied and that its values are finite."""
     misfit = misfit_of(edit, blocks, parameters)
     require(not misfit, f"the edit does not fit: {misfit}")
     plain = all(type(each) is int for each in edit.counts.values())
@@ -201,7 +201,7 @@ def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) 
     number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
     for name, overwrite in edit.values.items():
         values, rows = overwrite.values, overwrite.rows
-        # A run spreads what is smaller over the rows: hardly ever meant.
+        # A run would broadcast a smaller tensor over the rows, which is hardly ever intended.
         wanted = (number if rows is None else len(rows), *parameters[name].shape[1:])
         found = tuple(values.shape)
         require(found == wanted, f"edit.values of {name} has the shape {found}, expected {wanted}")
@@ -209,14 +209,14 @@ def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) 
 
 
 def its_needs_are_statistics(make: Make[Densifier]) -> None:
-    """`needs` names optional outputs that rasterizers may have; another one refuses every run."""
+    """`needs` names optional outputs that rasterizers may provide; other names refuse every run."""
     known = ("depth", "pixels", "abs_gradient", "directions", "count")
     more = sorted(make().needs.difference(known))
     require(not more, f"needs names {listed(more)}; rasterizers may provide {listed(known)}")
 
 
 def quiet_before_its_time(make: Make[Densifier]) -> None:
-    """Nothing is edited up to and including step `densify_from`."""
+    """No edit is made up to and including step `densify_from`."""
     run = DensifierRun.of(make())
     for step in (1, 100, 499, 500):
         edit = run.take_step(step)
@@ -224,7 +224,7 @@ def quiet_before_its_time(make: Make[Densifier]) -> None:
 
 
 def edits_keep_everything_aligned(make: Make[Densifier]) -> None:
-    """Edits are well formed; parameters and statistics have a row per primitive afterwards."""
+    """Edits are valid; afterwards parameters and statistics have one row per primitive."""
     run = DensifierRun.of(make())
     for step in _AROUND_EDITS:
         run.take_step(step)
@@ -237,7 +237,7 @@ def edits_keep_everything_aligned(make: Make[Densifier]) -> None:
 
 
 def never_outgrows_the_room(make: Make[Densifier]) -> None:
-    """No more primitives are added than `context.room`."""
+    """At most `context.room` primitives are added."""
     for room in (0, 1, 5):
         run = DensifierRun.of(make())
         for step in range(_EDIT - 4, _EDIT):
@@ -249,7 +249,7 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
-    """No edit removes nearly all primitives of a sound model: it could not be trained back."""
+    """No edit removes nearly all primitives of a sound model: training could not restore them."""
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):
         before = run.primitives
@@ -263,7 +263,7 @@ def most_primitives_survive(make: Make[Densifier]) -> None:
 
 
 def same_seed_same_edits(make: Make[Densifier]) -> None:
-    """The edits depend on the arguments alone, and randomness comes from `context.rng`."""
+    """The edits depend only on the arguments, and randomness comes from `context.rng`."""
     with global_randomness_untouched():
         one, other = DensifierRun.of(make()), DensifierRun.of(make())
         for step in _AROUND_EDITS:
@@ -273,7 +273,7 @@ def same_seed_same_edits(make: Make[Densifier]) -> None:
 
 
 def resumes_exactly(make: Make[Densifier]) -> None:
-    """A run that continues from a checkpoint edits what an uninterrupted run edits."""
+    """A run resumed from a checkpoint makes the same edits as an uninterrupted run."""
     whole, broken = DensifierRun.of(make()), DensifierRun.of(make())
     for step in _AROUND_EDITS:
         whole.take_step(step)
@@ -294,7 +294,7 @@ def _require_same(one: DensifierRun, other: DensifierRun, otherwise: str) -> Non
 
 
 def inputs_stay_untouched(make: Make[Densifier]) -> None:
-    """Parameters change through the answered edit only, and the old state not at all."""
+    """Parameters change only through the returned edit, and the old state never changes."""
     run = DensifierRun.of(make())
     for step in _AROUND_EDITS:
         copies: dict[str, Tensor] = {n: t.detach().clone() for n, t in run.parameters.items()}

@@ -14,19 +14,19 @@ from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
 _FRAME = Similarity(np.array([1.0, -2.0, 3.0]), 0.5)
-#: Of a few operations in float32, on numbers of about 1.
+#: Rounding error of a few float32 operations on numbers of about 1.
 _ROUNDING = 1e-5
 
 
 def has_a_suffix(make: Make[Exporter]) -> None:
-    """`suffix` is what follows the dot in the names of its files."""
+    """`suffix` is the suffix of its file names, without the dot."""
     suffix = getattr(make(), "suffix", None)
     good = isinstance(suffix, str) and suffix.isalnum() and suffix == suffix.lower()
     require(good, f"suffix is {suffix!r}; it must be lower-case letters and digits, without a dot")
 
 
 def writes_one_file(make: Make[Exporter]) -> None:
-    """The named file alone is written, the same bytes for the same Gaussians, which stay so."""
+    """Only the named file is written, with equal bytes for equal Gaussians, which do not change."""
     with TemporaryDirectory() as folder:
         first, second = (Path(folder) / name for name in ("a", "b"))
         for path in (first, second):
@@ -43,7 +43,7 @@ def writes_one_file(make: Make[Exporter]) -> None:
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
-    """A file that is there is replaced as a whole and never written over in place."""
+    """An existing file is replaced as a whole and never overwritten in place."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         make().write(_gaussians(), _FRAME, path, ())
@@ -60,7 +60,7 @@ def appears_at_once(make: Make[Exporter]) -> None:
 
 
 def writes_the_input_frame(make: Make[Exporter]) -> None:
-    """Where the local frame has another offset or scale, so have the coordinates of the file."""
+    """Another offset or scale of the local frame changes the coordinates in the file."""
     exporter, given = make(), _gaussians()
     offset = Similarity(_FRAME.offset + np.array([8.0, 16.0, -4.0]), _FRAME.scale)
     scale = Similarity(_FRAME.offset, 4.0 * _FRAME.scale)
@@ -90,7 +90,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
         found = exporter.read(path, _FRAME)
     stored = exporter.stored(_gaussians())
     require(len(found) == len(stored), f"{len(stored)} Gaussians are read as {len(found)}")
-    # What is added to positions in the input frame is lost to their last bits.
+    # The offset in the input frame costs the positions their last bits.
     size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
     for name in ("means", "scales", "opacities"):
         error = float((getattr(found, name) - getattr(stored, name)).abs().max())
@@ -102,7 +102,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
 
 
 def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
-    """`stored` gives finite Gaussians, as many as it got, and leaves its own as they are."""
+    """`stored` returns as many finite Gaussians as it got, and does not change its input."""
     given = _gaussians()
     stored = make().stored(given)
     require(isinstance(stored, Gaussians), f"stored() answers {stored!r}, not Gaussians")

@@ -11,12 +11,12 @@ from crossgrad_core.testing.fixtures import sample_scene
 from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, cannot_tell, require
 
-#: How far a second projection may move what was projected already.
+#: Largest change by a second projection.
 _ROUNDING = 1e-5
 
 
 def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
-    """`fitted_to` answers with a `Fitted`: an exposure, the name of another one, and notes."""
+    """`fitted_to` returns a `Fitted`: an exposure, the name of another exposure, and notes."""
     exposure = make()
     fitted = exposure.fitted_to(sample_scene())
     require(isinstance(fitted, Fitted), f"fitted_to() answers {fitted!r}, not a Fitted")
@@ -28,14 +28,14 @@ def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
 
 
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
-    """Each parameter starts with one finite float32 row for each training photo, and learns."""
+    """Each parameter starts with one finite float32 row per training photo, and is trained."""
     for name, each in make().per_photo(sample_scene()).items():
         _require_rows(f"the start of {name}", each.first())
         require(each.lr.initial > 0, f"the learning rate of {name} is {each.lr.initial}")
 
 
 def an_image_stays_an_image(make: Make[Exposure]) -> None:
-    """Of any size and outside [0, 1], it stays finite, of its shape and type, and untouched."""
+    """An image of any size or range stays finite, keeps its shape and type, and is not modified."""
     exposure, values = make(), _first(_starts(make()))
     for image in (_image(), _image()[:5, :9], 3.0 * _image() - 1.0, torch.zeros(4, 4, 3)):
         kept = image.clone()
@@ -47,7 +47,7 @@ def an_image_stays_an_image(make: Make[Exposure]) -> None:
 
 
 def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
-    """The image as taken is differentiable in the render and in every value."""
+    """The exposed image is differentiable in the render and in every value."""
     exposure = make()
     values = {name: row.clone().requires_grad_() for name, row in _first(_starts(exposure)).items()}
     image = _image().requires_grad_()
@@ -62,7 +62,7 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
 
 
 def projected_values_stay_projected(make: Make[Exposure]) -> None:
-    """The projection keeps names and shapes, leaves its input as it is, and is done once."""
+    """The projection keeps names and shapes, does not change its input, and is idempotent."""
     exposure = make()
     values = {name: each + _noise(each) for name, each in _starts(exposure).items()}
     if not values:
@@ -79,7 +79,7 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
 
 
 def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
-    """Held-out views get finite values of the shape that training photos have."""
+    """Held-out views get finite values of the same shape as training photos."""
     exposure, scene = make(), sample_scene()
     starts = _starts(exposure)
     for view in scene.test_views:
@@ -91,7 +91,7 @@ def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
 
 
 def same_input_same_bits(make: Make[Exposure]) -> None:
-    """The image as taken depends on the render and the values alone."""
+    """The exposed image depends only on the render and the values."""
     values = _first(_starts(make()))
     one, two = (make().apply(_image(), values) for _ in range(2))
     require(torch.equal(one, two), "two calls give different images")

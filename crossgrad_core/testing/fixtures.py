@@ -1,4 +1,4 @@
-"""Small scenes in memory, whole or as camera positions, and what hooks offer about them."""
+"""Small scenes in memory, complete or as camera positions, and contexts of hooks for them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.slots.sampler import Sampler
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
-#: Steps of the schedule that contexts carry: the published one.
+#: Length of the schedule in the contexts: the published one.
 STEPS = 30_000
 _VIEWS, _POINTS = 12, 40
 _NEAR_RADIUS, _FAR_RADIUS, _STEP = 0.4, 0.8, 0.02
@@ -27,7 +27,7 @@ _CLOUD = 0.1
 
 @dataclass(frozen=True)
 class NoisePhoto:
-    """A photo of random pixels that is the same each time.
+    """A photo of random pixels that are the same in every call.
 
     Attributes:
         seed: Seed of the pixels.
@@ -36,20 +36,20 @@ class NoisePhoto:
     seed: int
 
     def image(self) -> Tensor:
-        """[H, W, 3] uint8."""
+        """Return the pixels [H, W, 3] uint8."""
         rng = np.random.default_rng(self.seed)
         return torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
 
     def mask(self) -> Tensor | None:
-        """None: every pixel counts."""
+        """Return None: every pixel counts."""
         return None
 
 
 @cache
 def sample_scene() -> Scene:
-    """Six near and six far cameras around a small cloud; every fourth view is held out.
+    """Make six near and six far cameras around a small cloud; every fourth view is held out.
 
-    The cameras of each regime are in a folder of their own, at different distances, so that every
+    The cameras of each regime are in a separate folder and at different distances, so that every
     grouping finds its groups. The frame is a local one: extent 1.
     """
     rng = np.random.default_rng(7)
@@ -60,7 +60,7 @@ def sample_scene() -> Scene:
 
 
 def _view(index: int) -> View:
-    """View `index`: the first half far and high, the second half near and low."""
+    """Make view `index`: the first half is far and high, the second half near and low."""
     far = index < _VIEWS // 2
     angle = 2.4 * index
     radius = (_FAR_RADIUS if far else _NEAR_RADIUS) + _STEP * index
@@ -76,12 +76,12 @@ def _view(index: int) -> View:
 
 
 def sample_camera() -> Camera:
-    """The first training camera of the sample scene."""
+    """Return the first training camera of the sample scene."""
     return sample_scene().train_views[0].camera
 
 
 def sample_gaussians(number: int = 30, *, harmonics: bool = False) -> Gaussians:
-    """Gaussians of a few pixels in the sample scene, float32; all are leaves with gradients."""
+    """Make float32 Gaussians of a few pixels in the sample scene; all are leaves with gradients."""
     rng = np.random.default_rng(3)
 
     def leaf(values: NDArray[np.float64]) -> Tensor:
@@ -104,12 +104,12 @@ def sample_gaussians(number: int = 30, *, harmonics: bool = False) -> Gaussians:
 
 
 def sample_phase(step: int = STEPS, *, training: bool = True) -> Phase:
-    """A moment of a run of the published length; by default the last step."""
+    """Return a phase of a run of the published length; by default the last step."""
     return Phase(step, training, Schedule.for_run(STEPS))
 
 
 def step_fields(step: int = 1) -> dict[str, Any]:
-    """The fields that every hook's context shares."""
+    """Return the fields that the contexts of all hooks share."""
     return {
         "step": step,
         "schedule": Schedule.for_run(STEPS),
@@ -138,7 +138,7 @@ def posed_view(
     focal: float = 4.0,
     seen: Sequence[int] = (),
 ) -> View:
-    """A 4 x 4 view from `center` [3] along `forward` [3], held upright along `up` [3]."""
+    """Make a 4 x 4 view from `center` [3] along `forward` [3], upright along `up` [3]."""
     z = _unit(np.asarray(forward, dtype=np.float64))
     x = _unit(np.cross(z, np.asarray(up, dtype=np.float64)))
     rotation = np.stack([x, np.cross(z, x), z])
@@ -150,7 +150,7 @@ def posed_view(
 
 
 def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()) -> Scene:
-    """A scene of these views that trains on all but the positions in `test`."""
+    """Make a scene of these views; all but the positions in `test` are training views."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     train = tuple(i for i in range(len(views)) if i not in set(test))
     colors = np.zeros((len(cloud), 3), dtype=np.uint8)
@@ -160,15 +160,15 @@ def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[in
 
 @dataclass
 class SamplerRun:
-    """Calls a sampler step by step as a training run does.
+    """A sampler that is called step by step, as in a training run.
 
     Attributes:
         sampler: The sampler.
         scene: The scene.
         groups: Labels of the training views, or None.
-        views_per_step: K; the sampler's usual one where None.
+        views_per_step: K; None uses the sampler's default.
         steps: Length of the schedule.
-        losses: [N] what each training view's loss is said to be.
+        losses: [N] reported loss of each training view.
         rng: The generator of the hook.
         state: The sampler's state.
         step: Number of steps taken.
@@ -187,7 +187,7 @@ class SamplerRun:
     last: StepRecord | None = None
 
     def draw(self) -> ViewSample:
-        """The views of the next step."""
+        """Return the views of the next step."""
         self.step += 1
         draw, self.state = self.sampler.sample(self.context(), self.state)
         losses = self.losses or [1.0] * len(self.scene.train)
@@ -204,12 +204,12 @@ class SamplerRun:
         return draw
 
     def draws(self, count: int) -> Iterator[ViewSample]:
-        """The views of the next `count` steps."""
+        """Yield the views of the next `count` steps."""
         for _ in range(count):
             yield self.draw()
 
     def context(self) -> SampleContext:
-        """What the sampler is offered in the present step."""
+        """Return the sampler's context in the present step."""
         views = self.scene.train_views
         centers = [view.camera.center.numpy() for view in views]
         return SampleContext(

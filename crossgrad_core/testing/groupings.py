@@ -22,21 +22,21 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True)
 class SampleProbe:
-    """Gradients of which those of far views agree with each other, and those of near views.
+    """Gradients of views that agree within a regime and conflict between regimes.
 
     Attributes:
-        scene: The scene whose regimes decide.
+        scene: The scene that gives the regimes.
     """
 
     scene: Scene
 
     @property
     def blocks(self) -> tuple[str, ...]:
-        """[2]."""
+        """The two blocks of the Gramians."""
         return ("means", "f_dc")
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """[2, V, V]."""
+        """Return Gramians [2, V, V]."""
         names = [self.scene.train_views[view].regime for view in views]
         same = np.array([[one == other for other in names] for one in names])
         gramian = np.where(same, 0.9, -0.5) + 0.1 * np.eye(len(names))
@@ -44,13 +44,13 @@ class SampleProbe:
 
 
 def fitted(grouping: Grouping, scene: Scene, seed: int = 0) -> GroupingRule:
-    """What a grouping answers for a scene."""
+    """Return the rule that a grouping fits to a scene."""
     probe: GradientProbe | None = SampleProbe(scene) if grouping.needs_probe else None
     return grouping.fit(scene, np.random.default_rng(seed), probe)
 
 
 def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
-    """One label per view, each of them announced in `labels` (unless the user's input names it)."""
+    """Each view has one label, declared in `labels` (unless the user's input names it)."""
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
     require(isinstance(rule, GroupingRule), f"the answer is {rule!r}, not a GroupingRule")
@@ -62,7 +62,7 @@ def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
 
 
 def every_group_has_training_views(make: Make[Grouping]) -> None:
-    """No declared group is empty without an error, for samplers draw from all of them."""
+    """A declared group without training views raises an error: samplers draw from all groups."""
     grouping, scene = make(), sample_scene()
     found = set(fitted(grouping, scene).labels(scene.train_views))
     empty = sorted(set(grouping.labels) - found)
@@ -70,7 +70,7 @@ def every_group_has_training_views(make: Make[Grouping]) -> None:
 
 
 def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
-    """A view's label depends on the training views and itself, not on what else is labelled."""
+    """A view's label depends only on the training views and on the view itself."""
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
     together = rule.labels(scene.views)
@@ -83,7 +83,7 @@ def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
 
 
 def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
-    """What the rule splits has a name and a number for each view, whatever else is measured."""
+    """The split quantity has a name, and one number per view, independent of other views."""
     grouping, scene = make(), sample_scene()
     together = grouping.quantity(scene, scene.views)
     if together is None:
@@ -98,7 +98,7 @@ def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
 
 
 def same_seed_same_labels(make: Make[Grouping]) -> None:
-    """The labels depend on the arguments alone, and randomness comes from `rng`."""
+    """The labels depend only on the arguments, and randomness comes from `rng`."""
     scene = sample_scene()
     with global_randomness_untouched():
         one = fitted(make(), scene).labels(scene.views)

@@ -19,10 +19,10 @@ from crossgrad_core.testing.support.contract import (
 
 
 def adds_points(make: Make[Initializer]) -> None:
-    """Positions and colours, sizes above 0 and opacities between 0 and 1, one of each a point.
+    """Each point has a position, a colour, a size above 0 and an opacity between 0 and 1.
 
-    A size or an opacity may be NaN. A start that works alone is also asked about a scene without
-    points; it may find none there, and says so by an error.
+    A size or an opacity may be NaN. An initializer that works alone is also tested on a scene
+    without points; it may raise an error there if it finds no points.
     """
     start = make()
     _require_points(start.more_points(sample_scene()))
@@ -52,7 +52,7 @@ def _require_points(more: object) -> None:
 
 
 def answers_alike(make: Make[Initializer]) -> None:
-    """Asked again, also as a new object, it gives the same points and says the same."""
+    """Another call, also on a new object, gives the same points and the same messages."""
     scene = sample_scene()
     with global_randomness_untouched():
         one, other = make(), make()

@@ -8,7 +8,7 @@ from crossgrad_core.testing.support.components import COMPONENT_CHECKS
 from crossgrad_core.testing.support.contract import Check, Make, require
 
 _HEIGHT, _WIDTH = 24, 32
-#: Relative difference between two ways of one sum in float32.
+#: Relative difference between two orders of summation in float32.
 _ROUNDING = 1e-5
 
 
@@ -23,7 +23,7 @@ def is_a_finite_scalar_with_a_gradient(make: Make[Loss]) -> None:
 
 
 def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
-    """A render that is the photo has a smaller loss than one that is not."""
+    """A render equal to the photo has a smaller loss than another render."""
     loss, same = make(), _photo().float() / 255
     best = loss.loss(same, _photo(), None, None)
     other = loss.loss(_render(), _photo(), None, None)
@@ -31,7 +31,7 @@ def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
 
 
 def masked_pixels_do_not_count(make: Make[Loss]) -> None:
-    """Where the mask is False, neither render nor photo changes the loss; no gradient there."""
+    """Pixels with a False mask do not change the loss and get no gradient."""
     loss, mask = make(), _mask()
     value, gradient = _taken(loss, _render(), mask, None)
     require(not gradient[~mask].any(), "the render gets a gradient where the mask is False")
@@ -41,7 +41,7 @@ def masked_pixels_do_not_count(make: Make[Loss]) -> None:
 
 
 def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
-    """Where no pixel counts, by the mask or by its weight, the loss is 0 and so is its gradient."""
+    """If no pixel counts, by mask or by weight, the loss and its gradient are 0."""
     nothing = torch.zeros(_HEIGHT, _WIDTH)
     for mask, weights in ((nothing.bool(), None), (None, nothing)):
         value, gradient = _taken(make(), _render(), mask, weights)
@@ -51,7 +51,7 @@ def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
 
 
 def equal_weights_change_nothing(make: Make[Loss]) -> None:
-    """Pixels of one weight, whatever it is, give the loss without weights."""
+    """Equal weights of any value give the loss without weights."""
     loss = make()
     plain = loss.loss(_render(), _photo(), _mask(), None)
     for level in (1.0, 0.25):
@@ -61,7 +61,7 @@ def equal_weights_change_nothing(make: Make[Loss]) -> None:
 
 
 def weights_count(make: Make[Loss]) -> None:
-    """A pixel without weight gets less of the gradient than one with all of it."""
+    """Pixels with weight 0 get less gradient than pixels with weight 1."""
     left = torch.zeros(_HEIGHT, _WIDTH)
     left[:, : _WIDTH // 2] = 1.0
     _, gradient = _taken(make(), _render(), None, left)
@@ -70,7 +70,7 @@ def weights_count(make: Make[Loss]) -> None:
 
 
 def same_input_same_bits(make: Make[Loss]) -> None:
-    """The loss depends on its arguments alone, which stay as they are."""
+    """The loss depends only on its arguments and does not change them."""
     render, photo, mask, weights = _render(), _photo(), _mask(), _weights()
     first = make().loss(render, photo, mask, weights)
     require(torch.equal(first, make().loss(render, photo, mask, weights)), "two calls differ")
@@ -82,7 +82,7 @@ def same_input_same_bits(make: Make[Loss]) -> None:
 def _taken(
     loss: Loss, render: Tensor, mask: Tensor | None, weights: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Value and gradient by the render."""
+    """Return the loss and its gradient with respect to the render."""
     leaf = render.clone().requires_grad_()
     value = loss.loss(leaf, _photo(), mask, weights)
     (gradient,) = torch.autograd.grad(value, leaf)

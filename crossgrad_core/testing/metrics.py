@@ -16,7 +16,7 @@ from crossgrad_core.testing.support.contract import Check, Make, require
 
 
 def names_its_figure(make: Make[Metric]) -> None:
-    """`figure` has a name that can be a column, a label, and a form that formats a number."""
+    """`figure` has a valid column name, a label, and a format for numbers."""
     figure = getattr(make(), "figure", None)
     require(isinstance(figure, Figure), f"figure is {figure!r}, not a Figure")
     name, label = make().figure.name, make().figure.label
@@ -28,7 +28,7 @@ def names_its_figure(make: Make[Metric]) -> None:
 
 
 def its_columns_are_its_own(make: Make[Metric]) -> None:
-    """No column that crossgrad writes in every run has its name."""
+    """Its name differs from every column that crossgrad writes in each run."""
     metric = make()
     first = load(Metric, METRICS.split("+")[0])
     figures = () if type(metric) is first else (first.figure,)
@@ -37,20 +37,20 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
-    """Of every view there is a finite number, or None; also of a render that is the photo."""
+    """Every view gets a finite number or None, also if the render equals the photo."""
     photo = sample_scene().test_views[0].photo.image()
     for render in (_render(), photo, torch.zeros_like(photo)):
         _require_number(make().measure(_compared(render)))
 
 
 def an_empty_mask_is_no_error(make: Make[Metric]) -> None:
-    """Where no pixel counts there is None or a finite number, and no error."""
+    """If no pixel counts, the result is None or a finite number, without an error."""
     nothing = torch.zeros(_render().shape[:2], dtype=torch.bool)
     _require_number(make().measure(_compared(_render(), nothing)))
 
 
 def masked_pixels_do_not_count(make: Make[Metric]) -> None:
-    """What the render holds where the mask is False makes no difference."""
+    """The render's pixels under a False mask do not change the figure."""
     mask = torch.ones(_render().shape[:2], dtype=torch.bool)
     mask[2:6, 3:12] = False
     other = _render()
@@ -60,7 +60,7 @@ def masked_pixels_do_not_count(make: Make[Metric]) -> None:
 
 
 def same_input_same_figure(make: Make[Metric]) -> None:
-    """The figure depends on what is compared alone, which stays as it is."""
+    """The figure depends only on the compared images, and does not change them."""
     compared = _compared(_render())
     one, two = make().measure(compared), make().measure(compared)
     require(one == two, f"two looks at one render give {one} and {two}")

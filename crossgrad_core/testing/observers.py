@@ -1,4 +1,4 @@
-"""Contract checks of observers: they survive every event and leave every hook answered."""
+"""Contract checks of observers: they survive every event and every hook keeps an answer."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -78,11 +78,11 @@ from crossgrad_core.wording import in_one_line
 Hooks: TypeAlias = Any
 
 _VIEWS = (0, 4)
-#: Steps that observers are looked at in: the first ones, and more and more of a whole run.
+#: Steps of the checks: the first steps, then sparser steps up to a whole run.
 _STEPS = (*range(1, 17), 50, 100, 500, 600, 1_000, 7_000, 15_000, STEPS)
 
 
-#: Hooks that a step waits for.
+#: Hooks that run inside a training step.
 _ON_THE_CLOCK = {
     "crossgrad_sample_views",
     "crossgrad_choose_scales",
@@ -92,14 +92,14 @@ _ON_THE_CLOCK = {
     "crossgrad_densify",
     "crossgrad_after_step",
 }
-#: Calls of each, and what the fastest of them may take: a busy machine slows some, hardly all.
+#: Number of calls, and the time limit of the fastest call: a busy machine slows only some calls.
 _CALLS, _SLOW = 6, 0.1
-#: Bytes that an observer may keep of each step, and steps between two looks at the memory.
+#: Bytes that an observer may keep per step, and steps between two measurements of the memory.
 _KEPT, _BLOCK = 100_000, 4
 
 
 class _Components:
-    """Stands in for the selected components: a fixed draw, full size, the plain sum, no edit."""
+    """Replacement of the selected components: a fixed sample, full size, plain sum, no edit."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
@@ -120,11 +120,11 @@ class _Components:
 
 @contextmanager
 def _hooks(observer: Observer, seconds: dict[str, float] | None = None) -> Iterator[Hooks]:
-    """The hooks with the observer registered; what it prints is kept off the terminal.
+    """Yield the hooks with the observer registered; its output is hidden from the terminal.
 
     Args:
         observer: The observer.
-        seconds: Name of a hook -> wall time of its fastest call, to be filled; None takes no times.
+        seconds: Filled with hook name -> wall time of its fastest call; None measures no times.
     """
     manager = make_manager({"components": _Components(), "observer": observer})
     if seconds is not None:
@@ -159,7 +159,7 @@ def _step_end(hooks: Hooks, step: int, answers: list[Answer]) -> None:
 
 
 def survives_every_event(make: Make[Observer]) -> None:
-    """A whole run's events raise nothing, with a folder to write to and without one."""
+    """All events of a run raise nothing, with and without an output folder."""
     with TemporaryDirectory() as folder:
         for place in (Path(folder), None):
             observer = make()
@@ -176,7 +176,7 @@ def survives_every_event(make: Make[Observer]) -> None:
 
 
 def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
-    """Requires that the hooks of a step raise nothing; what they answer is looked at elsewhere."""
+    """Require that the hooks of a step raise nothing; other checks test their answers."""
     try:
         _step_end(hooks, step, _step_hooks(hooks, observer, step))
         hooks.crossgrad_model_ready(model=_model(step))
@@ -190,7 +190,7 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
 
 
 def the_model_stays_untouched(make: Make[Observer]) -> None:
-    """Looking at the model changes none of its tensors."""
+    """An observer does not change any tensor of the model."""
     with _hooks(make()) as hooks:
         _start(hooks, None)
         for step in _STEPS:
@@ -201,7 +201,7 @@ def the_model_stays_untouched(make: Make[Observer]) -> None:
 
 
 def _require_new(model: Model, step: int) -> None:
-    """Requires that a model is as `_model` made it."""
+    """Require that a model is unchanged since `_model` made it."""
     same = _model(step).parameters
     for name, tensor in model.parameters.items():
         equal = torch.equal(tensor.detach(), same[name].detach())
@@ -212,7 +212,7 @@ def _require_new(model: Model, step: int) -> None:
 
 
 def survives_an_early_end(make: Make[Observer]) -> None:
-    """A run that fails before its first step ends without an error of the observer's own."""
+    """If a run fails before its first step, the observer raises no error of its own."""
     for status in ("failed", "stopped"):
         with _hooks(make()) as hooks:
             _start(hooks, None)
@@ -220,7 +220,7 @@ def survives_an_early_end(make: Make[Observer]) -> None:
 
 
 def hooks_stay_answered(make: Make[Observer]) -> None:
-    """Around each hook the observer returns an answer of the right kind and shape, and finite."""
+    """Wrappers of each hook return a finite answer of the right kind and shape."""
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
@@ -257,7 +257,7 @@ def _require_gradients(step: int, aggregated: AggregateResult) -> None:
 
 
 def questions_are_answered_in_kind(make: Make[Observer]) -> None:
-    """Objections, weights, loss terms and edits can be used; parameters change by edits only."""
+    """Objections, weights, loss terms and edits are valid; only edits change parameters."""
     config = RunConfig(scene="sample", device="cpu")
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), reader="sample")
@@ -304,7 +304,7 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
-    if not isinstance(answer, kind):  # To write down what was answered takes long.
+    if not isinstance(answer, kind):  # Formatting the answer takes long, so it is not done before.
         raise ContractError(f"a hook answers {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
         require(isinstance(state, PluginState), f"the state of {name} is {state!r}, no PluginState")
@@ -312,7 +312,7 @@ def _require_answer(answer: Answer, kind: type[Answer]) -> None:
 
 
 def _model(step: int) -> Model:
-    """The model of a new run on the sample scene."""
+    """Make the model of a new run on the sample scene."""
     backbone = build(Backbone, BACKBONE, {})
     rasterizer = build(Rasterizer, REFERENCE_RASTERIZER, {})
     parameters, phase, scene = created(backbone), sample_phase(step), sample_scene()
@@ -340,10 +340,10 @@ def _step_hooks(
     step: int,
     states: Mapping[str, PluginState] = MappingProxyType({}),
 ) -> list[Answer]:
-    """The answers of the hooks of a step, as the training loop asks for them.
+    """Return the answers of the hooks of a step, called as in the training loop.
 
-    Gradients of single views are there only if the observer asks for them. The first step has no
-    record of a step before it, and its views have no labels.
+    Gradients of single views are available only if the observer needs them. The first step has no
+    record of a former step, and its views have no labels.
     """
     centers, last = sample_scene().centers, _record(step - 1) if step > 1 else None
     sample = SampleContext(
@@ -369,7 +369,7 @@ def _step_hooks(
 
 
 def states_stay_bounded(make: Make[Observer]) -> None:
-    """What wrappers keep in states does not grow with the number of steps."""
+    """The states of wrappers do not grow with the number of steps."""
     observer = make()
     with _hooks(observer) as hooks:
         _start(hooks, None)
@@ -377,7 +377,7 @@ def states_stay_bounded(make: Make[Observer]) -> None:
 
 
 def _states(hooks: Hooks, observer: Observer) -> Iterator[Mapping[str, PluginState]]:
-    """All states after each step of a run without an end."""
+    """Yield all states after each step of an endless run."""
     states: Mapping[str, PluginState] = {}
     for step in count(1):
         for answer in _step_hooks(hooks, observer, step, states):
@@ -390,7 +390,7 @@ def _size(states: Mapping[str, PluginState]) -> int:
 
 
 def nothing_piles_up(make: Make[Observer]) -> None:
-    """The memory that an observer keeps for itself does not grow by much with each step."""
+    """The observer's own memory grows only little per step."""
     observer, model = make(), _model(1)
     summed = not observer.needs_separate_gradients
     gradients = aggregate_context(sample_gradients(len(_VIEWS)), summed=summed)
@@ -403,7 +403,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # What it keeps once, such as a buffer, comes in the first steps.
+    # Memory that it allocates once, such as a buffer, is allocated in the first steps.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(
         grown <= _KEPT,
@@ -414,7 +414,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
 
 
 def steps_are_not_held_up(make: Make[Observer]) -> None:
-    """No hook that is called in every step takes long, at the fastest of several calls."""
+    """No hook that is called in every step is slow, measured by the fastest of several calls."""
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     seconds: dict[str, float] = {}
     with _hooks(observer, seconds) as hooks:

@@ -1,7 +1,7 @@
 """Contract checks of operators.
 
-The Gramians of the checks come from gradients that training does produce: zero, repeated, opposite,
-of very different length, very long and very short, and fewer dimensions than views.
+The Gramians of the checks come from gradients that occur in training: zero, repeated, opposite, of
+very different length, very long and very short, and with fewer dimensions than views.
 """
 
 from collections.abc import Iterator
@@ -31,21 +31,21 @@ Array = NDArray[np.float64]
 
 _SIZE = 8
 _KINDS: tuple[BlockKind, ...] = ("geometry", "appearance", "neutral")
-#: Steps that state is followed for.
+#: Number of steps for which the state is checked.
 _STEPS = 4
 #: A power of two, so that scaled gradients have exactly scaled Gramians.
 _SCALE = 64.0
 _TOLERANCE = 1e-6
-#: Relative difference of two solutions of one problem, as solvers that iterate find them.
+#: Relative difference of two solutions of one problem by iterative solvers.
 _SOLVED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class OperatorCase:
-    """Gradients of K views, one block per family, and what an operator is told about them.
+    """Gradients of K views, one block per family, and the context of the operator.
 
     Attributes:
-        families: [B] what is special about each block's gradients.
+        families: [B] special property of each block's gradients.
         gramians: [B, K, K].
         context: The context.
     """
@@ -56,7 +56,7 @@ class OperatorCase:
 
 
 def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase:
-    """All families of gradients of K = `views` views, times `scale`, drawn anew for each step."""
+    """Make all families of gradients of `views` views, times `scale`, with a new draw per step."""
     rng = np.random.default_rng(step)
     families = dict(_families(rng.normal(size=(views, _SIZE))))
     gradients = scale * np.stack(list(families.values()))
@@ -75,7 +75,7 @@ def operator_case(views: int, step: int = 1, scale: float = 1.0) -> OperatorCase
 
 
 def _families(draw: Array) -> Iterator[tuple[str, Array]]:
-    """Name -> gradients [K, _SIZE] from one draw of normal ones."""
+    """Yield name and gradients [K, _SIZE], made from one normally distributed draw."""
     views = len(draw)
     ramp = np.arange(views)[:, None]
     yield "usual", draw
@@ -94,13 +94,13 @@ def _families(draw: Array) -> Iterator[tuple[str, Array]]:
 def transformed(
     operator: MatrixOperator, case: OperatorCase, state: PluginState = EMPTY_STATE, seed: int = 0
 ) -> tuple[Array, PluginState]:
-    """What the operator answers to a case."""
+    """Return the operator's answer to a case."""
     rng = np.random.default_rng(seed)
     return operator.transform(case.gramians, case.context, state, rng)
 
 
 def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
-    """The operator, where it has a matrix.
+    """Return the operator if it computes a matrix.
 
     Raises:
         SkipTest: It needs the gradients themselves.
@@ -112,7 +112,7 @@ def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
 
 
 def matrices_have_the_shape(make: Make[Operator]) -> None:
-    """`transform` answers [B, R, K] float64 for every number of views that it admits."""
+    """`transform` returns [B, R, K] float64 for every admitted number of views."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -126,7 +126,7 @@ def matrices_have_the_shape(make: Make[Operator]) -> None:
 
 
 def matrices_are_finite(make: Make[Operator]) -> None:
-    """No finite gradients give a NaN or an infinity."""
+    """Finite gradients never give NaN or infinity."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -139,7 +139,7 @@ def matrices_are_finite(make: Make[Operator]) -> None:
 
 
 def one_block_is_enough(make: Make[Operator]) -> None:
-    """Each block is treated by itself: alone it gets the matrix that it gets among others."""
+    """Each block is processed separately: other blocks do not change its matrix."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -168,7 +168,7 @@ def _only(case: OperatorCase, block: int) -> OperatorCase:
 
 
 def inputs_stay_untouched(make: Make[Operator]) -> None:
-    """`transform` changes neither the Gramians nor what the context holds nor the old state."""
+    """`transform` does not change the Gramians, the context or the old state."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         _, state = transformed(operator, operator_case(views))
@@ -183,7 +183,7 @@ def inputs_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_answer(make: Make[Operator]) -> None:
-    """The answer depends on the arguments alone, and randomness comes from `rng`."""
+    """The answer depends only on the arguments, and randomness comes from `rng`."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         with global_randomness_untouched():
@@ -194,7 +194,7 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
 
 
 def state_survives_a_checkpoint(make: Make[Operator]) -> None:
-    """After each step the state can be written, read and continued from, bit for bit."""
+    """After each step the state can be saved, loaded and continued, bit for bit."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         state, copy = PluginState(), PluginState()
@@ -224,7 +224,7 @@ def one_view_keeps_its_direction(make: Make[Operator]) -> None:
 
 
 def scales_with_the_gradients(make: Make[Operator]) -> None:
-    """Gradients times c > 0 give the answer times c, so no threshold hides an absolute length."""
+    """Gradients times c > 0 scale the answer by c, so no threshold depends on absolute length."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case, scaled = operator_case(views), operator_case(views, scale=_SCALE)
@@ -232,7 +232,7 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
         again = transformed(operator, scaled)[0].sum(axis=1)
         lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
         for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
-            # Measured against the longest summand: that is what rounding is relative to.
+            # The error is relative to the longest summand, because rounding is.
             error = np.abs((one - other) * length).max()
             size = np.abs(one * length).max()
             require(
@@ -244,10 +244,10 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 
 
 def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
-    """The place of a view in the step means nothing: views that differ in nothing else count alike.
+    """The order of views in a step has no effect: equal views get equal weights.
 
-    Such views have gradients of one length at one angle. With more than two views only a right
-    angle is tried, because methods may go through pairs that conflict in turn.
+    Such views have gradients of equal length with equal angles. With more than two views only a
+    right angle is tested, because methods may process conflicting pairs one after another.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
@@ -270,7 +270,7 @@ def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
 
 
 def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
-    """The case with Gramians of one block, and nothing else that tells the views apart."""
+    """Return the case with Gramians of one block; the views do not differ in anything else."""
     number = gramians.shape[1]
     context = replace(
         case.context,
@@ -283,7 +283,7 @@ def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
 
 
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
-    """`reads_labels` and `reads_gramians` are right: other labels or Gramians change nothing else.
+    """`reads_labels` and `reads_gramians` are right: inputs that are not read have no effect.
 
     A run refuses a grouping that is not read, and a granularity of Gramians that are not read.
     """

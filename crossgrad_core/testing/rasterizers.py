@@ -19,7 +19,7 @@ _ROUNDING = 1e-4
 def _drawn(
     rasterizer: Rasterizer, gaussians: Gaussians, level: float = 0.0, *, backward: bool = False
 ) -> Render:
-    """A render with all optional outputs over a grey background, and its backward pass."""
+    """Render with all optional outputs over a grey background, and run the backward pass."""
     background = torch.full((3,), level, device=gaussians.means.device)
     render = rasterizer.render(gaussians, sample_camera(), background, rasterizer.provides)
     if backward:
@@ -28,7 +28,7 @@ def _drawn(
 
 
 def _loss(render: Render) -> Tensor:
-    """A weighted sum of the image in which no two pixels count alike."""
+    """Return a weighted sum of the image in which every pixel has a different weight."""
     weights = torch.linspace(0.5, 1.5, render.image.numel()).reshape(render.image.shape)
     return (render.image * weights.to(render.image)).sum()
 
@@ -43,7 +43,7 @@ def _shape(name: str, tensor: Tensor | None, *expected: int) -> None:
 
 
 def renders_have_the_shape(make: Make[Rasterizer]) -> None:
-    """Image [H, W, 3], alpha [H, W], radii [N] int32, and each optional output that it provides."""
+    """Image [H, W, 3], alpha [H, W], radii [N] int32 and provided outputs have their shapes."""
     rasterizer = make()
     gaussians = moved(sample_gaussians(), device_of(rasterizer))
     render = _drawn(rasterizer, gaussians)
@@ -70,7 +70,7 @@ def the_background_shows_through(make: Make[Rasterizer]) -> None:
 
 
 def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
-    """No Gaussians, or none in front of the camera, give the background and radius 0."""
+    """Without Gaussians in front of the camera, the image is the background and radii are 0."""
     rasterizer = make()
     device = device_of(rasterizer)
     some = moved(sample_gaussians(), device)
@@ -151,7 +151,7 @@ def _directions_are_of_pixels(screen: Screen) -> None:
 
 
 def same_input_same_bits(make: Make[Rasterizer]) -> None:
-    """Two renders and their gradients are equal to the last bit, and inputs stay as they were."""
+    """Two renders and their gradients are equal to the last bit, and inputs do not change."""
     if not make().deterministic:
         raise cannot_tell("it says that its bits differ from run to run")
     results = []
@@ -172,7 +172,7 @@ def same_input_same_bits(make: Make[Rasterizer]) -> None:
 
 
 def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
-    """A dilation that Gaussians bring replaces its own, as where only some pixels are drawn."""
+    """A dilation of the Gaussians replaces the rasterizer's own dilation."""
     rasterizer = make()
     try:
         wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
@@ -188,7 +188,7 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
-    """With `sparse_rows`, rows that are drawn are asked for and have the gradients, to the bit."""
+    """With `sparse_rows`, only drawn rows are requested; gradients are sparse and bit-equal."""
     rasterizer = make()
     if not rasterizer.sparse_rows:
         return
@@ -222,7 +222,7 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
 
 
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
-    """`--rasterizer auto` never takes it for a device on which it does not run."""
+    """`--rasterizer auto` never selects it for a device that it does not support."""
     rasterizer = make()
     for device in ("cpu", "cuda"):
         speed = rasterizer.speed(device)

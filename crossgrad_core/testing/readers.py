@@ -1,4 +1,4 @@
-"""Contract checks of readers: what every reader does with folders that it cannot read."""
+"""Contract checks of readers: behaviour for folders that are not scenes."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,7 @@ from crossgrad_core.testing.support.contract import Check, ContractError, Make, 
 
 
 def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
-    """`accepts` says no to a folder that is empty, missing, or a file; it never raises."""
+    """`accepts` returns False for an empty or missing folder and for a file; it never raises."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "notes.txt"
         for path, what in ((Path(folder), "an empty"), (Path(folder) / "gone", "a missing")):
@@ -21,7 +21,7 @@ def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
 
 
 def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
-    """Reading a folder that is no scene ends in a UserError that says what is missing."""
+    """Reading a folder that is not a scene raises a UserError that names the missing file."""
     with TemporaryDirectory() as folder:
         for path in (Path(folder), Path(folder) / "gone"):
             try:

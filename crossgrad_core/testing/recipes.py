@@ -17,7 +17,7 @@ from crossgrad_core.wording import listed
 
 
 def decides_every_setting(make: Make[Recipe]) -> None:
-    """There is one row for each setting that has no default, in short runs and in long ones."""
+    """Each setting without a default has exactly one row, in short and in long runs."""
     for steps in (30, 3_000, 60_000):
         names = [row.setting for row in make().decide(_facts(steps))]
         missing = [name for name in DECIDED if name not in names]
@@ -27,7 +27,7 @@ def decides_every_setting(make: Make[Recipe]) -> None:
 
 
 def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
-    """Each row says why, and all texts of it have one line."""
+    """Each row gives a reason, and all of its texts fit in one line."""
     for row in make().decide(_facts(3_000)):
         require(isinstance(row, Decision), f"a row is {type(row).__name__}, not a Decision")
         require(row.because, f"the row of {row.setting} says no reason")
@@ -36,7 +36,7 @@ def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
 
 
 def names_settings_that_exist(make: Make[Recipe]) -> None:
-    """Each row is about a setting of a run, or about an option of a component."""
+    """Each row names a setting of a run or an option of a component."""
     settings = [*(row.setting for row in make().decide(_facts(3_000))), *make().settings]
     names = {setting.partition(".")[0] for setting in settings}
     unknown = sorted(names - RunConfig.model_fields.keys())

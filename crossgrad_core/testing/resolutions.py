@@ -21,14 +21,14 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.testing.support.growth import require_bounded, size_of
 
-#: Steps that are looked at, spread over a run of the published length.
+#: Steps of the checks, spread over a run of the published length.
 _STEPS = tuple(range(1, STEPS + 1, STEPS // 40))
 _BREAK = 20
 
 
 @dataclass
 class _Run:
-    """Asks a resolution step by step, as a training run does."""
+    """A resolution that is called step by step, as in a training run."""
 
     resolution: Resolution
     state: PluginState = field(default_factory=PluginState)
@@ -51,7 +51,7 @@ def _draw(step: int) -> ViewSample:
 
 
 def every_view_has_a_scale(make: Make[Resolution]) -> None:
-    """For each drawn view, however many there are, there is a number above 0 and at most 1."""
+    """Each sampled view gets a number above 0 and at most 1, for any number of views."""
     run = _Run(make())
     for step in _STEPS:
         scales = run.take_step(step)
@@ -63,7 +63,7 @@ def every_view_has_a_scale(make: Make[Resolution]) -> None:
 
 
 def same_seed_same_scales(make: Make[Resolution]) -> None:
-    """The scales depend on the arguments alone, and randomness comes from `context.rng`."""
+    """The scales depend only on the arguments, and randomness comes from `context.rng`."""
     with global_randomness_untouched():
         one, other = (
             [run.take_step(step) for step in _STEPS] for run in (_Run(make()), _Run(make()))
@@ -72,7 +72,7 @@ def same_seed_same_scales(make: Make[Resolution]) -> None:
 
 
 def resumes_exactly(make: Make[Resolution]) -> None:
-    """A run that continues from a checkpoint has the scales of an uninterrupted run."""
+    """A run resumed from a checkpoint has the same scales as an uninterrupted run."""
     whole, broken = _Run(make()), _Run(make())
     for number, step in enumerate(_STEPS):
         if number == _BREAK:
@@ -86,7 +86,7 @@ def resumes_exactly(make: Make[Resolution]) -> None:
 
 
 def old_states_stay_untouched(make: Make[Resolution]) -> None:
-    """`scales` returns a new state and leaves the old one as it was."""
+    """`scales` returns a new state and does not change the old state."""
     run = _Run(make())
     for step in _STEPS:
         old = run.state
@@ -104,7 +104,7 @@ def states_stay_bounded(make: Make[Resolution]) -> None:
 
 
 def pixels_add_up(make: Make[Resolution]) -> None:
-    """Steps of one view render some pixels, and no more than the view has in full size."""
+    """A step of one view renders more than 0 pixels and at most the view's full size."""
     resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
     for before, after in pairwise((0, *_STEPS)):
         pixels = resolution.pixels(schedule, after) - resolution.pixels(schedule, before)

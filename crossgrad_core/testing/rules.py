@@ -29,12 +29,12 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import final_edits
 
-#: Steps of a run, and the step after which it is stopped. Averages and tails are at work by then.
+#: Steps of a run, and the step after which it stops. Averages and tails are active by then.
 _STEPS, _STOP = 8, 6
 
 
 def trains_soundly(make: Make[Rule]) -> None:
-    """A run with it trains finite parameters, and the same ones again."""
+    """A run with the rule trains finite parameters, and a second run gives the same parameters."""
     setup = _setup(make)
     with on_one_thread(), global_randomness_untouched():
         run = train(setup, _STEPS)
@@ -43,7 +43,7 @@ def trains_soundly(make: Make[Rule]) -> None:
 
 
 def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
-    """A run that is stopped and resumed ends with the bits of a run that is not."""
+    """A stopped and resumed run ends with the same bits as an uninterrupted run."""
     setup = _setup(make)
     with on_one_thread():
         state = first_state(setup)
@@ -60,7 +60,7 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
 
 
 def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
-    """The reason why it would change nothing is a text, empty if there is none."""
+    """The reason why the rule would have no effect is a text, empty if it has an effect."""
     setup = _setup(make)
     reason = make().unused(setup.backbone, setup.scene)
     require(isinstance(reason, str), f"unused() answers {reason!r}, not a text")

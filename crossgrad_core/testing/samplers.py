@@ -23,10 +23,10 @@ from crossgrad_core.testing.support.contract import (
 )
 from crossgrad_core.testing.support.growth import require_bounded, size_of
 
-#: Steps after which a run is interrupted, and steps that follow.
+#: Steps before a run is interrupted, and steps after it.
 _BEFORE, _AFTER = 7, 12
-#: Steps within which every training view must come: for uniform draws of one view of nine the
-#: probability of missing one is 9 (8/9)^400 < 1e-19.
+#: Number of steps within which every training view must be drawn. For uniform draws of one view of
+#: nine, the probability of missing one is 9 (8/9)^400 < 1e-19.
 _PATIENCE = 400
 
 
@@ -38,7 +38,7 @@ def _groups(grouping: str) -> tuple[str, ...]:
 
 
 def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
-    """A run of the sampler on the sample scene, with the groups that it needs."""
+    """Make a run of the sampler on the sample scene, with the groups that it needs."""
     needed = sampler.default_grouping
     losses = np.random.default_rng(1).uniform(0.05, 0.3, len(sample_scene().train)).tolist()
     groups = None if needed is None else _groups(needed)
@@ -46,7 +46,7 @@ def sampler_run(sampler: Sampler, views: int | None = None) -> SamplerRun:
 
 
 def default_views_are_admitted(make: Make[Sampler]) -> None:
-    """K where the user names none is one that the sampler has a meaning for."""
+    """The sampler's default K is one that it supports."""
     sampler = make()
     require(
         sampler.view_counts.admits(sampler.resolved_views),
@@ -55,12 +55,12 @@ def default_views_are_admitted(make: Make[Sampler]) -> None:
 
 
 def draws_are_training_views(make: Make[Sampler]) -> None:
-    """Every draw holds K positions of training views, and K labels where it holds labels."""
+    """Every sample contains K positions of training views, and K labels if it has labels."""
     sampler = make()
     for views in admitted(sampler.view_counts):
         run = sampler_run(sampler, views)
         for _ in range(_AFTER):
-            # Looked at before the run takes it, which needs a good one.
+            # This check comes before the run, because the run requires a valid sample.
             draw, _ = sampler.sample(run.context(), run.state)
             _require_good(draw, sampler.counts(views), len(run.scene.train))
             run.draw()
@@ -85,7 +85,7 @@ def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> N
 
 
 def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
-    """Where the training views have groups, every draw has labels: operators may need them."""
+    """If the training views have groups, every sample has labels: operators may need them."""
     sampler = make()
     if sampler.default_grouping is not None or sampler.own_labels:
         raise cannot_tell("it has groups of its own choice")
@@ -101,7 +101,7 @@ def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
 
 
 def every_view_comes(make: Make[Sampler]) -> None:
-    """Each training view is drawn sooner or later."""
+    """Each training view is drawn within a limited number of steps."""
     sampler = make()
     run = sampler_run(sampler)
     missing = set(range(len(run.scene.train)))
@@ -113,7 +113,7 @@ def every_view_comes(make: Make[Sampler]) -> None:
 
 
 def same_seed_same_draws(make: Make[Sampler]) -> None:
-    """The draws depend on the arguments alone, and randomness comes from `context.rng`."""
+    """The samples depend only on the arguments, and randomness comes from `context.rng`."""
     with global_randomness_untouched():
         one = list(sampler_run(make()).draws(_AFTER))
         other = list(sampler_run(make()).draws(_AFTER))
@@ -121,7 +121,7 @@ def same_seed_same_draws(make: Make[Sampler]) -> None:
 
 
 def resumes_exactly(make: Make[Sampler]) -> None:
-    """A run that continues from a checkpoint draws what an uninterrupted run draws."""
+    """A run resumed from a checkpoint draws the same views as an uninterrupted run."""
     whole, broken = sampler_run(make()), sampler_run(make())
     for _ in range(_BEFORE):
         whole.draw()
@@ -137,7 +137,7 @@ def resumes_exactly(make: Make[Sampler]) -> None:
 
 
 def old_states_stay_untouched(make: Make[Sampler]) -> None:
-    """`sample` returns a new state and leaves the old one as it was."""
+    """`sample` returns a new state and does not change the old state."""
     run = sampler_run(make())
     for _ in range(_BEFORE):
         old = run.state

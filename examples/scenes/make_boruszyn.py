@@ -1,10 +1,10 @@
-"""Makes the bundled scene `boruszyn` from the 800 px COLMAP scene `boruszyn_kap`.
+"""Make the bundled scene `boruszyn` from the 800 px COLMAP scene `boruszyn_kap`.
 
     python make_boruszyn.py SOURCE TARGET
 
-Photos are resized to 400 px, the camera with them; every SfM point is kept. To keep the scene
-small, each track keeps every eighth of its observations, and at least one: they tell which view saw
-which part of the scene, and training starts from the points alone.
+Photos and camera are resized to 400 px; every SfM point is kept. To keep the scene small, each
+track keeps every eighth observation, and at least one. Observations show which view saw which part
+of the scene; training starts from the points alone.
 """
 
 import sys
@@ -36,23 +36,23 @@ without EXIF; every eighth observation of each track kept, and at least one. All
 
 
 def scale_camera(camera: pycolmap.Camera) -> None:
-    """Scales a camera to the size of the bundled photos."""
+    """Scale a camera to the size of the bundled photos."""
     scale = LONG_SIDE / max(camera.width, camera.height)
     camera.rescale(round(camera.width * scale), round(camera.height * scale))
 
 
 def thin_tracks(source: pycolmap.Reconstruction) -> dict[int, list[tuple[int, int]]]:
-    """Point id -> (image id, observation) pairs that are kept."""
+    """Return point id -> (image id, observation) pairs that are kept."""
     kept = {}
     for point_id, point in sorted(source.points3D.items()):
         elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
-        # Starting at another place in each track keeps the share of every photo alike.
+        # A different start in each track keeps the same share for every photo.
         kept[point_id] = elements[point_id % min(len(elements), KEPT_SHARE) :: KEPT_SHARE]
     return kept
 
 
 def make_model(source: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The scaled model with thinned tracks."""
+    """Return the scaled model with thinned tracks."""
     target = pycolmap.Reconstruction()
     old_width = {camera_id: camera.width for camera_id, camera in source.cameras.items()}
     for camera in source.cameras.values():
@@ -82,7 +82,7 @@ def make_model(source: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 
 
 def main(source: Path, target: Path) -> None:
-    """Writes the bundled scene."""
+    """Write the bundled scene."""
     model = make_model(pycolmap.Reconstruction(source / "sparse" / "0"))
     (target / "images").mkdir(parents=True, exist_ok=True)
     (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def main(source: Path, target: Path) -> None:
         path = target / "images" / image.name
         Image.fromarray(photo).save(path, quality=QUALITY, optimize=True, progressive=True)
     model.write_binary(target / "sparse" / "0")
-    # Rigs and frames of single cameras say nothing that cameras and images do not.
+    # Rigs and frames of single cameras add no information to cameras and images.
     for name in ("rigs.bin", "frames.bin"):
         (target / "sparse" / "0" / name).unlink(missing_ok=True)
     (target / "README.txt").write_text(README, encoding="utf-8")

@@ -1,1 +1,1 @@
-"""Anchors that carry neural Gaussians: what the backbones of the Scaffold-GS family share."""
+"""Anchors with neural Gaussians: the common parts of the Scaffold-GS backbones."""

@@ -1,4 +1,4 @@
-"""Neural Gaussians as plain ones: what the cameras that see an anchor see of it, on average."""
+"""Conversion of neural Gaussians to plain ones: the mean over the cameras that see an anchor."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from crossgrad_core.plugin import Camera, Gaussians
 
 #: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).
 _SH_C1 = sqrt(3.0 / (4.0 * pi))
-#: Weight of the squared coefficients of band 1, as a share of what directions all around would
-#: give them. From one direction, or the same one again, band 1 then stays 0.
+#: Regularisation of the coefficients of band 1, as a share of the weight that directions from all
+#: sides would give them. If all directions are equal, band 1 then stays 0.
 RIDGE = 0.01
 _BASIS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ColorFit:
-    """Normal equations of the fit for P anchors of k slots.
+    """Normal equations of the colour fit for P anchors with k slots each.
 
     Attributes:
         products: [P, k, 4, 4] weighted sums of basis times basis.
@@ -35,15 +35,15 @@ class ColorFit:
 
     @classmethod
     def zeros(cls, like: Tensor) -> "ColorFit":
-        """For tensors [P, k, ...]."""
+        """Make zero sums for tensors [P, k, ...]."""
         shape = (*like.shape[:2], _BASIS)
         return cls(like.new_zeros(*shape, _BASIS), like.new_zeros(*shape, 3))
 
     def add(self, rows: Tensor, weights: Tensor, directions: Tensor, colors: Tensor) -> None:
-        """Adds the colours of anchors `rows` [A] as seen along the given directions.
+        """Add the colours of anchors `rows` [A], seen along the given directions.
 
         Args:
-            rows: [A] int64, each once.
+            rows: [A] int64, without duplicates.
             weights: [A, k].
             directions: [A, k, 3] unit vectors from the camera.
             colors: [A, k, 3] RGB.
@@ -56,7 +56,7 @@ class ColorFit:
         self.colors[rows] += weighted * (colors[..., None, :] - 0.5)
 
     def solved(self, anchor: Tensor, slot: Tensor) -> Tensor:
-        """[G, 4, 3] coefficients of the given slots, whose weights must not all be 0."""
+        """Solve for coefficients [G, 4, 3] of the given slots; their weights must not all be 0."""
         products = self.products[anchor, slot]
         total = products[:, 0, 0] / SH_C0**2
         ridge = torch.diag(products.new_tensor([0.0, 1.0, 1.0, 1.0]))
@@ -65,22 +65,22 @@ class ColorFit:
         return solution
 
 
-#: The average is taken over at most so many cameras.
+#: The mean is taken over at most this many cameras.
 BAKED_CAMERAS = 32
 
 
 def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """At most `most` of the cameras, evenly spread over their order."""
+    """Return at most `most` of the cameras, evenly spaced in their order."""
     count = min(len(cameras), most)
     return [cameras[i * len(cameras) // count] for i in range(count)]
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """How A anchors of k slots look to a camera.
+    """The appearance of A anchors with k slots each in one camera.
 
     Attributes:
-        opacities: [A, k], 0 where nothing is drawn.
+        opacities: [A, k], 0 if nothing is drawn.
         covariances: [A, k, 7] scales and unit quaternion.
         colors: [A, k, 3] RGB.
         directions: [A, k, 3] unit vectors from the camera to the Gaussians' centres.
@@ -97,10 +97,10 @@ class _Sums:
     """Sums over cameras, for all P anchors and k slots.
 
     Attributes:
-        cameras: [P, 1] cameras that counted.
+        cameras: [P, 1] number of cameras that were added.
         opacities: [P, k].
-        covariances: [P, k, 7], weighted with the opacities.
-        colors: Colours by direction, weighted likewise.
+        covariances: [P, k, 7], weighted by the opacities.
+        colors: Colours by direction, weighted by the opacities.
     """
 
     cameras: Tensor
@@ -110,7 +110,7 @@ class _Sums:
 
     @classmethod
     def zeros(cls, offsets: Tensor) -> "_Sums":
-        """For offsets [P, k, 3]."""
+        """Make zero sums for offsets [P, k, 3]."""
         shape = offsets.shape[:2]
         return cls(
             offsets.new_zeros(shape[0], 1),
@@ -120,7 +120,7 @@ class _Sums:
         )
 
     def add(self, rows: Tensor, look: Look) -> None:
-        """Adds what one camera sees of anchors `rows`."""
+        """Add the appearance of anchors `rows` in one camera."""
         sums = self.covariances[rows]
         # A quaternion and its negative are the same rotation.
         along = (sums[..., 3:] * look.covariances[..., 3:]).sum(-1, keepdim=True)
@@ -138,20 +138,20 @@ def baked(
     views: Sequence[tuple[Camera, Seen]],
     code: Tensor | None = None,
 ) -> Gaussians:
-    """Plain Gaussians, for every anchor the mean over the cameras that see it.
+    """Convert anchors to plain Gaussians: for each anchor the mean over the cameras that see it.
 
-    Opacities are averaged with 0 for cameras that do not draw a Gaussian; scales and rotations are
-    averaged with the opacities as weights, and so are colours, up to the first band of spherical
-    harmonics. An anchor that no camera sees is taken as all of them would see it.
+    Opacities are averaged with 0 for cameras that do not draw a Gaussian. Scales, rotations and
+    colours are averaged with the opacities as weights; colours use spherical harmonics up to band
+    1. An anchor that no camera sees is averaged over all cameras.
 
     Args:
         heads: The networks.
         parameters: As for `decoded`.
-        views: Cameras, and what each sees.
+        views: Cameras and the anchors that each camera sees.
         code: [C] appearance code, or None.
 
     Returns:
-        Gaussians of degree 1 that are drawn somewhere, anchor by anchor.
+        Gaussians of degree 1 with a mean opacity above the alpha threshold, anchor by anchor.
     """
     sums = _Sums.zeros(parameters["offsets"])
     for camera, seen in views:

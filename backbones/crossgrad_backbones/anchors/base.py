@@ -34,21 +34,21 @@ from crossgrad_core.plugin import (
 NEAR, DILATION = 1e-3, 0.3
 #: Standard deviations at which an opaque Gaussian falls below the alpha threshold.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
-#: Where the centre of the first pixel is, from the image's border.
+#: Distance of the first pixel's centre from the image border.
 _HALF_PIXEL = 0.5
 
 
 @torch.no_grad()
 def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
-    """[P] bool, anchors whose own Gaussian would reach the image.
+    """Return a mask [P] of the anchors whose own Gaussian would reach the image.
 
-    The anchor counts as an opaque, unrotated Gaussian with the scales that stretch its offsets,
-    projected by the rules of the rasterizers: it passes where the box around its footprint
-    (alpha >= 1/255) holds a pixel centre.
+    The anchor counts as an opaque, unrotated Gaussian with the scales that stretch its offsets. It
+    is projected with the rasterizers' formulas. It passes if the bounding box of its footprint
+    (alpha >= 1/255) contains a pixel centre.
 
     Args:
         positions: [P, 3] local units.
-        log_scales: [P, 3] or more columns, of which the first three are taken.
+        log_scales: [P, 3] or more columns; the first three are used.
         camera: The camera.
 
     Source: Scaffold-GS, section 3.2 (view-frustum filtering).
@@ -60,7 +60,7 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 
 def _axes(camera: Camera) -> list[tuple[float, ...]]:
-    """For x and y: focal length, centre, clamp of the Jacobian's slope, first and last place."""
+    """Return for x and y: focal length, centre, clamp of the slope, first and last position."""
     sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     axes: list[tuple[float, ...]] = []
     for focal, center, size in sizes:
@@ -79,7 +79,7 @@ def _plain(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
         flat, pose, _axes(camera), strict=False
     ):
         slope = along / depth
-        # The row of the Jacobian in the world's axes, times depth / focal.
+        # The row of the Jacobian in world axes, times depth / focal.
         row = axis[:3] - slope.clamp(least, most)[:, None] * pose[2, :3]
         variance = (row.square() * squares).sum(1) * (focal / depth).square() + DILATION
         extent = REACH * variance.sqrt()
@@ -108,7 +108,7 @@ def _fused(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 
 def mean_volume(gaussians: Gaussians) -> Tensor:
-    """Mean over the Gaussians of the product of their three scales; 0 where there are none.
+    """Return the mean over the Gaussians of the product of their scales; 0 without Gaussians.
 
     Source: Scaffold-GS, section 3.4.
     """
@@ -121,7 +121,7 @@ class Used:
 
     Attributes:
         mask: [P] bool.
-        factor: [P] in [0, 1], what multiplies their opacities; None: 1.
+        factor: [P] in [0, 1], factor of their opacities; None for 1.
     """
 
     mask: Tensor
@@ -129,14 +129,14 @@ class Used:
 
 
 class AnchorBackbone(AnchorOptions):
-    """Anchors with a feature each, which networks decode to k Gaussians per anchor and view.
+    """Anchors with one feature each, which networks decode to k Gaussians per anchor and view.
 
-    A backbone of this family says where its anchors start and which of them a camera uses.
+    A subclass decides where anchors start and which anchors a camera uses.
 
     Blocks: anchors [P, 3] (frozen); offsets [P, k, 3] in units of exp(scales[:, :3]); features
     [P, F]; scales [P, 6] (log: stretch of the offsets, then size of the Gaussians); mlp_opacity,
-    mlp_cov, mlp_color and where it is on mlp_bank (four tensors each); voxel_size (frozen). The
-    rotation and the opacity of an anchor, which the published code holds but never trains, are left
+    mlp_cov, mlp_color and, if enabled, mlp_bank (four tensors each); voxel_size (frozen). The
+    rotation and opacity of an anchor, which the published code stores but never trains, are left
     out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
     """
 
@@ -150,14 +150,14 @@ class AnchorBackbone(AnchorOptions):
         scene: Scene,
         rng: np.random.Generator,
     ) -> Parameters:
-        """First values of all blocks of this class.
+        """Create the initial values of all blocks of this class.
 
         Args:
-            positions: [P, 3] of the anchors, local units.
-            spacing: [P] their first sizes, local units.
+            positions: [P, 3] positions of the anchors, local units.
+            spacing: [P] initial sizes of the anchors, local units.
             voxel_size: Edge of the finest voxel, local units.
             scene: The scene, for the appearance codes of its training views.
-            rng: Draws the first values of the networks and codes.
+            rng: Draws the initial values of the networks and codes.
         """
         count = positions.shape[0]
         scales = torch.from_numpy(np.log(spacing)).float()
@@ -178,10 +178,10 @@ class AnchorBackbone(AnchorOptions):
 
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
-        """Anchors where the Gaussians are; of these only the means are taken over.
+        """Create anchors at the Gaussians; only their means are used.
 
         Raises:
-            UserError: None of the Gaussians can be seen.
+            UserError: All Gaussians are too faint to be seen.
         """
         drawn = gaussians.opacities >= ALPHA_THRESHOLD
         if not bool(drawn.any()):
@@ -198,16 +198,16 @@ class AnchorBackbone(AnchorOptions):
 
     @abstractmethod
     def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:
-        """Which anchors a camera uses, whether or not they are in its frustum; None: all of them.
+        """Return the anchors that a camera uses, inside its frustum or not; None for all anchors.
 
         Args:
             parameters: The parameters.
             camera: The camera.
-            phase: The moment.
+            phase: The phase of training.
         """
 
     def seen(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Seen:
-        """The anchors that a camera uses and that are in its frustum."""
+        """Return the anchors that a camera uses and that are in its frustum."""
         mask = in_frustum(parameters["anchors"], parameters["scales"].detach(), camera)
         used = self.used(parameters, camera, phase)
         if used is None:
@@ -240,7 +240,7 @@ class AnchorBackbone(AnchorOptions):
 
     @hookimpl
     def crossgrad_regularize(self, context: RegularizeContext) -> RegularizeResult | None:
-        """The mean volume of what a view draws, times `volume_weight`."""
+        """Return the mean volume of the Gaussians of a view, times `volume_weight`."""
         if context.gaussians is None or not self.volume_weight:
             return None
         return RegularizeResult(self.volume_weight * mean_volume(context.gaussians))

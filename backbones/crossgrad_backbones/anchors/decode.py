@@ -1,4 +1,4 @@
-"""Decoding anchors to the Gaussians that a camera sees."""
+"""Decoding of anchors to the Gaussians of a camera."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -27,23 +27,23 @@ from crossgrad_core.numerics.jobs import parallel
 from crossgrad_core.plugin import Camera, Gaussians
 
 Gradients: TypeAlias = tuple[Tensor | None, ...]
-#: Opacity, covariance and colour, and the place of the covariance among them.
+#: Indices of opacity, covariance and colour, and the index of the covariance among them.
 _HEADS, _COVARIANCE = (0, 1, 2), 1
-#: Place of the scales among means, quaternions, scales, opacities and colours.
+#: Index of the scales among means, quaternions, scales, opacities and colours.
 _SCALES = 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Back:
-    """Sums over the anchors, and memory for a stretch of them.
+    """Gradient sums over the anchors, and buffers for a stretch of anchors.
 
     Attributes:
-        heads: Which of opacity, covariance and colour have a gradient, without gaps.
+        heads: The heads (opacity, covariance, colour) with a gradient, without gaps.
         features: [Q, F] sum.
         first: Sums of the first layers.
-        second: Sums of the second layers of `heads`, one after the other.
-        raw: [n, outputs of all heads] gradient by the raw outputs.
-        hidden: [n, H of all heads] gradient by the hidden layers.
+        second: Sums of the second layers of `heads`, concatenated.
+        raw: [n, outputs of all heads] gradient with respect to the raw outputs.
+        hidden: [n, H of all heads] gradient with respect to the hidden layers.
     """
 
     heads: tuple[int, ...]
@@ -64,7 +64,7 @@ class _Back:
         return cls(heads, torch.zeros_like(inputs.features), first, second, *buffers)
 
     def sweep(self, inputs: Inputs, kept: Kept, fill: Callable[..., None]) -> None:
-        """Goes through all anchors; `fill(first, n)` writes `raw`."""
+        """Process all anchors in stretches; `fill(first, n)` writes `raw`."""
         width, feature = self.second[0].shape[1], inputs.features.shape[1]
         begin = self.heads[0] * width
         mine = slice(begin, begin + self.hidden.shape[1])
@@ -84,7 +84,7 @@ class _Back:
             self.features.index_copy_(0, owners, hidden[:count] @ weight)
 
     def _second(self, inputs: Inputs, hidden: Tensor, raw: Tensor, out: Tensor) -> None:
-        """Gradient [n, H of all heads] by the rectified layers, and by the second layers."""
+        """Compute gradients of the hidden layers [n, H of all heads] and of the second layers."""
         width, at = self.second[0].shape[1], 0
         for place, head in enumerate(self.heads):
             weight = inputs.second[head][0]
@@ -96,7 +96,7 @@ class _Back:
         self.second[1].add_(raw.sum(0))
 
     def by_second(self, inputs: Inputs) -> list[Tensor | None]:
-        """Gradients of weight and bias of the three second layers, None for heads without."""
+        """Return gradients of weight and bias of the three second layers; None for unused heads."""
         found: list[Tensor | None] = [None] * (2 * len(_HEADS))
         sizes = [len(inputs.second[head][1]) for head in self.heads]
         weights, biases = (torch.split(each, sizes) for each in self.second)
@@ -106,17 +106,17 @@ class _Back:
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
-    """Gradients of the inputs.
+    """Compute the gradients of the inputs.
 
     Args:
-        inputs: What the way there took.
-        kept: What it kept.
-        given: Gradients by means, quaternions, scales, opacities and colours; None is zero.
+        inputs: Inputs of the forward pass.
+        kept: Values that the forward pass saved.
+        given: Gradients of means, quaternions, scales, opacities and colours; None is zero.
 
     Returns:
-        Gradients by features, offsets, log scales, weight and bias of the first layers, and of each
-        second layer. Where only the scales have a gradient (volume regularisation), those of the
-        offsets and of the other two networks are None and cost nothing.
+        Gradients of features, offsets, log scales, weight and bias of the first layers, and of each
+        second layer. If only the scales have a gradient (volume regularisation), the gradients of
+        the offsets and of the other two networks are None and cost nothing.
     """
     alone = all((each is not None) == (i == _SCALES) for i, each in enumerate(given))
     back = _Back.of(inputs, kept, (_COVARIANCE,) if alone else _HEADS)
@@ -151,7 +151,7 @@ def _filled(given: Gradients, kept: Kept) -> list[NDArray[Any]]:
     ]
 
 
-#: What `forward` returns; the first five are differentiable.
+#: Names of the outputs of `forward`; the first five are differentiable.
 _OUTPUTS = ("means", "quats", "scales", "opacities", "colors", "origin", "slot")
 _DIFFERENTIABLE = 5
 
@@ -175,7 +175,7 @@ class _Decode(torch.autograd.Function):
 
 
 def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
-    """The Gaussians of positive opacity, differentiable in all tensors.
+    """Return the Gaussians of positive opacity, differentiable in all tensors.
 
     Args:
         view: The constant part.
@@ -193,19 +193,19 @@ def decoded(
     seen: Seen,
     code: Tensor | None = None,
 ) -> Gaussians:
-    """The Gaussians of the given anchors as a camera sees them, differentiable.
+    """Decode the given anchors to Gaussians for a camera, differentiable.
 
     Args:
         heads: The networks.
         parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6] (log)
             and the tensors of the networks.
         camera: The camera.
-        seen: The anchors to decode, and what multiplies their opacities.
+        seen: The anchors to decode, and the factors of their opacities.
         code: [C] appearance code, or None.
 
     Returns:
-        Gaussians with `colors`, `origin`, `slot` and `decoded`; those whose opacity is not positive
-        are left out.
+        Gaussians with `colors`, `origin`, `slot` and `decoded`, without the Gaussians whose opacity
+        is not positive.
     """
     positions = parameters["anchors"]
     eye = camera.center.to(positions, non_blocking=True)
@@ -217,7 +217,7 @@ def decoded(
 
 
 def _fusible(parameters: Mapping[str, Tensor]) -> bool:
-    """Whether the fused decoding can be used: float32 on the CPU, and anchors that stay."""
+    """Return True if fused decoding is possible: float32 on the CPU, and fixed anchors."""
     names = ("anchors", "offsets", "features", "scales")
     tensors = [parameters[name] for name in names]
     plain = all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)

@@ -1,6 +1,6 @@
 """Networks and activations of the anchors in one differentiable step.
 
-Needs float32 on a CPU.
+This step requires float32 on a CPU.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from crossgrad_backbones.anchors.numba_kernels import networks as layers
 from crossgrad_core.numerics.elementwise import sigmoid_
 from crossgrad_core.numerics.jobs import parallel
 
-#: Anchors of a stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
+#: Anchors per stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
 STRETCH = 2048
 #: Weight and bias of a linear layer.
 Layer = tuple[Tensor, Tensor]
@@ -30,10 +30,10 @@ class View:
 
     Attributes:
         positions: [P, 3].
-        rows: [A] int64, the anchors that are seen, each once.
-        factor: [A] what multiplies their opacities; None: 1.
+        rows: [A] int64, the anchors that are seen, without duplicates.
+        factor: [A] factor of their opacities; None for 1.
         views: [A, V] direction (and distance) from the camera.
-        feature_rows: [A] int64, the row of each anchor's feature, each once.
+        feature_rows: [A] int64, the row of each anchor's feature, without duplicates.
     """
 
     positions: Tensor
@@ -45,14 +45,14 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """A view, and what the Gaussians are differentiable in; H is the width of a hidden layer.
+    """A view and the differentiable inputs; H is the width of a hidden layer.
 
     Attributes:
         view: The constant part.
         features: [Q, F].
         offsets: [P, k, 3].
         log_scales: [P, 6].
-        first: [3 H, F + V] the first layers one after the other.
+        first: [3 H, F + V] the first layers, concatenated.
         second: The second layers of opacity, covariance and colour.
     """
 
@@ -65,7 +65,7 @@ class Inputs:
 
     @classmethod
     def of(cls, view: View, tensors: Sequence[Tensor]) -> "Inputs":
-        """From a view and all tensors in the order of the attributes, weights before biases."""
+        """Make inputs from a view and all tensors in attribute order, weights before biases."""
         features, offsets, log_scales, *layers = tensors
         first, *second = zip(layers[::2], layers[1::2], strict=True)
         opacity, covariance, color = second
@@ -74,7 +74,7 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Values kept for the backward pass besides the inputs; G Gaussians are drawn.
+    """Values saved for the backward pass in addition to the inputs; G Gaussians are drawn.
 
     Attributes:
         joined: [A or more, F + V] inputs of the networks, padded with rows of 0.
@@ -98,7 +98,7 @@ class Kept:
 
 
 def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
-    """The G Gaussians of positive opacity, and what the backward pass needs.
+    """Compute the G Gaussians of positive opacity, and the values for the backward pass.
 
     Returns:
         Means, quaternions, scales, opacities, colours, origin [G] and slot [G].
@@ -118,7 +118,7 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
-    # The kernel gave raw numbers and the anchor's size: torch's sigmoid is vectorised.
+    # The kernel wrote raw values and the anchor's size: torch's sigmoid is vectorised.
     scales.mul_(sigmoid_(shares))
     sigmoid_(colors)
     remembered = (array(spreads), starts, array(slot), array(shares), array(colors))
@@ -127,18 +127,18 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
 
 
 def stretches(anchors: int) -> list[slice]:
-    """The anchors in stretches of fixed length."""
+    """Split the anchors into stretches of fixed length."""
     return [slice(i, min(i + STRETCH, anchors)) for i in range(0, anchors, STRETCH)]
 
 
 def array(tensor: Tensor) -> NDArray[Any]:
-    """The tensor without its graph as an array in C order, without a copy where it is in order."""
+    """Return the tensor without its graph as a C-order array; copies only if needed."""
     numbers: NDArray[Any] = tensor.detach().contiguous().numpy()
     return numbers
 
 
 def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
-    """Inputs and rectified hidden layers, padded to a multiple of `PANEL`: no inputs are 0."""
+    """Compute inputs and rectified hidden layers; zero rows pad them to a multiple of `PANEL`."""
     weight, bias = inputs.first
     anchors = len(inputs.view.rows)
     joined = torch.empty(anchors + -anchors % PANEL, weight.shape[1])
@@ -151,7 +151,7 @@ def _hidden(inputs: Inputs) -> tuple[Tensor, Tensor]:
 
 
 def _fill(inputs: Inputs, hidden: Tensor, arrays: tuple[NDArray[Any], ...]) -> None:
-    """Runs the second layers of covariance and colour and writes what is drawn."""
+    """Run the second layers of covariance and colour, and write the drawn Gaussians."""
     (_, (cov, cov_bias), (color, color_bias)) = inputs.second
     width = cov.shape[1]
     for part in stretches(len(inputs.view.rows)):

@@ -1,4 +1,4 @@
-"""The networks that give the Gaussians of the anchors that a camera sees, in plain torch."""
+"""The networks that compute the Gaussians of the anchors in view, in plain torch."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from crossgrad_core.plugin import Block, BlockKind, Gaussians, LearningRate, Par
 
 #: Width of the direction from the camera to the anchor.
 DIRECTION = 3
-#: Places of the two linear layers; the ReLU between them is number 1.
+#: Indices of the two linear layers; index 1 is the ReLU between them.
 LAYERS = (0, 2)
 #: Strides at which the feature bank reads the feature, from coarse to fine.
 BANK_STRIDES = (4, 2, 1)
-#: Numbers of a Gaussian's covariance: 3 scales and a quaternion wxyz.
+#: Number of covariance values per Gaussian: 3 scales and a quaternion wxyz.
 COVARIANCE = 7
 _CHANNELS = 3
-#: Rows that are summed in one go.
+#: Rows that are summed at once.
 PANEL = 256
 
 
@@ -53,11 +53,11 @@ class Network:
         return tuple(f"{self.name}.{n}.{kind}" for n in LAYERS for kind in ("weight", "bias"))
 
     def block(self, kind: BlockKind, lr: LearningRate) -> Block:
-        """The block of all its tensors."""
+        """Return the block of all its tensors."""
         return Block(self.name, self.tensors, per_primitive=False, kind=kind, lr=lr)
 
     def created(self, rng: np.random.Generator) -> Parameters:
-        """First values as those of `torch.nn.Linear`: uniform in +-1 / sqrt(inputs of a layer)."""
+        """Draw initial values like `torch.nn.Linear`: uniform in +-1 / sqrt(inputs of a layer)."""
         tensors: Parameters = {}
         widths = ((self.inputs, self.hidden), (self.hidden, self.outputs))
         for layer, (width, out) in zip(LAYERS, widths, strict=True):
@@ -68,7 +68,7 @@ class Network:
         return tensors
 
     def layers(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Weight and bias of the first layer, then of the second."""
+        """Return weight and bias of the first layer, then of the second layer."""
         first, first_bias, second, second_bias = (parameters[name] for name in self.tensors)
         return first, first_bias, second, second_bias
 
@@ -90,14 +90,14 @@ class Raw:
 
 @dataclass(frozen=True)
 class Heads:
-    """The networks that turn an anchor's feature and the view of it into its Gaussians.
+    """The networks that map an anchor's feature and viewing direction to its Gaussians.
 
     Attributes:
         offsets: k, Gaussians of an anchor.
         feature: Width F of the feature and of the hidden layers.
-        far: Whether the networks of opacity, covariance and colour take the distance too.
-        code: Width of the appearance code, which the colour takes too; 0 without.
-        banked: Whether a feature bank mixes the feature at three strides by direction and distance.
+        far: For opacity, covariance and colour: True if the network also uses the distance.
+        code: Width of the appearance code, which the colour network also uses; 0 without a code.
+        banked: True if a feature bank mixes the feature at three strides by direction and distance.
     """
 
     offsets: int
@@ -108,7 +108,7 @@ class Heads:
 
     @cached_property
     def networks(self) -> tuple[Network, ...]:
-        """Those of opacity, covariance and colour, then the feature bank's if there is one."""
+        """The networks of opacity, covariance and colour, then the feature bank's if enabled."""
         outputs = (self.offsets, COVARIANCE * self.offsets, _CHANNELS * self.offsets)
         codes = (0, 0, self.code)
         three = tuple(
@@ -121,18 +121,18 @@ class Heads:
         return (*three, bank) if self.banked else three
 
     def views(self, offset: Tensor) -> Tensor:
-        """[A, 4] direction and distance of anchors at `offset` [A, 3] from the camera."""
+        """Return direction and distance [A, 4] of anchors at `offset` [A, 3] from the camera."""
         distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
-        # An anchor in the very centre of the camera has no direction.
+        # An anchor exactly at the camera centre has no direction.
         direction = offset / distance.clamp(min=torch.finfo(offset.dtype).tiny)
         return torch.cat([direction, distance], 1)
 
     def inputs(self, views: Tensor) -> Tensor:
-        """[A, 3 or 4] what of `views` the three networks take besides the feature."""
+        """Return the part [A, 3 or 4] of `views` that the three networks use with the feature."""
         return views if any(self.far) else views[:, :DIRECTION]
 
     def mixed(self, parameters: Mapping[str, Tensor], features: Tensor, views: Tensor) -> Tensor:
-        """[A, F] features read at every fourth, second and first place (repeated to F), mixed."""
+        """Mix features [A, F] read at every fourth, second and first index (repeated to F)."""
         first, first_bias, second, second_bias = self.networks[-1].layers(parameters)
         hidden = linear(views, first, first_bias).relu()
         shares = torch.softmax(linear(hidden, second, second_bias), 1)
@@ -143,11 +143,11 @@ class Heads:
     def first_layers(
         self, parameters: Mapping[str, Tensor], code: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Weights [3 H, F + 3 or 4] and biases [3 H] of the first layers one after the other.
+        """Return the first layers, concatenated: weights [3 H, F + 3 or 4] and biases [3 H].
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None: the same for all anchors, so a part of the bias.
+            code: [C] appearance code, or None. It is equal for all anchors and enters the bias.
         """
         weights, biases = [], []
         for network, far in zip(self.networks[:3], self.far, strict=True):
@@ -162,7 +162,7 @@ class Heads:
         return torch.cat(weights), torch.cat(biases)
 
     def second_layers(self, parameters: Mapping[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
-        """Weight and bias of the second layers of opacity, covariance and colour."""
+        """Return weight and bias of the second layers of opacity, covariance and colour."""
         layers = [network.layers(parameters) for network in self.networks[:3]]
         return [(weight, bias) for _, _, weight, bias in layers]
 
@@ -173,13 +173,13 @@ class Heads:
         views: Tensor,
         code: Tensor | None = None,
     ) -> Raw:
-        """Evaluates the networks.
+        """Evaluate the networks.
 
         Args:
             parameters: The parameters, with the tensors of all networks.
             features: [A, F] of the anchors.
             views: [A, 4] from `views`.
-            code: [C] appearance code; None without.
+            code: [C] appearance code; None without a code.
 
         Source: Scaffold-GS, section 3.2; methods of section 2.2.
         """
@@ -197,8 +197,8 @@ class Seen:
     """The anchors that a view decodes.
 
     Attributes:
-        rows: [A] int64, their rows, each once.
-        factor: [A] in [0, 1], what multiplies the opacities of each; None: 1.
+        rows: [A] int64, their rows, without duplicates.
+        factor: [A] in [0, 1], factor of the opacities of each anchor; None for 1.
     """
 
     rows: Tensor
@@ -208,18 +208,18 @@ class Seen:
 def activated(
     raw: Raw, positions: Tensor, offsets: Tensor, log_scales: Tensor, seen: Seen
 ) -> Gaussians:
-    """The Gaussians whose opacity is positive, anchor by anchor, slot by slot.
+    """Return the Gaussians with positive opacity, anchor by anchor, slot by slot.
 
     Gaussian j of anchor a has the mean x_a + offset_aj exp(l1_a), the opacity tanh(raw), the scales
-    exp(l2_a) sigmoid(raw) and the colour sigmoid(raw). Quaternions keep their length, which no
-    rasterizer depends on.
+    exp(l2_a) sigmoid(raw) and the colour sigmoid(raw). Quaternions are not normalised, because no
+    rasterizer depends on their length.
 
     Args:
         raw: Outputs for A anchors of k Gaussians.
         positions: [P, 3] of all anchors.
         offsets: [P, k, 3] of all anchors.
         log_scales: [P, 6] of all anchors: l1, then l2.
-        seen: Which anchors the outputs are for.
+        seen: The anchors of the outputs.
 
     Returns:
         Gaussians with `colors`, `origin` and `slot`.
@@ -247,17 +247,17 @@ def activated(
 
 
 def product(left: Tensor, right: Tensor) -> Tensor:
-    """[a, b] left [n, a] transposed times right [n, b], n a multiple of `PANEL`.
+    """Return the product [a, b] of left [n, a] transposed and right [n, b]; n % `PANEL` is 0.
 
-    Panel by panel: the libraries split one long sum over as many threads as there are, which would
-    let the bits depend on their number.
+    The sum is computed panel by panel. The libraries split one long sum over all threads, so the
+    bits would depend on the number of threads.
     """
     first, second = (torch.unflatten(each, 0, (-1, PANEL)) for each in (left, right))
     return torch.bmm(first.transpose(1, 2), second).sum(0)
 
 
 def panel_linear(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """[n, b] inputs [n, a] times weight [b, a] transposed, plus bias [b]; differentiable once."""
+    """Return inputs [n, a] times weight [b, a] transposed, plus bias [b]; differentiable once."""
     outputs: Tensor = _Linear.apply(inputs, weight, bias)  # type: ignore[no-untyped-call]
     return outputs
 

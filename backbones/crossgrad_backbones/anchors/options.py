@@ -1,4 +1,4 @@
-"""Options of the backbones of anchors, their blocks, and the appearance codes of views."""
+"""Options and blocks of the anchor backbones, and the appearance codes of views."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -21,7 +21,7 @@ from crossgrad_core.plugin import (
 )
 
 _FROZEN = LearningRate(0.0)
-#: Names of the codes [V, C] and of the poses [V, 3, 4] (float64, frozen) that they belong to.
+#: Names of the codes [V, C] and of the poses [V, 3, 4] (float64, frozen) of the training views.
 CODES, POSES = "appearance", "appearance_poses"
 
 
@@ -104,7 +104,7 @@ class AnchorOptions(Backbone):
 
 
 def created_codes(scene: Scene, codes: Tensor) -> Parameters:
-    """The tensors of the appearance: the codes of the training views and their poses.
+    """Return the appearance tensors: the codes of the training views and their poses.
 
     Args:
         scene: The scene.
@@ -115,16 +115,16 @@ def created_codes(scene: Scene, codes: Tensor) -> Parameters:
 
 
 def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> Tensor:
-    """[C] code of a training view in training, the mean code otherwise.
+    """Return the code [C] of a training view during training, or else the mean code.
 
-    Scaffold-GS evaluates a held-out view with the code of the training view that has its running
-    number; there is no reason for that view.
+    Scaffold-GS evaluates a held-out view with the code of the training view of the same index.
+    These two views are unrelated, so this code does not follow it.
 
     Args:
         codes: [V, C].
         poses: [V, 3, 4] world to camera.
-        camera: The camera; cameras of one pose share the code of the first one.
-        training: Whether the view is trained on.
+        camera: The camera; cameras with the same pose share the first code.
+        training: True if the view is trained on.
     """
     if training:
         own = camera.world_to_camera[:3].to(poses, non_blocking=True)

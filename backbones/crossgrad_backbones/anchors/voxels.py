@@ -1,26 +1,26 @@
-"""Cells of a grid: anchors by voxel rounding, the size of a voxel, and free cells."""
+"""Grid cells: anchors by voxel rounding, automatic voxel size, and free cells."""
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: Smallest automatic voxel size, local units: that of a cloud of identical points.
+#: Smallest automatic voxel size, local units: used for a cloud of identical points.
 SMALLEST_VOXEL = 1e-5
 #: The automatic voxel size of a cloud without neighbours, local units.
 LONE_VOXEL = 0.01
 #: The automatic voxel size, in median distances between neighbours. With 1, nearly every point gets
-#: an anchor of its own, hence ten Gaussians where vanilla has one.
+#: its own anchor, that is ten Gaussians for one Gaussian of vanilla.
 SPACING = 2.0
-#: Cells farther from the origin than this are left out: their numbers would not be exact.
+#: Cells farther from the origin are left out: their integer coordinates would not be exact.
 FARTHEST = 2**40
 
 
 def automatic_voxel_size(points: NDArray[np.float64]) -> float:
-    """Twice the median over the points of the distance to the nearest other one, local units.
+    """Return twice the median distance of the points to their nearest neighbour, local units.
 
-    Scaffold-GS takes the median of the mean *squared* distance to three neighbours for a length;
-    that depends on the unit of the input, so it is not reproduced here.
+    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. That
+    value depends on the unit of the input, so it is not reproduced here.
 
     Args:
         points: [N, 3].
@@ -34,7 +34,7 @@ def automatic_voxel_size(points: NDArray[np.float64]) -> float:
 
 
 def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """[P, 3] centres of the voxels that hold a point, each once, in lexicographic order.
+    """Return the centres [P, 3] of the voxels that contain points, in lexicographic order.
 
     Source: Scaffold-GS, section 3.1: unique(round(p / v)) v.
 
@@ -47,23 +47,24 @@ def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float6
 
 
 def cells_of(positions: Tensor, size: float) -> Tensor:
-    """[N, 3] int64 cell of each position [N, 3]; half-way positions go to the even cell.
+    """Return the cell [N, 3] int64 of each position [N, 3]; half-way positions go to the even cell.
 
-    Positions beyond `FARTHEST` cells, and those that are not finite, are moved to it.
+    Positions beyond `FARTHEST` cells and non-finite positions are moved to cell `FARTHEST`.
     """
     cells = (positions.double() / size).round()
     return cells.nan_to_num(FARTHEST, FARTHEST, -FARTHEST).clamp(-FARTHEST, FARTHEST).long()
 
 
 def in_reach(cells: Tensor) -> Tensor:
-    """[N] bool, cells that were not moved."""
+    """Return a mask [N] of the cells that were not moved to `FARTHEST`."""
     return (cells.abs() < FARTHEST).all(1)
 
 
 def numbered(cells: Tensor) -> Tensor:
-    """[N] int64, the same number for equal cells [N, 3] and for no others.
+    """Return numbers [N] int64 that are equal exactly for equal cells [N, 3].
 
-    Column by column, so that no product overflows: much faster than `unique` of whole rows.
+    Columns are numbered one by one so that no product overflows. This is much faster than `unique`
+    of whole rows.
     """
     number = cells.new_zeros(cells.shape[0])
     for column in cells.unbind(1):
@@ -73,15 +74,15 @@ def numbered(cells: Tensor) -> Tensor:
 
 
 def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
-    """The wanted cells that nothing occupies, each once, and who wants which.
+    """Return the distinct wanted cells that are free, and the index of each request in them.
 
     Args:
         wanted: [N, 3] int64.
         taken: [M, 3] int64.
 
     Returns:
-        [C] int64 row in `wanted` of the first that wants each free cell, in the order of
-        `numbered`; [N] int64 position of each wanted cell in that list, -1 where it is taken.
+        [C] int64 row in `wanted` of the first request for each free cell, in the order of
+        `numbered`; [N] int64 index of each wanted cell in that list, -1 if the cell is taken.
     """
     number = numbered(torch.cat([wanted, taken]))
     count = int(number.max()) + 1 if len(number) else 0

@@ -1,1 +1,1 @@
-"""Levels of detail: how many there are, what stands on each, and when each may be trained."""
+"""Levels of detail of octree anchors: the lattices of all levels, and growth and pruning."""

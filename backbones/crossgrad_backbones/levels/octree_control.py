@@ -23,30 +23,30 @@ from crossgrad_core.plugin import SHORTEST_ANCHOR_INTERVAL, DensifyContext, Para
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Gradients that ask for growth, level by level.
+    """Gradients that trigger growth, level by level.
 
     Attributes:
         base: Least gradient that grows at level 0, NDC norm.
-        ratio: From one level to the next.
+        ratio: Factor from one level to the next.
     """
 
     base: float
     ratio: float
 
     def at(self, levels: Tensor) -> Tensor:
-        """[A] float64, least gradient that grows at levels [A]."""
+        """Return the least gradient [A] float64 that grows at levels [A]."""
         return self.base * self.ratio ** levels.double()
 
 
 @dataclass(frozen=True)
 class Requests:
-    """The cells that N offsets ask for.
+    """The cells that N offsets request.
 
     Attributes:
-        sites: [N, 4] int64, level and place in its lattice.
+        sites: [N, 4] int64, level and position in its lattice.
         anchors: [N] int64, the anchors of the offsets.
         strength: [N] gradients of the offsets.
-        features: [N, F] what the offset offers to the new anchor, -inf where nothing.
+        features: [N, F] features for the new anchor, -inf for none.
     """
 
     sites: Tensor
@@ -61,11 +61,11 @@ def requests(
     request: GrowthRequest,
     thresholds: Thresholds,
 ) -> Requests:
-    """What the offsets ask for.
+    """Return the cells that the offsets request.
 
-    An offset of an anchor of level l asks where its gradient reaches the threshold of that level:
-    for the cell around its Gaussian, of level l, or of level l + 1 where the gradient reaches that
-    level's threshold as well. There is no level beyond the last.
+    An offset of an anchor of level l requests a cell if its gradient reaches the threshold of level
+    l. The cell is the one around its Gaussian: on level l + 1 if that level exists and the gradient
+    reaches its threshold, else on level l.
     """
     levels = parameters["levels"]
     asks = request.eligible & (request.gradient >= thresholds.at(levels)[:, None])
@@ -86,15 +86,15 @@ def grown(
     thresholds: Thresholds,
     cameras: Tensor,
 ) -> NewAnchors:
-    """New anchors in the free cells that offsets ask for.
+    """Return new anchors in the free cells that offsets request.
 
-    A new anchor has the elementwise largest feature of the anchors of its own level that asked for
-    it, or 0 where there is none. Anchors that too few cameras would see are weeded out.
+    The feature of a new anchor is the elementwise maximum over the requesting anchors of its own
+    level, or 0 without such anchors. Anchors that too few cameras would see are pruned.
 
     Args:
-        parameters: Those of an octree backbone, detached.
-        request: What the offsets ask for.
-        thresholds: From which gradients they grow.
+        parameters: Parameters of an octree backbone, detached.
+        request: The requests of the offsets.
+        thresholds: The least gradients for growth.
         cameras: [C, 3] camera centres, local units.
 
     Returns:
@@ -126,12 +126,12 @@ def grown(
 def seen_from_farther(
     parameters: Mapping[str, Tensor], request: GrowthRequest, thresholds: Thresholds
 ) -> Tensor:
-    """[P] bool, anchors whose eligible offsets have a mean gradient above their level's threshold.
+    """Return a mask [P] of anchors whose eligible offsets have a mean gradient above a threshold.
 
     Args:
-        parameters: Those of an octree backbone, detached.
-        request: What the offsets ask for.
-        thresholds: Those that the mean must reach.
+        parameters: Parameters of an octree backbone, detached.
+        request: The requests of the offsets.
+        thresholds: The thresholds of the mean, one per level.
 
     Source: Octree-GS; methods of section 6.
     """
@@ -140,26 +140,26 @@ def seen_from_farther(
     return (count > 0) & (mean >= thresholds.at(parameters["levels"]))
 
 
-#: The published schedule is one of 40,000 steps: anchors grow after 1500 and before 25,000 of them.
+#: The published schedule has 40,000 steps: anchors grow after step 1500 and before step 25,000.
 _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100
 
 
 class OctreeControl(AnchorDensifier):
-    """Adds anchors of the own level or, at larger gradients, of the next one.
+    """A densifier that adds anchors of the own level or, at larger gradients, of the next level.
 
-    Pruning is that of Scaffold-GS; no candidate is dropped at random. Anchors whose offsets have
-    large gradients on average are seen from a little farther away from then on. Where this differs
-    from the published code:
+    Pruning follows Scaffold-GS; no candidate is dropped at random. Anchors whose offsets have large
+    mean gradients are afterwards seen from slightly farther away. Differences from the published
+    code:
 
-    - An offset of the last level grows there whatever its gradient; the code grows nothing where it
-      exceeds the threshold of a level that does not exist.
+    - An offset of the last level grows there at any gradient above the level's threshold. The code
+      grows nothing if the gradient exceeds the threshold of the level after the last.
     - Each anchor is tested once per edit for its extra level, against the threshold of its own
-      level; the code tests all anchors against the threshold of every level in turn, and adds up.
-    - The next level takes anchors even if it holds none yet; in the code it stays empty.
-    - A cell that both levels ask for in one edit takes the features of its own level.
+      level. The code tests all anchors against the threshold of every level in turn and adds up.
+    - The next level receives anchors even if it is still empty; in the code it stays empty.
+    - If both levels request a cell in one edit, the cell uses the features of its own level.
 
-    As in the code, and unlike its evident intention, next levels and extra levels grow from the
-    first edit on, not after the coarse phase.
+    As in the code, next levels and extra levels grow from the first edit on. The apparent intention
+    of the code is to wait until the coarse phase ends.
     """
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {
@@ -206,6 +206,6 @@ class OctreeControl(AnchorDensifier):
         return {**super().changed(parameters, request), "extra_levels": extra}
 
     def _thresholds(self, parameters: Parameters, share: float = 1.0) -> Thresholds:
-        """The thresholds of all levels, times `share`."""
+        """Return the thresholds of all levels, times `share`."""
         fork = float(Lattice.of(parameters["lattice"]).fork)
         return Thresholds(share * self.grad_threshold, fork**self.update_ratio)

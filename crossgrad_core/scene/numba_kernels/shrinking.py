@@ -1,9 +1,9 @@
 """scikit-image's anti-aliased resize to a smaller size, row by row (Numba, CPU).
 
-A Gaussian along the columns, one along the rows, then linear interpolation, as `transform.resize`
-does through SciPy. Only rows that are interpolated are filtered, and no float image of the photo's
-size exists. Every sum is taken in SciPy's order and rounded where SciPy rounds, so that the bits
-are the same.
+The resize applies a Gaussian along the columns, then a Gaussian along the rows, then linear
+interpolation, as `transform.resize` does with SciPy. Only rows needed for interpolation are
+filtered, and no float image of the photo's size exists. Every sum uses SciPy's order and SciPy's
+rounding, so that the bits are the same.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 
-#: Columns that are filtered at once: what a core keeps at hand.
+#: Columns that are filtered at once, so that they stay in the cache of a core.
 _BLOCK = 1024
 
 
 @strict_device
 def _mirrored(index: int, length: int) -> int:
-    """The pixel that stands for one beyond the border; the border itself is not repeated."""
+    """Mirror a pixel index beyond the border into the image; the border pixel is not repeated."""
     if length == 1:
         return 0
     period = 2 * length - 2
@@ -37,7 +37,7 @@ def _add_pair(
 def _filter_columns(
     image: NDArray[np.uint8], y: int, weights: NDArray[np.float64], line: NDArray[np.float64]
 ) -> None:
-    """Row `y` [W C] of the image filtered along the columns, rounded to float32."""
+    """Filter the image along the columns and write row `y` [W C] to `line`, rounded to float32."""
     height, width = image.shape
     for left in range(0, width, _BLOCK):
         right = min(left + _BLOCK, width)
@@ -59,11 +59,11 @@ def _filter_row(
     weights: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
-    """A row [W C] filtered along itself, rounded to float32.
+    """Filter a row [W C] along itself, rounded to float32.
 
     Args:
-        padded: The row with as many pixels more at either end as there are weights but one, which
-            are filled in.
+        padded: The row, with (number of weights - 1) extra pixels at each end; this function fills
+            the extra pixels.
         channels: C.
         weights: From the middle outwards.
         result: [W C].
@@ -95,7 +95,7 @@ def _filter_row(
 def _columns(
     columns: int, channels: int, width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """[w C] what lies left and right of each number of a row, and the weight of what is left."""
+    """Return the left and right neighbour [w C] of each output value, and the left weight."""
     left, right = np.empty(columns * channels, np.int64), np.empty(columns * channels, np.int64)
     near = np.empty(columns * channels)
     for column in range(columns):
@@ -128,12 +128,12 @@ def shrink(
     along_rows: NDArray[np.float64],
     small: NDArray[np.uint8],
 ) -> None:
-    """Writes the image in a size that is at most its own.
+    """Resize the image to a size that is at most its own, and write it to `small`.
 
     Args:
         image: [H, W C], contiguous.
         along_columns: [R + 1] weights of the Gaussian along the columns, the middle one first.
-        along_rows: [S + 1] likewise along the rows.
+        along_rows: [S + 1] weights of the Gaussian along the rows, the middle one first.
         small: [h, w, C], h <= H and w <= W.
     """
     rows, columns, channels = small.shape
@@ -145,7 +145,7 @@ def shrink(
     filtered = np.empty((2, width * channels))
     held = np.full(2, -1)
     left, right, near = _columns(columns, channels, width)
-    # Both rows times their weights, and what is between their pixels.
+    # Both rows times their weights, and the values interpolated between their pixels.
     above, below = np.empty(width * channels), np.empty(width * channels)
     values = np.empty(columns * channels)
     for row in range(rows):

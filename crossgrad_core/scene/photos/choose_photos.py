@@ -1,4 +1,4 @@
-"""Which file, size and calibration every view gets; only headers are read."""
+"""The choice of file, size and calibration for every view; only headers are read."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,19 +34,19 @@ from crossgrad_core.scene.photos.shapes import check_mask, choose_reduction, is_
 from crossgrad_core.scene.raw import RawScene
 from crossgrad_core.scene.wording import count, name_some
 
-#: Photos of 8, 10, 12 or 14 bits reach this share of that range; darker ones may be anything.
+#: Photos of 8, 10, 12 or 14 bits reach this share of their range; darker photos are ambiguous.
 _REACHED: Final = 0.8
-#: Photos with a larger value use their 16 bits.
+#: Photos with a larger value use all 16 bits.
 _DARK: Final = WHITES[-2]
-#: Photos that are decoded before the largest value is looked at.
+#: Photos that are decoded before the largest value is checked.
 _AT_ONCE: Final = 8
 
 
 def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     """Return the value of white for all photos of 16 bits, and a note if it is not 65535.
 
-    All photos share one value, which depends on the brightest pixel of all. Photos that use a small
-    part of their range without filling that of a smaller number of bits are left dark.
+    All photos share one value, which depends on the brightest pixel of all photos. Photos stay dark
+    if they use a small part of their range and do not fill the range of a smaller bit depth.
 
     Args:
         deep: The photos. They are decoded until one is bright enough for 16 bits.
@@ -78,9 +78,9 @@ class ChosenPhotos:
     """The photos of a scene.
 
     Attributes:
-        sources: View name -> how its photo is decoded; views without a photo are not in it.
+        sources: View name -> how its photo is decoded; without the views that have no photo.
         pinholes: View name -> calibration of the photo as trained.
-        notes: What was left out, undistorted, resized or masked, and files that are not used.
+        notes: Photos left out, undistorted, resized or masked, and files that are not used.
     """
 
     sources: Mapping[str, PhotoSource]
@@ -103,13 +103,13 @@ class _Found:
 
 
 def choose_photos(raw: RawScene, options: SceneOptions) -> ChosenPhotos:
-    """Pairs views with photos by name and settles the size of each photo as trained.
+    """Pair views with photos by name and choose the training size of each photo.
 
     Raises:
-        UserError: No view has a photo, a photo is damaged or does not fit its camera, or the mask
-            folder that was asked for is not there.
+        UserError: No view has a photo, a photo is damaged or does not fit its camera, or the
+            requested mask folder does not exist.
     """
-    # Beside the scene's own folder lies what is not the scene's.
+    # If the photos are in the scene's root folder, its sibling folders do not belong to the scene.
     folders = find_photo_folders(raw.images)[: 1 if raw.images == raw.root else None]
     names = sorted(view.name for view in raw.views)
     full = _read_full(folders[0], names)
@@ -192,9 +192,9 @@ def _pair(folder: PhotoFolder, names: Sequence[str]) -> dict[str, Path]:
 def _prefer_reduced(
     full: _Found, reduced: Sequence[PhotoFolder], max_size: int | None
 ) -> tuple[_Found, list[str]]:
-    """The largest photo folder that keeps to the size limit, unless resizing keeps far more.
+    """Choose the largest photo folder within the size limit, or the full-size photos.
 
-    A folder with photos smaller than half the limit is not worth what it would throw away.
+    A reduced folder with photos smaller than half the limit would lose too much detail.
     """
     notes: list[str] = []
     if max_size is None or full.longest <= max_size:
@@ -215,10 +215,10 @@ def _prefer_reduced(
 
 
 def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int, int, int]:
-    """Width, height and EXIF orientation of a photo in the pixels that its pose refers to.
+    """Return width, height and EXIF orientation of a photo in the pixels that its pose refers to.
 
-    COLMAP ignores EXIF rotation, so the stored pixel grid is taken, unless the camera has the shape
-    of the rotated photo only.
+    COLMAP ignores EXIF rotation. Therefore the stored pixel grid is used, unless only the rotated
+    photo has the shape of the camera.
     """
     width, height = header.width, header.height
     posed = calibration.width, calibration.height
@@ -237,7 +237,7 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
 
 
 def _limit(width: int, height: int, max_size: int | None) -> tuple[int, int]:
-    """The size with the longest side cut down to the limit."""
+    """Return the size with the longest side reduced to the limit."""
     longest = max(width, height)
     if max_size is None or longest <= max_size:
         return width, height

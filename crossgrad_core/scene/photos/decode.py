@@ -25,7 +25,7 @@ _FULL_8_BIT, FULL_16_BIT = 255, 65535
 WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
 #: A mask of black and white has at most this share of pixels farther than a tenth from both.
 _MOST_GREY = 0.05
-#: Bytes of a photo that are taken over at once: they stay in the processor's cache.
+#: Bytes of a photo that are copied at once, so that they stay in the processor's cache.
 _BAND = 1 << 19
 #: Standard deviations at which SciPy cuts its Gaussians off.
 _WIDTHS = 4.0
@@ -34,17 +34,17 @@ _WIDTHS = 4.0
 def decode_photo(
     path: Path, reduction: int = 1, white: int = FULL_16_BIT
 ) -> tuple[Pixels, Pixels | None]:
-    """A photo as [H, W, 3] RGB and, where it has any, its [H, W] alpha channel.
+    """Decode a photo to RGB [H, W, 3], and its alpha channel [H, W] if it has one.
 
     Grey, palette, CMYK and 16-bit photos become 8-bit RGB. EXIF rotation is not applied.
 
     Args:
         path: The file.
-        reduction: 2, 4 or 8 decode a JPEG file with its sides divided by so much.
+        reduction: 2, 4 or 8 decode a JPEG file with both sides divided by this number.
         white: The value of white in a photo of 16 bits.
 
     Raises:
-        UserError: The photo is damaged or of a kind that cannot be shown.
+        UserError: The photo is damaged or of an unsupported kind.
     """
     if white == FULL_16_BIT:
         return _decode(path, _read_photo, reduction)
@@ -57,19 +57,19 @@ def brightest(path: Path) -> int:
     """Return the largest value of a photo of 16 bits.
 
     Raises:
-        UserError: The photo is damaged or of a kind that cannot be shown.
+        UserError: The photo is damaged or of an unsupported kind.
     """
     return int(_decode_deep(path)[0].max())
 
 
 def decode_mask(path: Path) -> Pixels:
-    """A mask as [H, W], 255 where the pixel counts: where it is at least half white.
+    """Decode a mask [H, W]: 255 if a pixel is at least half white and therefore counts, else 0.
 
-    White is the value of a full pixel in the fewest bits that hold all values: 1, 255, 4095 ...
-    If transparency varies and the colours are not black and white, opaque is white.
+    White is the largest value of the smallest bit depth that holds all values: 1, 255, 4095 ...
+    If transparency varies and the colours are not black and white, alpha is used as the mask.
 
     Raises:
-        UserError: The mask is damaged or of a kind that cannot be shown.
+        UserError: The mask is damaged or of an unsupported kind.
     """
     grey = _decode(path, _read_mask)
     white = next(white for white in WHITES if white >= min(grey.max(), FULL_16_BIT))
@@ -77,7 +77,7 @@ def decode_mask(path: Path) -> Pixels:
 
 
 def resize(image: Pixels, width: int, height: int) -> Pixels:
-    """[H, W] or [H, W, C] in another size, to the bits of scikit-image's anti-aliased resize."""
+    """Resize [H, W] or [H, W, C], bit-equal to scikit-image's anti-aliased resize."""
     tall, wide = image.shape[:2]
     if (tall, wide) == (height, width):
         return image
@@ -101,7 +101,7 @@ def _resized_by_skimage(image: Pixels, width: int, height: int) -> Pixels:
 
 
 def _gaussian(factor: float) -> NDArray[np.float64]:
-    """Weights of the filter before a side is divided by `factor`, from the middle outwards."""
+    """Return the weights of the filter for a side divided by `factor`, from the middle outwards."""
     deviation = (factor - 1.0) / 2.0
     radius = int(_WIDTHS * deviation + 0.5)
     if radius == 0:
@@ -111,7 +111,7 @@ def _gaussian(factor: float) -> NDArray[np.float64]:
 
 
 def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) -> Pixels:
-    """A photo [H, W, 3] over a colour in [0, 1], by its alpha [H, W]."""
+    """Blend a photo [H, W, 3] over a colour in [0, 1] by its alpha [H, W]."""
     weight = alpha[..., None].astype(np.float32) / _FULL_8_BIT
     behind = np.array(background, dtype=np.float32) * _FULL_8_BIT
     mixed = rgb * weight + behind * (1 - weight)
@@ -119,7 +119,7 @@ def blend(rgb: Pixels, alpha: Pixels, background: tuple[float, float, float]) ->
 
 
 def turn(pixels: Pixels, orientation: int) -> Pixels:
-    """[H, W, ...] pixels turned upright by an EXIF orientation of a quarter turn (5 to 8)."""
+    """Turn pixels [H, W, ...] upright by an EXIF orientation of a quarter turn (5 to 8)."""
     turned = {
         5: pixels.swapaxes(0, 1),
         6: np.rot90(pixels, -1),
@@ -145,7 +145,7 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
 
 
 def _decode_deep(path: Path) -> tuple[NDArray[np.int32], Pixels | None]:
-    """Grey [H, W, 1] or RGB [H, W, 3] of a photo of 16 bits, and its alpha in 8 bits, if any."""
+    """Decode a photo of 16 bits to grey [H, W, 1] or RGB [H, W, 3], and to 8-bit alpha, if any."""
     upper = _decode(path, np.array)
     if upper.ndim == 2:  # noqa: PLR2004 - grey, which Pillow decodes to 16 bits
         return upper[..., None].astype(np.int32), None
@@ -171,7 +171,7 @@ def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
 
 
 def _colours(image: "Image") -> Pixels:
-    """[H, W, 3] of an RGB photo, band by band: np.asarray copies large ones three times."""
+    """Decode an RGB photo [H, W, 3] in bands: np.asarray copies large photos three times."""
     pixels = np.empty((image.height, image.width, 3), np.uint8)
     rows = max(1, _BAND // pixels[0].size)
     for top in range(0, image.height, rows):
@@ -182,13 +182,13 @@ def _colours(image: "Image") -> Pixels:
 
 
 def _read_grey(image: "Image") -> NDArray[np.int32]:
-    """[H, W], in the file's own range: up to 255, or up to 65535."""
+    """Read grey [H, W] in the file's own range: up to 255, or up to 65535."""
     wide = image if image.mode.startswith("I") else image.convert("L")
     return np.array(wide).astype(np.int32)
 
 
 def _read_mask(image: "Image") -> NDArray[np.int32]:
-    """[H, W] grey, or alpha if it varies and the colours are not black and white."""
+    """Read grey [H, W], or alpha if alpha varies and the colours are not black and white."""
     if image.mode.startswith("I") or not pillow.has_alpha(image):
         return _read_grey(image)
     grey, alpha = (np.array(part).astype(np.int32) for part in image.convert("LA").split())
@@ -198,7 +198,7 @@ def _read_mask(image: "Image") -> NDArray[np.int32]:
 
 
 def _is_black_and_white(grey: NDArray[np.int32]) -> bool:
-    """Whether both are there, and hardly anything between them."""
+    """Return True if both black and white occur, and hardly any other value."""
     black, white = grey < _FULL_8_BIT // 10, grey > _FULL_8_BIT - _FULL_8_BIT // 10
     neither = 1.0 - float(black.mean() + white.mean())
     return bool(black.any() and white.any() and neither <= _MOST_GREY)

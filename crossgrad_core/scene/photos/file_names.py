@@ -1,6 +1,6 @@
-"""Files of a scene by name: their kind, and names that other programs give them.
+"""Matching of a scene's files with the names that other programs use, and file kinds by name.
 
-Such names may have other folders, another suffix or another case.
+Names from other programs may have other folders, another suffix or another letter case.
 """
 
 import os
@@ -15,8 +15,8 @@ from typing import Final, TypeAlias
 
 from crossgrad_core.scene.photos.pillow import SUFFIXES
 
-#: How much a file's path is like a name: same folders, number of shared folders at the end, one
-#: path ends with the other, same base name up to letter case, same base name. Greater is more.
+#: Similarity of a file's path to a name: same folders, number of equal folders at the end, one path
+#: ends with the other, same base name up to letter case, same base name. Greater is more similar.
 _Likeness: TypeAlias = tuple[bool, int, bool, bool, bool]
 #: Suffixes of photos and masks.
 IMAGES: Final = frozenset(
@@ -38,7 +38,7 @@ _WORDS: Final = {
     **dict.fromkeys(("depth", "depths", "disparity", "normal", "normals"), DEPTH),
 }
 _COPIES: Final = re.compile(r"(images|photos|rgb)_[248]")
-#: Files of numbers, of any kind unless a word says which.
+#: Array files. Their kind is known only if a word in the path gives it.
 _ARRAYS: Final = frozenset({".npy", ".npz"})
 
 
@@ -56,16 +56,16 @@ class Pairs:
 
 
 class FileNames:
-    """Files below one folder, found by the names that other programs give them.
+    """Files below one folder, found by the names that other programs use for them.
 
-    A name stands for the file with the same path, or else for the file with the same base name
-    whose path is most alike. Suffix, case and Unicode form may differ. A file in another folder
-    stands in only if the folder of the name is not there: otherwise the file itself is missing.
+    A name matches the file with the same path. Otherwise it matches the file with the same base
+    name and the most similar path. Suffix, case and Unicode form may differ. A file in another
+    folder matches only if the name's own folder does not exist: otherwise the file is missing.
 
     Args:
         names: Paths below the folder, with forward slashes.
-        called: Returns the name that a path is compared by.
-        aside: Returns True for a path that no name with other folders stands for.
+        called: Returns the name under which a path is compared.
+        aside: Returns True for a path that must not match a name with other folders.
     """
 
     def __init__(
@@ -82,20 +82,20 @@ class FileNames:
             self._alike[_base(without_suffix(call))].append(name)
 
     def find(self, name: str) -> str | None:
-        """Return the one file that a name stands for; None if there is none, or several."""
+        """Return the only file that matches a name; None if no file or several files match."""
         return self.pair((name,)).files.get(name)
 
     def fitting(self, name: str) -> list[str]:
-        """Return the files that fit a name equally well, sorted."""
+        """Return the files that match a name equally well, sorted."""
         pairs = self.pair((name,))
         return sorted(pairs.ambiguous.get(name) or filter(None, [pairs.files.get(name)]))
 
     def pair(self, names: Collection[str], taken: Container[str] = ()) -> Pairs:
-        """Find the file of each name. A file belongs to the name that is most like its path.
+        """Find the file of each name. A file belongs to the name that is most similar to its path.
 
         Args:
             names: The names, relative or absolute, with forward slashes or backslashes.
-            taken: Files that stand for none of the names.
+            taken: Files that must not match any of the names.
         """
         exact = {name: name for name in names if name in self._called and name not in taken}
         best = {
@@ -107,7 +107,7 @@ class FileNames:
         for likeness, files in best.values():
             for file in files:
                 claims[file].append(likeness)
-        # A name that is less like a file's path than another name is has lost its own file.
+        # If another name is more similar to a file's path, this name loses the file.
         held = {
             name: (likeness, [file for file in files if likeness == max(claims[file])])
             for name, (likeness, files) in best.items()
@@ -124,7 +124,7 @@ class FileNames:
     def _most_alike(
         self, name: str, is_taken: Callable[[str], bool]
     ) -> tuple[_Likeness, list[str]]:
-        """The files that are most like a name, and how much they are."""
+        """Return the files that are most similar to a name, and their similarity."""
         found: dict[str, _Likeness] = {}
         for base in {_base(name), _stem(name)}:
             for file in self._alike.get(base, ()):
@@ -135,7 +135,7 @@ class FileNames:
         return most, [file for file, likeness in found.items() if likeness == most]
 
     def _likeness(self, name: str, file: str) -> _Likeness | None:
-        """How much a file's path is like a name; None if the folder of the name is there."""
+        """Return the similarity of a file's path to a name; None if the name's folder exists."""
         call = self._called[file]
         own, other = _folders(name), _folders(call)
         pairs = zip(reversed(own), reversed(other), strict=False)
@@ -174,12 +174,12 @@ def _folders(name: str) -> list[str]:
 
 
 def _base(name: str) -> str:
-    """The base name of a path, in one case and Unicode form."""
+    """Return the base name of a path, in one case and Unicode form."""
     return _fold("".join(_parts(name)[-1:]))
 
 
 def _stem(name: str) -> str:
-    """The base name of a path without any suffix, in one case and Unicode form."""
+    """Return the base name of a path without any suffix, in one case and Unicode form."""
     return PurePosixPath(_base(name)).stem
 
 
@@ -188,9 +188,9 @@ def _fold(text: str) -> str:
 
 
 def kind_of(name: str) -> str | None:
-    """Return the kind of a file by its path below the scene; None for files of no known kind.
+    """Return the kind of a file by its path below the scene; None for an unknown kind.
 
-    Images are photos, unless a word in their name or in the names of their folders says otherwise.
+    Images are photos, unless a word in the file name or in a folder name gives another kind.
     """
     path = PurePosixPath(name)
     suffix = path.suffix.lower()

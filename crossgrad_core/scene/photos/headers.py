@@ -1,4 +1,4 @@
-"""Headers of photo files: size and kind without decoding, and whether the file is whole."""
+"""Headers of photo files: size and kind without decoding, and a check for truncated files."""
 
 from dataclasses import dataclass, replace
 from math import inf
@@ -24,15 +24,15 @@ _TIFF_DATA = ((273, 279), (324, 325))  # offsets and byte counts of strips and o
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """Size of the stored pixel grid, before any EXIF rotation, and whether there is transparency.
+    """The size of the stored pixel grid, before any EXIF rotation, and the kind of pixels.
 
     Attributes:
         width: Pixels.
         height: Pixels.
-        alpha: Whether pixels may be transparent.
-        grey: Whether the photo has no colour.
-        reducible: Whether it can be decoded at a reduced size in less memory.
-        deep: Whether it is grey, RGB or RGBA with 16 bits a channel.
+        alpha: True if pixels may be transparent.
+        grey: True if the photo has no colour.
+        reducible: True if it can be decoded at a reduced size in less memory.
+        deep: True if it is grey, RGB or RGBA with 16 bits per channel.
     """
 
     width: int
@@ -43,12 +43,12 @@ class PhotoHeader:
     deep: bool = False
 
     def reduced(self, by: int) -> "PhotoHeader":
-        """The photo decoded with each side divided by 1, 2, 4 or 8."""
+        """Return the header for decoding with each side divided by 1, 2, 4 or 8."""
         return replace(self, width=-(-self.width // by), height=-(-self.height // by))
 
 
 def read_header(path: Path) -> PhotoHeader:
-    """Reads the header of a photo and checks cheaply that the file was not cut short.
+    """Read the header of a photo and check cheaply that the file is not truncated.
 
     Raises:
         UserError: Not a readable photo, or its end is missing.
@@ -68,7 +68,7 @@ def read_header(path: Path) -> PhotoHeader:
 
 
 def read_quarter_turn(path: Path) -> int | None:
-    """The EXIF orientation of a photo, if it swaps width and height (5 to 8).
+    """Return the EXIF orientation of a photo if it swaps width and height (5 to 8), else None.
 
     Raises:
         UserError: The EXIF header is damaged.
@@ -87,12 +87,12 @@ def _describe(image: "Image") -> PhotoHeader:
 
 
 def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
-    """How many pixels a file of so many bytes can hold at most, in formats where that is known.
+    """Return the largest number of pixels that `size` bytes can hold; inf for other formats.
 
-    A header that claims more would have memory set aside for a photo that is not there.
+    A header that claims more pixels would make the decoder allocate memory for a missing photo.
     """
     if image.format in {"JPEG", "MPO"}:
-        # A block of 8 x 8 pixels takes one bit at least, the Huffman code of its mean.
+        # A block of 8 x 8 pixels needs at least one bit, the Huffman code of its mean.
         return _JPEG_PIXELS_PER_BYTE * size
     if image.format == "PNG":
         file.seek(_PNG_DEPTH)
@@ -102,7 +102,7 @@ def _most_pixels(image: "Image", file: BinaryIO, size: int) -> float:
 
 
 def _is_whole(file: BinaryIO) -> bool:
-    """Whether JPEG, PNG and WebP files have their end; leaves the file at its start."""
+    """Return True if a JPEG, PNG or WebP file is complete; leaves the file at its start."""
     head = file.read(12)
     size = file.seek(0, 2)
     file.seek(max(0, size - _TAIL))
@@ -118,9 +118,9 @@ def _is_whole(file: BinaryIO) -> bool:
 
 
 def _has_jpeg_end(file: BinaryIO) -> bool:
-    """Whether an end marker follows the first scan: data behind the photo is allowed.
+    """Return True if an end marker follows the first scan: data after the photo is allowed.
 
-    The thumbnail within the EXIF header has an end marker of its own, which does not count.
+    The thumbnail in the EXIF header has its own end marker, which is ignored.
     """
     data = file.read()
     file.seek(0)

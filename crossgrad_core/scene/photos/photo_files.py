@@ -1,4 +1,4 @@
-"""The files of a scene's posed photos and of their masks, found by name."""
+"""Matching of a scene's posed photos and masks with files by name."""
 
 import os
 import re
@@ -32,7 +32,7 @@ class PhotoFolder:
     """The photos below one folder, found by name.
 
     Args:
-        path: The folder; need not be there.
+        path: The folder; it may be missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,7 +43,7 @@ class PhotoFolder:
         """Find the photo of each posed image; see `FileNames`.
 
         Args:
-            names: What the poses call the photos.
+            names: Names of the photos in the pose file.
         """
         there = {name: name for name in names if self._holds(name)}
         rest = [name for name in names if name not in there]
@@ -54,16 +54,16 @@ class PhotoFolder:
         return replace(pairs, files={**there, **pairs.files})
 
     def _holds(self, name: str) -> bool:
-        """Whether a file of that name is there, whatever its suffix says."""
+        """Return True if a file of this name exists, whatever its suffix."""
         inside = not is_absolute(name) and ".." not in PurePosixPath(name).parts
         return inside and is_file(self.path / name)
 
 
 def find_photo_folders(images: Path) -> list[PhotoFolder]:
-    """The photo folders that are there: full size first, then `<images>_2`, `_4`, `_8`.
+    """Return the existing photo folders: full size first, then `<images>_2`, `_4`, `_8`.
 
     Raises:
-        UserError: None is there.
+        UserError: No photo folder exists.
     """
     paths = [images, *(images.with_name(f"{images.name}_{n}") for n in _REDUCED)]
     folders = [PhotoFolder(path) for path in paths if path.is_dir()]
@@ -79,13 +79,14 @@ def find_photo_folders(images: Path) -> list[PhotoFolder]:
 
 
 def walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Folders at and below a folder, then those behind its links to folders, each once.
+    """Walk a folder, then the folders that its links point to, each folder once.
 
-    Links behind links are not followed, nor one that leads to where the folder itself lies.
+    Links inside linked folders are not followed. A link to a parent of the folder is not followed.
 
     Yields:
-        The path below the folder with forward slashes (`.` for itself), the names of its folders,
-        of which those that are taken out of the list are not looked into, and of its files.
+        The path relative to the folder with forward slashes (`.` for the folder itself), the names
+        of its subfolders, and the names of its files. A caller can remove subfolders from the list
+        to skip them.
     """
     seen: set[str] = set()
     links: list[Path] = []
@@ -109,7 +110,7 @@ def _tree(folder: Path, start: Path, seen: set[str]) -> Iterator[tuple[str, list
 
 
 def _list_photos(folder: Path) -> list[str]:
-    """Names of all photos below a folder, with forward slashes."""
+    """Return the names of all photos below a folder, with forward slashes."""
     names: list[str] = []
     for below, _, files in walked(folder):
         prefix = "" if below == "." else below + "/"
@@ -118,7 +119,7 @@ def _list_photos(folder: Path) -> list[str]:
 
 
 def mask_names(name: str) -> tuple[str, ...]:
-    """What the mask of a photo may be called in a folder of masks, the first that is there.
+    """Return the possible names of a photo's mask in a mask folder; the first existing file counts.
 
     `aerial/0001.jpg` has the mask `aerial/0001.jpg.png` (COLMAP), `aerial/0001.png`,
     `aerial/0001_mask.png` (Metashape) or `aerial/0001.jpg`.
@@ -128,15 +129,15 @@ def mask_names(name: str) -> tuple[str, ...]:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of a photo; None where it has none."""
+    """Return the mask of a photo; None without a mask."""
     return next(filter(is_file, (folder / each for each in mask_names(name))), None)
 
 
 def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Find the mask of each photo that has one.
 
-    Names of `mask_names` come first. Then other folders, suffixes and letter cases are tried, and
-    last names with a word such as `mask` before or after the photo's name.
+    The names of `mask_names` are tried first. Then other folders, suffixes and letter cases are
+    tried, and finally names with a word such as `mask` before or after the photo's name.
 
     Args:
         folder: The folder of the masks.
@@ -152,10 +153,10 @@ def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def find_mask_folder(option: Path | None, root: Path) -> Path | None:
-    """The mask folder: the option's, as given or within the scene; else `<scene>/masks`, if any.
+    """Return the mask folder: the option, as given or in the scene; else `<scene>/masks`, if any.
 
     Raises:
-        UserError: The option names a folder that is not there.
+        UserError: The folder of the option does not exist.
     """
     if option is None:
         return next(_default_folders(root), None)
@@ -170,10 +171,10 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
 
 
 def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[str]) -> None:
-    """Refuse a mask folder that fits no photo; by default an empty folder is no mask folder.
+    """Refuse a mask folder without a mask for any photo; an empty default folder is ignored.
 
     Raises:
-        UserError: No photo has a mask in it.
+        UserError: No photo has a mask in the folder.
     """
     there = PhotoFolder(folder).names if not found else ()
     if found or (option is None and not there):
@@ -190,7 +191,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
 
 
 def _default_folders(root: Path) -> Iterator[Path]:
-    """`<scene>/masks`, and folders whose name differs in letter case only."""
+    """Yield `<scene>/masks`, and folders whose name differs in letter case only."""
     if (root / _DEFAULT).is_dir():
         yield root / _DEFAULT
     alike = (path for path in sorted(root.iterdir()) if path.name.casefold() == _DEFAULT)
@@ -198,17 +199,17 @@ def _default_folders(root: Path) -> Iterator[Path]:
 
 
 def _undecorated(name: str) -> str:
-    """The name of a mask without a word such as `mask` at its start or end."""
+    """Return the name of a mask without a word such as `mask` at its start or end."""
     path = PurePosixPath(without_suffix(name))
     stem = without_suffix(_DECORATION.sub("", path.name))
     return str(path.with_name(stem)) if stem else str(path)
 
 
 def with_photo_names(raw: RawScene) -> RawScene:
-    """Return the scene with each posed image under the name that its photo has below `images`.
+    """Return the scene with each posed image under the path of its photo below `images`.
 
-    Programs write absolute paths, or paths from another folder. Spelling is left as it is: a name
-    may differ from its photo's in suffix and case.
+    Programs write absolute paths, or paths relative to another folder. Suffix and case of a name
+    are kept, even if they differ from the photo file.
 
     Raises:
         UserError: There is no photo folder, or an absolute path fits several photos.

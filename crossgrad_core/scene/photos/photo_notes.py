@@ -1,4 +1,4 @@
-"""Notes on the files of a scene: what was done to its photos, and which files nothing uses."""
+"""Notes on the files of a scene: processing of its photos, and unused files."""
 
 import os
 from collections import Counter, defaultdict
@@ -22,17 +22,17 @@ _SHOWN_SIZES = 3
 #: Undistortion of ordinary lenses loses less than this share of the pixels.
 _WORTH_A_NOTE = 0.1
 Sources = Mapping[str, PhotoSource]
-#: Files of crossgrad: a folder with one of the first was written by a run or by `prepare`.
+#: Files of crossgrad: a folder with one of the first set was written by a run or by `prepare`.
 _OWN_FOLDERS: Final = frozenset({"config.yaml", "plan.json"})
 _OWN_FILES: Final = frozenset({"report.png"})
-#: Folders with a note of their own.
+#: Largest number of groups of unused files with a separate note.
 _MOST: Final = 8
 
 
 def note_pairing(
     folder: PhotoFolder, paths: Mapping[str, Path], names: Sequence[str], used: Collection[Path]
 ) -> list[str]:
-    """Posed images without a photo, photos without a pose, and pairs that differ in spelling."""
+    """Note posed images without a photo, photos without a pose, and names spelled differently."""
     absent = [name for name in names if name not in paths]
     known = frozenset(used)
     others = [name for name in folder.names if folder.path / name not in known]
@@ -51,7 +51,7 @@ def note_pairing(
 
 
 def note_links(root: Path, sources: Sources) -> list[str]:
-    """Where photos and masks lie that are no part of the scene's folder."""
+    """Note photos and masks that are stored outside the scene's folder."""
     home = os.path.join(os.path.realpath(root), "")
     files = [file for each in sources.values() for file in (each.path, each.mask) if file]
     outside = [file for file in files if not os.path.realpath(file).startswith(home)]
@@ -65,7 +65,7 @@ def note_links(root: Path, sources: Sources) -> list[str]:
 
 
 def note_undistortion(sources: Sources) -> list[str]:
-    """How many photos are undistorted, from which camera models."""
+    """Note the number of undistorted photos, by camera model."""
     models = Counter(s.distorted.model for s in sources.values() if s.distorted is not None)
     if not models:
         return []
@@ -75,7 +75,7 @@ def note_undistortion(sources: Sources) -> list[str]:
 
 
 def _costs(sources: Sources) -> list[str]:
-    """What undistortion loses of lenses that fold over or see far more than a pinhole camera."""
+    """Note the losses of undistortion for lenses that fold over or are wider than a pinhole."""
     lenses = [source.distorted for source in sources.values() if source.distorted is not None]
     found = [(lens, cost) for lens in lenses if (cost := lens.cost) is not None]
     folded = [(lens.model, cost.beyond) for lens, cost in found if cost.beyond > 0.0]
@@ -103,7 +103,7 @@ def _percent(shares: Sequence[float]) -> str:
 
 
 def _degrees(values: Sequence[float]) -> str:
-    """Whole numbers from the least to the most."""
+    """Format the range from the smallest to the largest value in whole numbers."""
     low, high = (f"{value:.0f}" for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 
@@ -111,7 +111,7 @@ def _degrees(values: Sequence[float]) -> str:
 def note_sizes(
     folder: str, sources: Sources, calibrated: Mapping[str, tuple[int, int]]
 ) -> list[str]:
-    """Sizes as trained, the folder that they come from, and the resize filter."""
+    """Note the training sizes, the folder of the photos, and the resize filter."""
     sizes = Counter(source.target for source in sources.values()).most_common()
     shown = [f"{width} x {height} px ({number})" for (width, height), number in sizes]
     text = ", ".join(shown[:_SHOWN_SIZES])
@@ -127,7 +127,7 @@ def note_sizes(
 
 
 def note_reductions(sources: Sources) -> list[str]:
-    """How many photos are so large that they are decoded at a reduced size."""
+    """Note the number of photos that are so large that they are decoded at a reduced size."""
     reduced = [s.reduction for s in sources.values() if s.reduction > 1]
     if not reduced:
         return []
@@ -141,7 +141,7 @@ def note_kinds(
     headers: Mapping[str, PhotoHeader],
     background: tuple[float, float, float] | None,
 ) -> list[str]:
-    """Turned, transparent, grey and masked photos."""
+    """Note the numbers of turned, transparent, grey and masked photos."""
     total = len(sources)
     over = f"blended over RGB {background}" if background else "alpha < 0.5 does not count"
     told = (
@@ -159,7 +159,7 @@ def note_kinds(
 
 
 def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
-    """Says so when the decoded photos do not fit into the memory set aside for them."""
+    """Note if the decoded photos do not fit into the memory reserved for them."""
     need = sum(3 * s.target[0] * s.target[1] for s in sources.values()) / _MIB
     if need <= options.cache_mib:
         return []
@@ -171,13 +171,13 @@ def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
 
 
 def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list[str]:
-    """Return a note for each folder and reason: photos, masks, depth, points and tables not used.
+    """Note unused photos, masks, depth maps, points and tables: one note per folder and reason.
 
-    Photos without a pose in the photo folder are left out: they have a note of their own.
+    Photos without a pose in the photo folder are excluded: `note_pairing` reports them.
 
     Args:
         raw: The scene.
-        used: Files that are used, in addition to those of the reader.
+        used: Files that are used, in addition to the files of the reader.
         masks: The folder of the masks, if any.
     """
     groups = defaultdict[tuple[str, str], list[str]](list)
@@ -198,7 +198,7 @@ def note_unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> list
 
 
 def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str, str]:
-    """Files that are not used, as they are or through links, and the reasons."""
+    """Return the files that are not used, directly or through links, with the reasons."""
     known, home = set(map(os.path.abspath, used)), os.path.abspath(raw.root)
     files = [name for name in _files(raw.root) if os.path.join(home, name) not in known]
     reasons = {name: reason for name in files if (reason := _reason(name, raw, masks))}
@@ -213,7 +213,7 @@ def _unused(raw: RawScene, used: Iterable[Path], masks: Path | None) -> dict[str
 
 
 def _files(root: Path) -> Iterator[str]:
-    """Paths of the files below a scene, without hidden ones and what crossgrad writes."""
+    """Yield the paths of the files below a scene, except hidden files and outputs of crossgrad."""
     for below, folders, files in walked(root):
         if below != "." and _OWN_FOLDERS & set(files):
             folders.clear()
@@ -225,7 +225,7 @@ def _files(root: Path) -> Iterator[str]:
 
 
 def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
-    """Why a file is not used; None for a file of no known kind, or with a note of its own."""
+    """Return why a file is not used; None for an unknown kind or a file with its own note."""
     kind, path = kind_of(name), raw.root / name
     if kind is None or (kind is PHOTO and path.is_relative_to(raw.images)):
         return None

@@ -1,8 +1,8 @@
-"""Photos in the size that they are trained in, kept on disk from one run to the next.
+"""A disk cache of photos in their training size, shared by all runs.
 
-A file holds one photo and is named by all that its pixels come from, so an entry never has to be
-brought up to date. It appears whole or not at all, carries a checksum, and counts as missing where
-anything about it is not as expected.
+A file holds one photo. Its name is a hash of everything that determines the pixels, so an entry
+never needs an update. An entry is written completely or not at all. It carries a checksum, and an
+entry with any unexpected property counts as missing.
 """
 
 import logging
@@ -26,17 +26,17 @@ import torch
 from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
-#: The folder of all entries, where not below the user's cache folder.
+#: Environment variable for the folder of all entries; the default is in the user's cache folder.
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
 PIXELS_VERSION: Final = 2
-#: Bytes of a disk that are never taken.
+#: Bytes of a disk that stay free.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4
 _KEPT, _TEMPORARY = ".photo", ".tmp"
-#: Seconds after which an unfinished file is one of a process that was killed.
+#: Seconds after which an unfinished file belongs to a killed process.
 _STALE = 3600.0
-#: Seconds by which the times of files may be off.
+#: Uncertainty of file times in seconds.
 _GRAIN = 2.0
 _NUMBER = count()
 
@@ -44,7 +44,7 @@ Decoded = tuple[Tensor, Tensor | None]
 
 
 class Storable(Protocol):
-    """Something to be decoded that may be kept on disk."""
+    """An image that can be decoded and that may be cached on disk."""
 
     @property
     def target(self) -> tuple[int, int]:
@@ -53,16 +53,16 @@ class Storable(Protocol):
 
     @property
     def origin(self) -> str | None:
-        """All that the pixels come from; None where decoding takes no longer than reading."""
+        """Everything that determines the pixels; None if decoding is as fast as reading."""
         ...
 
     def decode(self) -> Decoded:
-        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts."""
+        """Return the photo [H, W, 3] uint8 and its mask [H, W] bool; None if all pixels count."""
         ...
 
 
 def store_folder() -> Path:
-    """Where photos are kept: `CROSSGRAD_CACHE`, else below the user's cache folder."""
+    """Return the cache folder: `CROSSGRAD_CACHE`, or a folder in the user's cache folder."""
     if given := os.environ.get(FOLDER):
         return Path(given) / "photos"
     beside = {"darwin": "~/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", "~")}
@@ -73,11 +73,12 @@ def store_folder() -> Path:
 class PhotoStore:
     """A folder of decoded photos of bounded size; several threads and processes may share it.
 
-    What was used since this one began stays; of the others those go first that were not used for
-    longest. Where that makes no room, or the disk has none, nothing more is kept.
+    Entries used since this store was opened are kept. The other entries are deleted if room is
+    needed, least recently used first. If this does not free enough room, or the disk is full, no
+    more photos are written.
 
     Args:
-        folder: The folder; made when something is kept.
+        folder: The folder; it is created when the first photo is written.
         mib: Size of all entries together, MiB.
     """
 
@@ -86,18 +87,18 @@ class PhotoStore:
         self._limit = mib * 2**20
         self._begun = time() - _GRAIN
         self._used: int | None = None
-        # When an entry that this one wrote or checked was last used: with that time it is sound.
+        # Last use of each entry that this store wrote or checked: valid while it is the file time.
         self._sound: dict[Path, int] = {}
         self._lock = Lock()
         self._open = mib > 0
 
     def holds(self, source: Storable) -> bool | None:
-        """Whether there is an entry of this photo, whole or not; None where none will be."""
+        """Return True if a file for this photo exists, valid or not; None if it is never cached."""
         origin = source.origin if self._open else None
         return None if origin is None else self._path(origin).is_file()
 
     def decoded(self, source: Storable) -> Decoded:
-        """The photo, from its entry where there is a good one; else decoded and kept.
+        """Return the photo from its entry if the entry is valid; else decode and store it.
 
         Raises:
             UserError: The photo is damaged.
@@ -143,7 +144,7 @@ class PhotoStore:
         self._sound[entry] = now
 
     def _close(self, why: str) -> None:
-        """Keeps nothing more in this run: photos are decoded again instead."""
+        """Write no more photos in this run: photos are decoded again instead."""
         self._open = False
         _LOG.info("no more photos are kept in %s: %s", self._folder, why)
 
@@ -156,7 +157,7 @@ class PhotoStore:
         return fits and shutil.disk_usage(self._folder).free >= size + RESERVE
 
     def _made_room(self, size: int) -> int:
-        """Deletes what nobody uses as far as needed; the bytes of what is left."""
+        """Delete unused entries as far as needed, and return the bytes of the remaining entries."""
         entries = sorted(_entries(self._folder))
         used = sum(length for _, length, _ in entries)
         for last_used, length, path in entries:
@@ -169,7 +170,7 @@ class PhotoStore:
 
 
 def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """When each was last used, its bytes and its path; deletes what killed processes left."""
+    """Yield time of last use, bytes and path of each entry; deletes files of killed processes."""
     with os.scandir(folder) as found:
         for each in found:
             with suppress(OSError):
@@ -181,7 +182,7 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
 
 
 def _packed(decoded: Decoded) -> list[bytes | memoryview]:
-    """An entry: magic, CRC-32 of the rest, pixels, and one bit for each pixel of a mask."""
+    """Pack an entry: magic, CRC-32 of the rest, pixels, and one bit for each pixel of a mask."""
     image, mask = decoded
     pixels = image.contiguous().numpy().reshape(-1).data
     bits = b"" if mask is None else np.packbits(mask.numpy()).tobytes()
@@ -190,9 +191,10 @@ def _packed(decoded: Decoded) -> list[bytes | memoryview]:
 
 
 def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | None:
-    """The photo and mask of an entry; None where it is missing or not what it should be.
+    """Read the photo and mask of an entry; None if the entry is missing or invalid.
 
-    Its checksum is left out where it was last used at `sound` [ns]: it takes as long as reading.
+    The checksum is skipped if the entry was last used at `sound` [ns], because computing it takes
+    as long as reading.
     """
     head, pixels, bits = len(_MAGIC) + _SUM, 3 * width * height, -(-width * height // 8)
     try:
@@ -218,6 +220,6 @@ def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | N
 
 @cache
 def made_by() -> str:
-    """What decides about the bits of a decoded photo, besides its file."""
+    """Return everything but the file that determines the bits of a decoded photo."""
     names = ("pillow", "pycolmap")
     return f"{PIXELS_VERSION} {' '.join(f'{name} {version(name)}' for name in names)}"

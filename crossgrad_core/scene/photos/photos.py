@@ -1,4 +1,4 @@
-"""Photos that are decoded when they are asked for, and the memory that keeps them."""
+"""Photos that are decoded on demand, and the memory cache that holds them."""
 
 import os
 from collections import OrderedDict
@@ -28,33 +28,33 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: The smallest size that JPEG files can be decoded at: all of their data is read for it.
+#: Decode JPEG files at an eighth of their sides to test them: this reads all of their data.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
-#: Seconds that a photo is waited for which another thread is decoding.
+#: Seconds to wait for a photo that another thread is decoding.
 _PATIENCE = 0.5
-# More than the views of one step, so that none is decoded twice in it.
+# More than the views of one step, so that no photo is decoded twice in one step.
 _LATEST = 16
-#: Photos of fewer pixels are decoded about as quickly as read.
+#: Photos with fewer pixels are decoded about as quickly as they are read from the disk cache.
 _LARGE = 2_000_000
 
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """How a view's photo comes from its file.
+    """How to decode a view's photo from its file.
 
     Attributes:
         path: The photo.
         width: Width of the photo in the pixels that its pose refers to.
-        height: Likewise.
+        height: Height of the photo in the same pixels.
         orientation: The EXIF orientation that its pose refers to; 1 for the stored pixel grid.
         mask: The mask file, or None.
-        alpha: Whether the file may have transparent pixels.
-        background: RGB in [0, 1] behind transparent pixels; None where they do not count.
-        distorted: The calibration to undistort with, in the size above; None for a pinhole.
+        alpha: True if the file may have transparent pixels.
+        background: RGB in [0, 1] behind transparent pixels; None if these pixels do not count.
+        distorted: Calibration for the undistortion, in the size above; None for a pinhole camera.
         target: (width, height) as trained.
-        reduction: What the file's width and height are divided by while it is decoded.
-        white: The value of white, if the file has 16 bits a channel.
+        reduction: Divisor of the file's width and height during decoding.
+        white: The value of white, if the file has 16 bits per channel.
     """
 
     path: Path
@@ -71,7 +71,7 @@ class PhotoSource:
 
     @property
     def may_mask(self) -> bool:
-        """Whether some pixels may not count."""
+        """True if some pixels may not count."""
         transparent = self.alpha and self.background is None
         blank = self.distorted is not None and not self.distorted.fills_frame
         return self.mask is not None or transparent or blank
@@ -85,25 +85,25 @@ class PhotoSource:
 
     @property
     def origin(self) -> str | None:
-        """All that the pixels come from; None where decoding takes no longer than reading them."""
+        """Everything that determines the pixels; None if decoding is as fast as reading."""
         pixels = self.width * self.height * self.reduction**2
         if pixels < _LARGE or (self.target == (self.width, self.height) and not self.distorted):
             return None
         files = [self.path] if self.mask is None else [self.path, self.mask]
         try:
             facts = [os.stat(path) for path in files]
-        except OSError:  # Decoding says what is wrong.
+        except OSError:  # Decoding reports the error later.
             return None
         marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
         return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
 
     @property
     def decoded_bytes(self) -> int:
-        """What the decoded photo and a mask take."""
+        """Upper bound of the bytes of the decoded photo and a mask."""
         return 4 * self.target[0] * self.target[1]
 
     def decode(self) -> Decoded:
-        """The photo [H, W, 3] uint8 and its mask [H, W] bool, None where every pixel counts.
+        """Decode the photo [H, W, 3] uint8 and its mask [H, W] bool; None if all pixels count.
 
         Raises:
             UserError: The photo or its mask is damaged or has changed its size.
@@ -127,7 +127,7 @@ class PhotoSource:
         return image, torch.from_numpy(resize(keep, *self.target) >= _HALF)
 
     def try_out(self) -> None:
-        """Finds out whether the files can be decoded, for less than `decode` takes.
+        """Test if the files can be decoded, in less time than `decode` needs.
 
         Raises:
             UserError: The photo or its mask is damaged.
@@ -148,7 +148,7 @@ class PhotoSource:
             )
 
     def _decode_mask(self) -> Pixels | None:
-        """The mask file in the photo's size, 0 or 255; the nearest pixel where sizes differ."""
+        """Decode the mask in the photo's size, 0 or 255; nearest neighbour if the sizes differ."""
         if self.mask is None:
             return None
         mask = decode_mask(self.mask)
@@ -159,7 +159,7 @@ class PhotoSource:
         return np.asarray(mask[rows[:, None], columns])
 
     def _undistort_mask(self, distorted: Calibration, keep: Pixels | None) -> Pixels | None:
-        """The mask in undistorted pixels; pixels that the photo does not reach do not count."""
+        """Undistort the mask; pixels outside the photo do not count."""
         if keep is not None:
             keep = distorted.undistort(keep)
         if distorted.fills_frame:
@@ -167,21 +167,21 @@ class PhotoSource:
         return _both(keep, np.where(distorted.reached(), _OPAQUE, 0).astype(np.uint8))
 
 
-#: Hashable, and equal where the outcome is.
+#: Hashable; two equal keys decode to the same pixels.
 Key = TypeVar("Key", bound=Storable)
 
 
 class PhotoCache(Generic[Key]):
-    """Decoded photos in a bounded amount of memory; may be used from several threads.
+    """A cache of decoded photos in bounded memory; it may be used from several threads.
 
-    Training walks through all photos again and again. Were the least recently used photo dropped, a
-    set a little larger than the memory would hardly ever be found in it. So what is there stays,
-    and only the latest few photos, and those that are expected, make room for new ones: of a set
-    twice as large as the memory, about half is found.
+    Training draws all photos again and again. A least-recently-used cache would almost never hold
+    the next photo if the set is a little larger than the memory. Therefore old photos stay, and new
+    photos replace only the latest few photos that are not expected next. If the set is twice as
+    large as the memory, about half of the photos are found.
 
     Args:
-        mib: Memory for decoded photos and masks, MiB. The latest photo is kept in any case.
-        store: Where photos are kept on disk; None decodes their files.
+        mib: Memory for decoded photos and masks, MiB. The latest photo is always kept.
+        store: Disk cache of the photos; None decodes their files.
     """
 
     def __init__(self, mib: int, store: PhotoStore | None = None) -> None:
@@ -200,18 +200,18 @@ class PhotoCache(Generic[Key]):
         return self._used
 
     def expect(self, sources: Iterable[Key]) -> None:
-        """Names the photos that will be asked for next: they are dropped last."""
+        """Announce the photos that will be requested next: they are dropped last."""
         self._expected = frozenset(sources)
 
     def holds(self, source: Key) -> bool:
-        """Whether a photo is there, or being decoded by some thread."""
+        """Return True if a photo is in memory or is being decoded by some thread."""
         return source in self._kept or source in self._latest or source in self._under_way
 
     def get(self, source: Key) -> Decoded:
-        """The decoded photo and mask of `source`; shared, so never to be written to.
+        """Return the decoded photo and mask of `source`; both are shared and must not be changed.
 
-        A photo that another thread is decoding is waited for, but not for long: where other
-        programs have the cores, that thread, which gives way to them, may get nowhere.
+        If another thread is decoding the photo, this waits only for a short time. The decoding
+        thread has low priority and may make no progress while other programs use the cores.
         """
         over, waited = Event(), False
         while True:
@@ -234,7 +234,7 @@ class PhotoCache(Generic[Key]):
                 over.set()
 
     def prepare(self, source: Key) -> bool:
-        """Sees to it that the photo is on disk; False where none are kept: nothing was done."""
+        """Write the photo to the disk cache; return False if no photo is written to disk."""
         there = None if self._store is None else self._store.holds(source)
         if there is False:
             self._decoded(source)
@@ -255,7 +255,7 @@ class PhotoCache(Generic[Key]):
             self._kept[key] = decoded
 
     def _dropped(self) -> Decoded:
-        """Takes out the oldest photo that is not expected, but never the latest one."""
+        """Remove the oldest photo that is not expected, but never the latest photo."""
         *others, _ = self._latest
         idle = next((key for key in others if key not in self._expected), None)
         if idle is None and self._kept:

@@ -1,4 +1,4 @@
-"""Threads that decode photos before they are needed, and the check that decodes each once."""
+"""Threads that decode photos before they are needed, and a check that decodes each photo once."""
 
 import logging
 import os
@@ -15,19 +15,19 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.scene.photos.photos import FilePhoto
 from crossgrad_core.scene.wording import name_some
 
-#: Photos that are decoded at once; more of them would take memory.
+#: Photos that are decoded at the same time; more photos would use more memory.
 AT_ONCE = 2
-#: Seconds that the end of a run waits for the photos that are being decoded beside it.
+#: Seconds that the end of a run waits for the photos that are still being decoded.
 _PATIENCE = 5.0
 _LEAST_URGENT = 19
 _LOG = logging.getLogger(__name__)
 
 
 class PhotosAhead:
-    """Decodes what the next steps will draw, and in between every photo once.
+    """Background threads that decode the photos of the next steps, and every other photo once.
 
-    So the training clock waits for no photo where there are cores enough, and a damaged photo is
-    found early, not when it is first drawn. Which photo is decoded when changes no bit of a run.
+    With enough cores the training clock never waits for a photo, and a damaged photo is found early
+    instead of when it is first drawn. The order of decoding never changes the result of a run.
     """
 
     def __init__(self) -> None:
@@ -42,13 +42,14 @@ class PhotosAhead:
     def at_work(
         self, views: Sequence[View], report: Callable[[Exception], None], *, keep: bool
     ) -> Iterator[None]:
-        """Decodes beside the block.
+        """Decode photos in the background while the block runs.
 
         Args:
-            views: All views, each of which is decoded once even where nobody asks for it.
-            report: Told the first error of those, from another thread; the others are not decoded.
-            keep: Whether there is memory for all of them; else those that are not expected go to
-                the disk, or it is only tried whether they can be decoded.
+            views: All views. Each is decoded once, even if no step requests it.
+            report: Called from another thread with the first error among these views; the remaining
+                views are then not decoded.
+            keep: True if all photos fit into memory. Otherwise the photos that are not expected are
+                written to the disk cache, or decoded only as a test.
         """
         self._unseen, self._report, self._keep = iter(views), report, keep
         self._at_work = True
@@ -66,18 +67,18 @@ class PhotosAhead:
 
     @property
     def useful(self) -> bool:
-        """Whether it helps to know which views come next: not once all photos are in memory."""
+        """True if announcing the next views helps: False once all photos are in memory."""
         return self._at_work
 
     def expect(self, views: Sequence[View]) -> None:
-        """Names the views that will be drawn next, in their order; replaces those named before."""
+        """Announce the next views in drawing order; this replaces the views announced before."""
         photos = [view.photo for view in views if isinstance(view.photo, FilePhoto)]
         if not photos:
             return
         cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
         for photo in photos:
             size += photo.source.decoded_bytes
-            if size <= cache.limit // 2:  # The others would drive them out again.
+            if size <= cache.limit // 2:  # More photos would push these out of the cache.
                 fitting.append(photo)
         cache.expect(photo.source for photo in fitting)
         with self._changed:
@@ -85,7 +86,7 @@ class PhotosAhead:
             self._changed.notify_all()
 
     def taken_cpu(self) -> float:
-        """CPU seconds of photos that were decoded since this was last asked."""
+        """Return the CPU seconds of photos decoded since the last call."""
         with self._changed:
             taken, self._cpu = self._cpu, 0.0
         return taken
@@ -99,7 +100,7 @@ class PhotosAhead:
                 self._cpu += thread_time() - begun
 
     def _next(self) -> Callable[[], None] | None:
-        """What to do next; None where there is nothing any more."""
+        """Return the next job; None if no job is left."""
         with self._changed:
             while self._at_work:
                 while self._expected:
@@ -120,7 +121,7 @@ class PhotosAhead:
         try:
             decode(view, keep=self._keep)
         except MemoryError:
-            self._unseen = iter(())  # Training needs it more.
+            self._unseen = iter(())  # Training needs the memory more.
         except Exception as error:  # Third-party photos may raise anything.
             self._unseen = iter(())
             report, self._report = self._report, _ignore
@@ -128,10 +129,10 @@ class PhotosAhead:
 
 
 def decode(view: View, *, keep: bool) -> None:
-    """Decodes a view's photo into memory, or else onto the disk, or to see whether that works.
+    """Decode a view's photo into memory, or else into the disk cache, or else only as a test.
 
     Raises:
-        UserError: It cannot be decoded.
+        UserError: The photo cannot be decoded.
     """
     photo = view.photo
     if keep or not isinstance(photo, FilePhoto):
@@ -142,38 +143,38 @@ def decode(view: View, *, keep: bool) -> None:
 
 
 def _get_quietly(photo: FilePhoto) -> None:
-    with suppress(Exception):  # Who asks for it is told.
+    with suppress(Exception):  # The later request for this photo reports the error.
         photo.cache.get(photo.source)
 
 
 def _ignore(error: Exception) -> None:
-    """Only the first error is reported."""
+    """Ignore an error: only the first error is reported."""
 
 
 def _give_way() -> None:
-    """Lets training have the processor, where a thread can have a priority of its own."""
+    """Give training priority over this thread, on systems with a priority per thread."""
     if sys.platform == "linux":
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, get_native_id(), _LEAST_URGENT)
 
 
 def fits(scene: Scene, mib: int) -> bool:
-    """Whether all decoded photos of a scene fit into so much memory: then none is decoded twice."""
+    """Return True if all decoded photos of a scene fit into memory, so none is decoded twice."""
     pixels = sum(view.camera.width * view.camera.height for view in scene.views)
     return 4 * pixels <= mib * 2**20  # RGB and a mask
 
 
 def check_photos(views: Sequence[View], *, keep: bool, whole: bool = False) -> None:
-    """Decodes the photos and masks of some views.
+    """Decode the photos and masks of some views to find damaged files.
 
     Args:
         views: The views.
-        keep: Whether there is room to keep what is decoded.
-        whole: Whether they are decoded whole even where there is none; else it is only tried
-            whether files can be decoded, JPEG files at an eighth of their size.
+        keep: True if there is memory to keep the decoded photos.
+        whole: True to decode photos completely even without memory to keep them. Otherwise the
+            files are only tested, JPEG files at an eighth of their size.
 
     Raises:
-        UserError: Some cannot be decoded; names them.
+        UserError: Some photos cannot be decoded; the message names them.
     """
     if not views:
         return

@@ -1,6 +1,6 @@
-"""Photo files through Pillow: which formats, how many pixels, and every fault as one error.
+"""Photo files through Pillow: allowed formats, pixel limit, and one error type for all faults.
 
-HEIC and HEIF, the formats of phones, are read where the package pillow-heif is installed.
+HEIC and HEIF, the formats of phones, are read if the package pillow-heif is installed.
 """
 
 import os
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-#: More pixels are not decoded at once: as much as Pillow allows by default, 0.5 GB of RGB.
+#: More pixels are not decoded at once. This is Pillow's default limit, 0.5 GB of RGB.
 MOST_PIXELS: Final = 178_956_970
-# What cameras and tools for masks write. Pillow knows more, among them formats that run programs.
+# Formats of cameras and mask tools. Pillow knows more formats, some of which run programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
 _LOCK = Lock()
 _DEEP = re.compile("RGBA?;16[BLN]")
-#: What the names of such files end in.
+#: Suffixes of HEIC and HEIF files.
 SUFFIXES = (".heic", ".heif", ".hif")
-#: Bytes of a file that tell.
+#: Bytes at the start of a file that identify HEIC and HEIF.
 HEAD = 12
 _BRANDS = frozenset(
     {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs", b"mif1", b"msf1"}
@@ -40,11 +40,11 @@ _BRANDS = frozenset(
 
 @contextmanager
 def opened(path: Path, what: str) -> Iterator["Image"]:
-    """A photo whose pixels are not decoded yet; what goes wrong with it inside becomes one error.
+    """Open a photo without decoding it; every error inside the block becomes one `UserError`.
 
     Args:
         path: The file.
-        what: The error in words, should there be one.
+        what: The message of the error.
 
     Raises:
         UserError: The file is missing, not a photo, without pixels, or damaged.
@@ -63,7 +63,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
             "the file is not a photo", where=path, found=found, todo="replace or remove it"
         ) from error
     except Exception as error:
-        # Decoders raise whatever a damaged file leads them into: KeyError, struct.error ...
+        # For damaged files, decoders raise any exception: KeyError, struct.error ...
         raise UserError(
             what,
             where=path,
@@ -73,9 +73,9 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
 
 
 class _Bounded(BufferedReader):
-    """A file of which no more is read than there is.
+    """A file from which no more bytes are read than it holds.
 
-    A chunk may claim any length, for which `read` would set memory aside at once.
+    A chunk may claim any length, and a plain `read` would allocate that much memory at once.
 
     Args:
         path: The file.
@@ -87,29 +87,29 @@ class _Bounded(BufferedReader):
 
     @override
     def read(self, size: int | None = -1, /) -> bytes:
-        """The next bytes; all that are left where no number is given."""
+        """Return the next bytes, or all remaining bytes if no number is given."""
         left = max(0, self._size - self.tell())
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def has_alpha(image: "Image") -> bool:
-    """Whether pixels of a photo may be transparent."""
+    """Return True if pixels of a photo may be transparent."""
     return "transparency" in image.info or image.mode in {"RGBA", "LA", "PA", "RGBa", "La"}
 
 
 def is_deep(image: "Image") -> bool:
-    """Whether a photo, not decoded yet, is grey, RGB or RGBA with 16 bits a channel."""
+    """Return True if an undecoded photo is grey, RGB or RGBA with 16 bits per channel."""
     return image.mode.startswith("I") or any(map(_DEEP.fullmatch, _stored_modes(image)))
 
 
 def take_lower_bytes(image: "Image") -> None:
-    """Let a colour photo of 16 bits be decoded to its lower bytes; by default the upper are taken.
+    """Make Pillow decode the lower bytes of a 16-bit colour photo; by default it uses the upper.
 
-    Pillow knows no colours of 16 bits. It takes the other byte where the byte order is the other.
+    Pillow has no 16-bit colour modes. It reads the other byte if the byte order is swapped.
     """
     other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
     modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
-    file: Any = image  # Types of Pillow know `tile` for opened files alone.
+    file: Any = image  # Pillow's types define `tile` only for opened files.
     file.tile = [
         (*tile[:3], mode if isinstance(tile[3], str) else (mode, *tile[3][1:]))
         for tile, mode in zip(file.tile, modes, strict=True)
@@ -117,15 +117,15 @@ def take_lower_bytes(image: "Image") -> None:
 
 
 def _stored_modes(image: "Image") -> list[str]:
-    """How the pixels of each part of a photo are stored, such as `RGB;16B`."""
+    """Return how the pixels of each part of a photo are stored, such as `RGB;16B`."""
     arguments = (tile[3] for tile in getattr(image, "tile", ()))
     return [str(args[0] if isinstance(args, tuple) and args else args) for args in arguments]
 
 
 def rows_of(image: "Image", top: int, end: int) -> bytes:
-    """The pixels of some rows of a photo that has been opened; decodes it if nobody has yet."""
+    """Return the pixels of some rows of an opened photo; decodes the photo if needed."""
     image.load()
-    with _LOCK:  # Pillow looks at its bound here, too.
+    with _LOCK:  # Pillow checks its pixel limit here, too.
         part = image.crop((0, top, image.width, end))
     return part.tobytes()
 
@@ -136,14 +136,14 @@ def _check_pixels(image: "Image", path: Path) -> None:
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
-    """As `Image.open`, but without a bound on the size: ours depends on how it is decoded."""
+    """Open an image like `Image.open`, but without Pillow's pixel limit: ours is checked later."""
     from PIL import Image
 
     Image.init()
     known = (*_FORMATS, "HEIF") if admit(file.read(HEAD), path) else _FORMATS
     file.seek(0)
     formats = [name for name in known if name in Image.OPEN]
-    with _LOCK:  # Pillow's bound is a global, and photos are decoded in several threads.
+    with _LOCK:  # Pillow's limit is a global, and photos are decoded in several threads.
         bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             return Image.open(file, formats=formats)
@@ -152,14 +152,14 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
 
 
 def admit(head: bytes, path: Path) -> bool:
-    """Whether a file is of this kind; if so, Pillow can open it from now on.
+    """Return True if a file is HEIC or HEIF; Pillow can then open it.
 
     Args:
-        head: Its first bytes.
+        head: The first bytes of the file.
         path: The file.
 
     Raises:
-        UserError: It is, and the package is missing.
+        UserError: The file is HEIC or HEIF, and the package pillow-heif is missing.
     """
     if head[4:8] != b"ftyp" or head[8:HEAD] not in _BRANDS:
         return False
@@ -179,6 +179,6 @@ def _registered() -> bool:
         from pillow_heif import register_heif_opener
     except ImportError:
         return False
-    # Photos are decoded in threads already.
+    # Photos are already decoded in several threads.
     register_heif_opener(thumbnails=False, decode_threads=1)
     return True

@@ -1,8 +1,8 @@
 """Sizes of photos and masks: scaled copies, turned photos, photos too large to decode.
 
-A JPEG file holds blocks of 8 x 8 frequencies, of which the decoder then takes the lowest 4 x 4, 2 x
-2 or 1 x 1: the whole photo never exists. Progressive files keep all frequencies in memory, so they
-cannot profit.
+A JPEG file holds blocks of 8 x 8 frequencies. For a reduced size the decoder uses only the lowest
+4 x 4, 2 x 2 or 1 x 1 frequencies, so the full photo is never in memory. Progressive files do not
+benefit, because their decoder keeps all frequencies in memory.
 """
 
 from pathlib import Path
@@ -18,14 +18,14 @@ _REDUCTIONS = (8, 4, 2)
 
 
 def is_scaled(size: Size, of: Size) -> bool:
-    """Whether a size is a scaled copy of another one, each side off by at most one pixel."""
+    """Return True if a size is a scaled copy of another size, each side within one pixel."""
     least = max((side - 1) / other for side, other in zip(size, of, strict=True))
     most = min((side + 1) / other for side, other in zip(size, of, strict=True))
     return least <= most
 
 
 def is_turned(size: Size, photo: Size) -> bool | None:
-    """Whether a mask is that of a photo turned by a quarter; None where it fits neither way."""
+    """Return True if a mask fits its photo only after a quarter turn; None if it never fits."""
     turned = photo[::-1]
     if size in {photo, turned}:
         return size != photo
@@ -33,10 +33,10 @@ def is_turned(size: Size, photo: Size) -> bool | None:
 
 
 def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
-    """Refuses a mask too large, or not in the proportion of its photo, perhaps of the turned one.
+    """Refuse a mask that is too large, or that does not have the proportions of its photo.
 
     Raises:
-        UserError: See above; or its file is damaged.
+        UserError: The mask is too large, has other proportions, or its file is damaged.
     """
     header = read_header(path)
     if header.width * header.height > pillow.MOST_PIXELS:
@@ -59,13 +59,13 @@ def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
 
 
 def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> int:
-    """By how much each side of a photo is divided while it is decoded: 1, 2, 4 or 8.
+    """Choose the divisor of each side of a photo during decoding: 1, 2, 4 or 8.
 
-    1 for all photos that can be decoded at once; else the most that keeps `max_size` pixels on the
-    longest side, or the least that is possible.
+    The divisor is 1 for all photos that can be decoded at once. For larger photos it is the largest
+    that keeps `max_size` pixels on the longest side, or else the smallest possible.
 
     Raises:
-        UserError: The photo is too large; says what to do.
+        UserError: The photo is too large; the message says what to do.
     """
     pixels = header.width * header.height
     if pixels <= pillow.MOST_PIXELS:
@@ -78,7 +78,7 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
 
 
 def too_large(path: Path, header: PhotoHeader) -> UserError:
-    """The error for a photo that cannot be decoded at once."""
+    """Return the error for a photo that cannot be decoded at once."""
     way = (
         "--max-size N, such as --max-size 4000, decodes it at a reduced size"
         if header.reducible

@@ -1,1 +1,1 @@
-"""The check of a scene against itself: do points, poses and photos belong together?"""
+"""The consistency check of a scene: agreement of its points, poses and photos."""

@@ -1,4 +1,4 @@
-"""The check of a scene against itself, before it is trained on."""
+"""The consistency check of a scene before training."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -23,24 +23,24 @@ from crossgrad_core.scene.wording import count, name_some
 
 #: Poses are equal below this difference of their numbers, local units.
 _SAME_POSE: Final = 1e-9
-#: Points beyond this many times the median distance from the cameras are as good as at infinity.
+#: Points beyond this many times the median distance from the cameras count as infinitely far.
 _INFINITE: Final = 1e4
-#: Pixels of the small photo that photos are compared by, in either direction.
+#: Pixels of the small copy for the comparison of photos, in either direction.
 _SMALL: Final = 16
 #: Mean difference in levels of 255 below which two photos are almost equal.
 _ALMOST: Final = 0.5
-#: A photo is blurred below this share of the usual sharpness, and dark or bright beyond so many
-#: stops from the usual brightness.
+#: A photo is blurred below this share of the median sharpness. It is dark or bright if it differs
+#: from the median brightness by more than this many stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
-#: Photos without which nothing is usual.
+#: With fewer photos, no median is computed.
 _FEWEST_PHOTOS: Final = 5
-#: Differences of neighbouring pixels over those of pixels this far apart measure sharpness.
+#: Sharpness is the difference of neighbouring pixels over that of pixels this far apart.
 _APART: Final = 6
 
 
 class Sketches:
-    """Photos as far as they are compared with each other: pixels on a grid.
+    """Samples of photos on a pixel grid, for comparing photos with each other.
 
     Args:
         images: [H, W, 3] photos.
@@ -48,7 +48,7 @@ class Sketches:
     Attributes:
         small: [V, 16, 16, 3] pixels, levels of 255.
         sharpness: [V] differences between neighbours over differences between pixels farther apart;
-            NaN if those hardly differ.
+            NaN if the farther pixels hardly differ.
         light: [V] mean level of the pixels, 0 to 255.
     """
 
@@ -64,7 +64,7 @@ class Sketches:
 
 @cache
 def _grid(height: int, width: int) -> Integers:
-    """Numbers of [3, 16, 16] pixels: on a grid, next to it, and farther to the right."""
+    """Return flat pixel indices [3, 16, 16]: on a grid, next to it, and farther to the right."""
     shares = (np.arange(_SMALL) + 0.5) / _SMALL
     down = (shares * height).astype(np.int64)
     right = (shares * max(width - _APART, 1)).astype(np.int64)
@@ -75,11 +75,11 @@ def _grid(height: int, width: int) -> Integers:
 def findings_of(
     scene: Scene, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
 ) -> Iterator[str]:
-    """Notes on a scene.
+    """Yield notes on unusual properties of a scene.
 
     Args:
         scene: The scene.
-        images: [H, W, 3] photos that were looked at.
+        images: [H, W, 3] photos that were checked.
         names: Their names.
     """
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
@@ -141,7 +141,7 @@ def _listed(which: NDArray[np.bool_], names: Sequence[str]) -> str:
 
 
 def _repeated(rows: NDArray[np.float64], names: Sequence[str]) -> list[str]:
-    """Names of the rows that equal an earlier row."""
+    """Return the names of the rows that equal an earlier row."""
     _, first, numbers = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     firsts = first[numbers.ravel()]
     return [name for i, name in enumerate(names) if firsts[i] != i]
@@ -152,17 +152,17 @@ _BYTES_OF_A_PIXEL: Final = 4
 
 
 def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -> Scene:
-    """The scene with notes on what in it disagrees, and the figures in `check`.
+    """Check a scene and return it with notes on contradictions, and with the figures in `check`.
 
     Args:
         scene: The scene.
         path: Its folder, for messages.
-        cache_mib: Memory for decoded photos: of a scene that is larger, evenly spread photos are
-            looked at.
-        accept: Go on although the scene disagrees as a whole.
+        cache_mib: Memory for decoded photos. If the scene needs more, only evenly spaced photos are
+            checked.
+        accept: Continue even if the scene as a whole is contradictory.
 
     Raises:
-        UserError: The scene disagrees as a whole.
+        UserError: The scene as a whole is contradictory.
     """
     begun = perf_counter()
     pixels = pixels_of(scene)
@@ -190,7 +190,7 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
 
 
 def _is_decoded(pixels: Pixels, view: int) -> bool:
-    """Decode a photo. If it cannot be decoded, return False; who needs the photo reports why."""
+    """Decode a photo; return False if this fails. Later users of the photo report the error."""
     try:
         pixels(view)
     except UserError:
@@ -199,7 +199,7 @@ def _is_decoded(pixels: Pixels, view: int) -> bool:
 
 
 def _looked_at(scene: Scene, cache_mib: int) -> Sequence[int]:
-    """All views, or as many as there is memory for, evenly spread."""
+    """Return all views, or as many evenly spaced views as fit into memory."""
     number = len(scene.views)
     if fits(scene, cache_mib):
         return range(number)

@@ -1,4 +1,4 @@
-"""The cause of a disagreement: the change that repairs the scene when it is tried."""
+"""Diagnosis of a contradictory scene: the trial change that repairs it names the cause."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -16,17 +16,17 @@ from crossgrad_core.scene.self_check.evidence import (
     Rig,
 )
 
-#: Cameras that trials are made with.
+#: Cameras that are used in trials.
 MOST_CAMERAS: Final = 12
-#: Points in frame below which an untracked camera counts as seeing nothing.
+#: With fewer points in frame, a camera without tracks counts as seeing nothing.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
-#: A later trial must be so much better than an earlier, simpler one.
+#: A later trial must score this much more than an earlier, simpler trial.
 _CLEARLY: Final = 0.03
-#: A probe must be so much better than the scene as it is.
+#: A probe must score this much more than the unchanged scene.
 _PROBED: Final = 0.01
-#: How often the step of a search is halved.
+#: Number of times that the step of a search is halved.
 _ROUNDS: Final = 4
-#: How well the photos of a scene agree at least, and what a change that repairs a scene gains.
+#: The least score of a consistent scene, and the least gain of a change that repairs a scene.
 LEAST: Final = 0.35
 GAINED: Final = 0.25
 Change: TypeAlias = Callable[[Rig], Rig]
@@ -34,11 +34,11 @@ _POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down,
 _PHOTOS: Final = "put the photos back as they were when the poses were estimated"
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 _AXES: Final = "xyz"
-#: Steps of a factor's logarithm; steps and reach of the principal point, shares of the photo.
+#: Step of a factor's logarithm; step and reach of the principal point, in shares of the photo.
 _FACTOR: Final = 0.04
 _OFF: Final = 0.05
 _MOST_OFF: Final = 0.5
-#: Turns and mirrorings of a photo around its middle.
+#: Rotations and reflections of a photo around its centre.
 _TURNS: Final = (
     ("the photos are mirrored left to right", [[-1.0, 0.0], [0.0, 1.0]]),
     ("the photos are mirrored top to bottom", [[1.0, 0.0], [0.0, -1.0]]),
@@ -55,8 +55,8 @@ class Trial:
     """A change of a rig.
 
     Attributes:
-        cause: What is wrong with the scene if the change repairs it.
-        todo: What the user can do about it.
+        cause: The defect of the scene if the change repairs it.
+        todo: The remedy for the user.
         change: The change.
     """
 
@@ -70,9 +70,9 @@ class Diagnosis:
     """The trial that fits best.
 
     Attributes:
-        before: How well the photos agree as they are, in [0, 1].
-        after: How well they agree after the change.
-        trial: The change; None if none is better.
+        before: Score of the unchanged photos, in [0, 1].
+        after: Score after the change.
+        trial: The change; None if no change is better.
     """
 
     before: float
@@ -81,12 +81,12 @@ class Diagnosis:
 
     @property
     def repairs(self) -> bool:
-        """Whether the change makes photos agree that did not."""
+        """True if the change makes photos agree that did not agree before."""
         return self.after >= LEAST and self.after >= self.before + GAINED
 
 
 def scores(agreement: Agreement, *, tracked: bool) -> Floats:
-    """[V] how well photos agree, in [0, 1]: correlation, times the share in frame of tracks."""
+    """Return scores [V] in [0, 1]: colour correlation, for tracks times the share in frame."""
     correlation = np.maximum(np.nan_to_num(agreement.correlation), 0.0)
     if tracked:
         return np.asarray(correlation * np.nan_to_num(agreement.share))
@@ -94,19 +94,19 @@ def scores(agreement: Agreement, *, tracked: bool) -> Floats:
 
 
 def some(cameras: Integers, most: int = MOST_CAMERAS) -> Integers:
-    """At most so many cameras, evenly spread."""
+    """Return at most `most` cameras, evenly spaced."""
     every = np.linspace(0, len(cameras) - 1, min(len(cameras), most))
     return cameras[every.round().astype(np.int64)]
 
 
 @dataclass(frozen=True)
 class Search:
-    """A change with one number or two that are looked for.
+    """A change with one or two unknown numbers.
 
     Attributes:
         values: [N, D] the numbers that are tried first.
-        step: Their distance from each other.
-        trial: The trial of D numbers.
+        step: Distance between neighbouring values.
+        trial: Makes the trial for D numbers.
     """
 
     values: Floats
@@ -115,23 +115,23 @@ class Search:
 
 
 class Bench:
-    """Tries changes on some cameras of the evidence."""
+    """A test of changes on some cameras of the evidence."""
 
     def __init__(self, evidence: Evidence, cameras: Integers) -> None:
         self._evidence = evidence.chosen(some(cameras))
         self.before = self.score(self._evidence.rig)
 
     def score(self, rig: Rig) -> float:
-        """How well the photos agree in a rig, mean over the cameras."""
+        """Return the mean score of the cameras in a rig."""
         return float(scores(self._evidence.agreement(rig), tracked=self._evidence.tracked).mean())
 
     def tried(self, trial: Trial) -> float:
-        """How well the photos agree after a change."""
+        """Return the mean score after a change."""
         with np.errstate(all="ignore"):
             return self.score(trial.change(self._evidence.rig))
 
     def is_off(self) -> bool:
-        """Whether a small change makes the photos agree better."""
+        """Return True if a small change makes the photos agree better."""
         evidence = self._evidence
         first, *others = [probe.change(evidence.rig) for probe in probes()]
         rows = np.tile(evidence.rows, (1 + len(others), 1))
@@ -140,7 +140,7 @@ class Bench:
         return bool(each.max() > self.before + _PROBED)
 
     def diagnosis(self) -> Diagnosis:
-        """The change that makes the photos agree best; the likely ones are tried first."""
+        """Return the change with the best score; likely changes are tried first."""
         found = self.best(likely())
         if not found.repairs:
             for search in searches():
@@ -148,14 +148,14 @@ class Bench:
         return found if found.repairs else self.best(other_axes(), found)
 
     def best(self, trials: Iterable[Trial], found: Diagnosis | None = None) -> Diagnosis:
-        """The best of some trials, if it is better than what was found before."""
+        """Return the best of some trials, or `found` if no trial is better."""
         found = found or Diagnosis(self.before, self.before, None)
         for trial in trials:
             found = _better(found, self.tried(trial), trial)
         return found
 
     def _searched(self, search: Search) -> tuple[float, Trial]:
-        """The best numbers of a search: the best of those given, then between their neighbours."""
+        """Search the best numbers: first the given values, then with halved steps around it."""
         tried = [self.tried(search.trial(value)) for value in search.values]
         best, score, step = search.values[int(np.argmax(tried))], max(tried), search.step
         for _ in range(_ROUNDS):
@@ -172,13 +172,13 @@ def _better(found: Diagnosis, score: float, trial: Trial) -> Diagnosis:
 
 
 def turns() -> Iterator[Trial]:
-    """Photos that are mirrored or rotated."""
+    """Yield trials that mirror or rotate the photos."""
     for cause, matrix in _TURNS:
         yield Trial(cause, _PHOTOS, _turned(np.array(matrix)))
 
 
 def likely() -> Iterator[Trial]:
-    """Common mistakes."""
+    """Yield trials for common mistakes."""
     yield Trial(
         "the poses have OpenGL axes (y up, z backward)",
         f"{_POSES}: negate the second and third row of each world-to-camera matrix",
@@ -205,7 +205,7 @@ def likely() -> Iterator[Trial]:
 
 
 def other_axes() -> Iterator[Trial]:
-    """All other axes of points and of cameras."""
+    """Yield trials for all other axes of points and of cameras."""
     for matrix, text in _signed_axes():
         yield Trial(
             f"the points have other axes than the poses: ({text}) of the points fit",
@@ -219,7 +219,7 @@ def other_axes() -> Iterator[Trial]:
 
 
 def searches() -> Iterator[Search]:
-    """All changes with numbers: factors by their logarithm, then shares of width and height."""
+    """Yield changes with numbers: factors by their logarithm, then shares of width and height."""
     for make, most in ((_focal, 5.0), (_scaled, 100.0), (_resized, 10.0)):
         steps = np.arange(-np.log(most), np.log(most), _FACTOR)
         yield Search(steps[:, None], _FACTOR, _by_logarithm(make))
@@ -229,7 +229,7 @@ def searches() -> Iterator[Search]:
 
 
 def probes() -> Iterator[Trial]:
-    """Small changes of what is known as numbers: a right scene agrees best as it is."""
+    """Yield small changes of the numeric parameters: a correct scene scores best unchanged."""
     for make in (_focal, _scaled):
         yield from (make(value) for value in (0.93, 1.07))
     for value in (-0.04, 0.04):
@@ -256,7 +256,7 @@ def _with_points(matrix: Floats) -> Change:
 
 
 def _signed_axes() -> Iterator[tuple[Floats, str]]:
-    """All ways to exchange and to negate axes but that which leaves them, with a name."""
+    """Yield all permutations and sign changes of the axes except the identity, with a name."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
@@ -267,7 +267,7 @@ def _signed_axes() -> Iterator[tuple[Floats, str]]:
 
 
 def _inverted() -> Iterator[Trial]:
-    """Poses that are inverse, or of which a part is."""
+    """Yield trials for poses that are inverse, completely or in part."""
     cause = "the poses are camera-to-world where world-to-camera is expected"
     todo = "invert the 4 x 4 matrix of each pose in the model"
     for own, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
@@ -317,7 +317,7 @@ def _placed(rig: Rig, rotations: Floats, centers: Floats) -> Rig:
 
 
 def _reordered(order: tuple[int, ...]) -> Change:
-    """The rotations of the quaternions (w, x, y, z) whose numbers are taken in another order."""
+    """Return a change that reads the quaternions (w, x, y, z) in another order."""
 
     def change(rig: Rig) -> Rig:
         from scipy.spatial.transform import Rotation
@@ -359,7 +359,7 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and poses have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # The same picture as of scaled points, and each camera may have its own factor.
+        # This gives the same image as scaled points, and each camera may have its own factor.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 

@@ -1,4 +1,4 @@
-"""How well photos agree with points: share of the points in frame, correlation of colours.
+"""The agreement of photos with points: share of points in frame, correlation of colours.
 
 Cameras and points are arrays in input coordinates, so that trials can change them.
 """
@@ -17,21 +17,21 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 #: Photos as they are, neither turned nor mirrored.
 UPRIGHT: Final = np.eye(2)
-#: Observations below which a correlation says nothing.
+#: With fewer observations, a correlation is not computed.
 FEWEST: Final = 8
-#: The same for colours of points that other photos show.
+#: The same limit if the colours of points come from other photos.
 FEWEST_OF_PHOTOS: Final = 24
-#: Observed points of a photo that are looked at.
+#: The most observed points of a photo that are used.
 MOST_OBSERVED: Final = 64
-#: Points of a camera that trials look at.
+#: The most points of a camera that trials use.
 MOST_TRIED: Final = 2_000
-#: Points that are tested for each photo without tracks, at least.
+#: The least number of points that are tested for each photo without tracks.
 _TESTED: Final = 1_500
-#: A point is hidden where another one in its cell is nearer by this factor.
+#: A point is hidden if another point in its cell is nearer by this factor.
 _HIDES: Final = 1.15
-#: Points of a cell of the depth test, and the most cells in either direction.
+#: Points per cell of the depth test, and the most cells in either direction.
 _IN_A_CELL, _CELLS = 6, 64
-#: Levels of 255: colours that spread less than this cannot be compared.
+#: Levels of 255: colours with a smaller spread cannot be compared.
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
@@ -50,9 +50,9 @@ class Rig:
         principal: [V, 2] pixels.
         sizes: [V, 2] width and height in pixels.
         points: [P, 3] input units.
-        photos: [V] the view whose photo each camera is compared with.
-        count: Photos of the scene.
-        turn: [2, 2] turns or mirrors the photos around their middle.
+        photos: [V] the view whose photo is compared with each camera.
+        count: Number of photos of the scene.
+        turn: [2, 2] matrix that turns or mirrors the photos around their centre.
     """
 
     rotations: Floats
@@ -67,7 +67,7 @@ class Rig:
 
     @classmethod
     def of(cls, scene: Scene) -> "Rig":
-        """The rig of a scene."""
+        """Make the rig of a scene."""
         cameras = [view.camera for view in scene.views]
         poses = np.stack([each.world_to_camera.numpy() for each in cameras])
         rotations = poses[:, :3, :3]
@@ -85,7 +85,7 @@ class Rig:
         )
 
     def chosen(self, views: Sequence[int] | Integers) -> "Rig":
-        """The rig with some of its cameras, which keep their photos."""
+        """Return the rig with some of its cameras, which keep their photos."""
         rows = np.asarray(views, dtype=np.int64)
         return replace(
             self,
@@ -98,7 +98,7 @@ class Rig:
         )
 
     def joined(self, others: Sequence["Rig"]) -> "Rig":
-        """The cameras of this rig and of others with the same points, in one rig."""
+        """Join the cameras of this rig and of other rigs with the same points."""
         rigs = (self, *others)
         return replace(
             self,
@@ -116,14 +116,14 @@ class Rig:
         return np.asarray(-np.einsum("vji,vj->vi", self.rotations, self.translations))
 
     def project(self, rows: Integers) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Where the cameras see points.
+        """Project points into the cameras.
 
         Args:
             rows: [V, N] rows of points for each camera.
 
         Returns:
-            [2, V, N] places in the photo as shares of its width and height, [V, N] depths, and
-            [V, N] whether the point is in front of the camera and in its frame.
+            [2, V, N] positions in the photo as shares of its width and height, [V, N] depths, and a
+            mask [V, N] of the points in front of the camera and in its frame.
         """
         local = self.rotations @ self.points.take(rows, axis=0).transpose(0, 2, 1)
         x, y, depth = local.transpose(1, 0, 2) + self.translations.T[:, :, None]
@@ -141,13 +141,13 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How well each photo agrees with the points.
+    """The agreement of each photo with the points.
 
     Attributes:
         share: [V] share of the points that are in front of the camera, in frame and not hidden;
             NaN without any points.
-        inside: [V] points whose colours were compared.
-        correlation: [V] of the colours of points and photo; NaN where it cannot be told.
+        inside: [V] number of points whose colours were compared.
+        correlation: [V] correlation of the colours of points and photo; NaN if it is undefined.
         spread: [V] standard deviation of the points' colours, levels of 255.
     """
 
@@ -158,20 +158,20 @@ class Agreement:
 
     @property
     def noise(self) -> Floats:
-        """[V] standard deviation of the points' colours around those that the photo predicts."""
+        """[V] standard deviation of the points' colours around the prediction by the photo."""
         return self.spread * np.sqrt(np.maximum(1.0 - np.maximum(self.correlation, 0.0) ** 2, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The points that are looked at, and the photos.
+    """The points and photos of the check.
 
     Attributes:
         pixels: Decodes the photo of a view.
-        rig: The cameras that are looked at.
-        rows: [V, N] rows of points for each camera, -1 where there are fewer.
-        colors: [P, 3] colours of points; None takes those of the other photos of each point.
-        tracked: Whether rows are observations; else points may be hidden or out of frame.
+        rig: The cameras of the check.
+        rows: [V, N] rows of points for each camera, padded with -1.
+        colors: [P, 3] colours of points; None uses each point's colours in the other photos.
+        tracked: True if rows are observations; else points may be hidden or out of frame.
     """
 
     pixels: Pixels
@@ -181,16 +181,16 @@ class Evidence:
     tracked: bool
 
     def chosen(self, cameras: Integers) -> "Evidence":
-        """The evidence of some cameras."""
+        """Return the evidence of some cameras."""
         rows = self.rows[cameras, :MOST_TRIED]
         return replace(self, rig=self.rig.chosen(cameras), rows=rows)
 
     def of_photos(self) -> "Evidence":
-        """The same with the colours of points as the other photos show them."""
+        """Return the evidence with the colours of points taken from the other photos."""
         return replace(self, colors=None)
 
     def sees_nothing(self, cameras: Integers) -> Booleans:
-        """Return for each of some cameras whether none of all points is in its frame."""
+        """Return a mask of the cameras without any point of the scene in frame."""
         rows = np.broadcast_to(np.arange(len(self.rig.points)), (1, len(self.rig.points)))
         return np.array(
             [not self.rig.chosen([camera]).project(rows)[2].any() for camera in cameras], dtype=bool
@@ -198,13 +198,13 @@ class Evidence:
 
     @property
     def colored(self) -> bool:
-        """Whether the colours of the points differ, so that they can be compared."""
+        """True if the colours of the points differ enough to be compared."""
         if self.colors is None:
             return True
         return bool(self.colors[np.unique(self.rows[self.rows >= 0])].std(axis=0).max() >= FLAT)
 
     def agreement(self, rig: Rig) -> Agreement:
-        """How well photos agree with the points in a rig, as it is or as a trial changes it."""
+        """Measure the agreement of photos and points in a rig, which a trial may have changed."""
         shares, depth, inside = rig.project(self.rows)
         known = self.rows >= 0
         inside &= known
@@ -227,7 +227,7 @@ class Evidence:
         return replace(found, correlation=np.where(few, np.nan, found.correlation))
 
     def _shown(self, photos: Integers, shares: Floats, inside: Booleans) -> Floats:
-        """[V, N, 3] colours of the photos at the points inside; masked pixels are not inside."""
+        """Return the photos' colours [V, N, 3] at points; clears `inside` for masked pixels."""
         photo_of = np.repeat(photos, inside.sum(axis=1))
         order = np.argsort(photo_of, kind="stable")
         at = np.flatnonzero(inside)[order]
@@ -247,7 +247,7 @@ class Evidence:
 
 
 def pixels_of(scene: Scene) -> Pixels:
-    """Decodes the photos of a scene, and keeps them."""
+    """Return a function that decodes the photos of a scene, and caches them."""
 
     @cache
     def decoded(view: int) -> Photo:
@@ -259,7 +259,7 @@ def pixels_of(scene: Scene) -> Pixels:
 
 
 def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
-    """The points that some views observed: of many those that other photos are looked at for, too.
+    """Collect points that some views observed, preferably points that several views observed.
 
     Args:
         scene: The scene.
@@ -278,13 +278,13 @@ def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
 
 
 def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence:
-    """Some points for each of some views without tracks: those in frame that none hides count.
+    """Collect random points for views without tracks; a depth test later removes hidden points.
 
     Args:
         scene: The scene.
         views: Rows of the views.
         pixels: Decodes their photos.
-        most: Points of all views together.
+        most: Number of points of all views together.
     """
     number, total = max(most // len(views), _TESTED), len(scene.points)
     some = np.random.default_rng(0).choice(total, min(number, total), replace=False)
@@ -293,7 +293,7 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
 
 
 def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
-    """[V, N] which points in frame are about the nearest of their cell: a coarse depth buffer."""
+    """Return a mask [V, N] of the points in frame nearest to the camera: a coarse depth buffer."""
     cameras = len(depth)
     cells = np.clip(np.sqrt(inside.sum(axis=1) / _IN_A_CELL), 1, _CELLS).astype(np.int64)
     across, down = (
@@ -307,7 +307,7 @@ def _unhidden(shares: Floats, depth: Floats, inside: Booleans) -> Booleans:
 
 
 def _compared(share: Floats, inside: Booleans, shown: Floats, expected: Floats) -> Agreement:
-    """The agreement of cameras, by the colours [V, N, 3] of the points inside."""
+    """Compute the agreement of cameras from the colours [V, N, 3] of the points inside."""
     number = inside.sum(axis=1)
     divisor = np.maximum(number, 1)
 

@@ -1,4 +1,4 @@
-"""Whether the photos of a scene agree with its points, which do not, and why."""
+"""The verdict on a scene: do its photos agree with its points, which photos do not, and why."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,34 +30,34 @@ from crossgrad_core.scene.self_check.evidence import (
     tested,
 )
 
-#: The scene disagrees as a whole if more of its photos disagree.
+#: If more than this share of the photos disagrees, the scene as a whole disagrees.
 _MOST_BAD: Final = 0.6
 #: A photo disagrees below this share of the correlation of the better photos.
 _BAD: Final = 0.33
-#: Share of observed points in frame below which the pose of a photo is wrong.
+#: A pose is wrong if less than this share of its observed points is in frame.
 _IN_FRAME: Final = 0.5
-#: A photo below this share of the correlation of the better photos is tried out, and another photo
-#: fits its pose if it correlates by so much more.
+#: Below this share of the correlation of the better photos, a photo is tested as a suspect.
+#: A change or another photo fits a pose if its score is higher by this difference.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
-#: Photos that photos are compared with if most disagree, and suspects that are tried.
+#: Photos used for comparison if most photos disagree, and suspects that are tested.
 _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
-#: Share of the correlation of the better photos that a photo reaches which fits.
+#: A photo fits if it reaches this share of the correlation of the better photos.
 _FITS: Final = 0.7
-#: So few photos are only tried mirrored and rotated: by chance one of all changes fits them.
+#: Up to this many photos are only tested mirrored and rotated: some other change fits by chance.
 _FEW: Final = 2
-#: Points in frame of a photo that is compared with others, or has no tracks.
+#: Points in frame that a photo needs if it is compared with others or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
-#: Standard errors by which the correlation of a photo without tracks is below that bound.
+#: A photo without tracks disagrees if its correlation is this many standard errors below the bound.
 _ERRORS: Final = 3.0
 #: Points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
-#: The better photos: the upper quartile.
+#: The better photos are the upper quartile.
 _BETTER: Final = 0.75
-#: Photos that agree by less are also tried with the likely changes of all cameras.
+#: Photos with a lower score are also tested with the likely changes of all cameras.
 _SURE: Final = 0.75
-#: What a small change of all cameras gains at least if it is the cause.
+#: The least gain of a small change of all cameras that counts as the cause.
 _GAIN_OF_ALL: Final = 0.08
 
 
@@ -68,7 +68,7 @@ class Cause:
     Attributes:
         views: The photos.
         what: The cause.
-        todo: What the user can do.
+        todo: The remedy for the user.
     """
 
     views: tuple[int, ...]
@@ -78,15 +78,15 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The outcome for a scene.
+    """The result of the check for a scene.
 
     Attributes:
-        compared: Photos that were compared with points.
+        compared: Number of photos that were compared with points.
         correlation: Median correlation of colours; NaN if nothing could be compared.
         in_frame: Median share of the observed points in frame; NaN without tracks.
-        all_wrong: Why the whole scene disagrees; None if it does not.
+        all_wrong: Why the whole scene disagrees; None if it agrees.
         some_wrong: Why some photos disagree.
-        notes: What else was found.
+        notes: Other findings.
     """
 
     compared: int
@@ -113,7 +113,7 @@ _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
 
 def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
-    """The outcome for some views of a scene.
+    """Check some views of a scene.
 
     Args:
         scene: The scene.
@@ -129,7 +129,7 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         return replace(_UNKNOWN, notes=("there are no photos to compare the points with",))
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
-    # Beside photos with tracks, points that may be hidden say too little about single photos.
+    # If some photos have tracks, photos without tracks are skipped: hidden points would mislead.
     if has_tracks.any():
         rows = rows[has_tracks]
         return _Group.of(observed(scene, rows, pixels), rows).verdict()
@@ -138,13 +138,13 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Photos with tracks, or photos without.
+    """A group of photos, either all with tracks or all without.
 
     Attributes:
-        evidence: What they are compared with.
+        evidence: The points for the comparison.
         views: [V] rows of the views.
-        agreement: How well they agree as they are.
-        recolored: Whether the points' own colours say nothing, so that photos replace them.
+        agreement: Agreement of the unchanged photos.
+        recolored: True if the points' own colours are useless and photos replace them.
     """
 
     evidence: Evidence
@@ -158,19 +158,19 @@ class _Group:
         return group.by_photos() if evidence.tracked and not evidence.colored else group
 
     def by_photos(self) -> "_Group":
-        """The same photos, with the colours of points as the other photos show them."""
+        """Return the same photos, with the colours of points taken from the other photos."""
         evidence = self.evidence.of_photos()
         return _Group(evidence, self.views, evidence.agreement(evidence.rig), recolored=True)
 
     @cached_property
     def better(self) -> float:
-        """The correlation of the better photos; 0 if no photo has one."""
+        """The correlation of the better photos; 0 if no photo has a correlation."""
         known = self.agreement.correlation[np.isfinite(self.agreement.correlation)]
         return float(np.quantile(known, _BETTER)) if len(known) else 0.0
 
     @property
     def told(self) -> Booleans:
-        """[V] photos about which something can be said."""
+        """[V] photos with enough information for a verdict."""
         return np.isfinite(self.agreement.correlation) | self._out
 
     @cached_property
@@ -184,14 +184,14 @@ class _Group:
 
     @cached_property
     def bad(self) -> Booleans:
-        """[V] photos that disagree: a low correlation, and points unlike the photo's colours."""
+        """[V] photos that disagree: low correlation, and colours that deviate too much."""
         correlation, noise = self.agreement.correlation, self.agreement.noise
         low = np.nan_to_num(correlation, nan=1.0) < _BAD * self.better
         good = np.isfinite(correlation) & ~low
         usual = float(np.median(noise[good])) if good.any() else 0.0
-        # Halfway between the noise of photos that agree and that of photos of something else.
+        # The limit is halfway between the noise of consistent photos and of unrelated photos.
         unlike = low & (np.nan_to_num(noise) > usual * (1.0 - min(self.better, 0.99) ** 2) ** -0.25)
-        if self.recolored:  # Colours that a few other photos show say too little.
+        if self.recolored:  # Colours from a few other photos are not reliable enough.
             unlike[:] = False
         if not self.evidence.tracked:
             error = 1.0 / np.sqrt(np.maximum(self.agreement.inside, 1))
@@ -200,7 +200,7 @@ class _Group:
         return np.asarray(unlike | out)
 
     def verdict(self) -> Verdict:
-        """The outcome for these photos."""
+        """Return the result for these photos."""
         correlation = self.agreement.correlation
         known = np.isfinite(correlation)
         verdict = Verdict(
@@ -224,7 +224,7 @@ class _Group:
         return replace(verdict, some_wrong=self.suspects())
 
     def _of_all(self, rows: Integers) -> Cause | None:
-        """What makes photos agree better that agree somewhat."""
+        """Find a change of all cameras that improves photos which agree only partly."""
         bench = Bench(self.evidence, rows)
         if bench.before < _SURE:
             found = bench.best(likely())
@@ -238,14 +238,14 @@ class _Group:
 
     @property
     def _mean(self) -> float:
-        """How well the photos agree, mean over those of which something can be said."""
+        """The mean score of the photos with enough information."""
         return float(scores(self.agreement, tracked=self.evidence.tracked)[self.told].mean())
 
     def _cause(self, trial: Trial) -> Cause:
         return Cause(tuple(self.views.tolist()), trial.cause, trial.todo)
 
     def _as_a_whole(self, verdict: Verdict) -> Verdict:
-        """The outcome if most photos disagree."""
+        """Return the result if most photos disagree."""
         cameras = np.arange(len(self.views))
         bench = Bench(self.evidence, cameras)
         found = bench.best(likely()) if self.recolored else bench.diagnosis()
@@ -258,7 +258,7 @@ class _Group:
         return self._unexplained(verdict)
 
     def _unexplained(self, verdict: Verdict) -> Verdict:
-        """The outcome if most photos disagree and nothing that was tried repairs it."""
+        """Return the result if most photos disagree and no trial repairs them."""
         if self.better >= LEAST:
             return replace(verdict, some_wrong=self.suspects())
         unrelated = Cause(tuple(self.views.tolist()), *_UNRELATED)
@@ -273,7 +273,7 @@ class _Group:
         return replace(verdict, notes=(*verdict.notes, note))
 
     def suspects(self) -> tuple[Cause, ...]:
-        """Why single photos disagree."""
+        """Return why single photos disagree."""
         bad, correlation = self.bad, self.agreement.correlation
         if self.recolored:
             rows = np.flatnonzero(bad)
@@ -285,7 +285,7 @@ class _Group:
         if not len(rows):
             return ()
         causes = []
-        # A photo that belongs to another pose leaves its own pose with a wrong photo.
+        # If a photo belongs to another pose, its own pose has a wrong photo.
         exchanged = self._fitting_others(rows, rows)
         if len(exchanged):
             causes.append(Cause(self._named(exchanged), *_EXCHANGED))
@@ -302,7 +302,7 @@ class _Group:
         return tuple(self.views[rows].tolist())
 
     def _in_common(self, rows: Integers) -> tuple[Cause | None, Integers]:
-        """What repairs most of some photos, or mirrors and rotates some; and which it repairs."""
+        """Find a change that repairs most photos, or a turn of some; return it and their rows."""
         none = np.zeros(0, dtype=np.int64)
         if not len(rows):
             return None, none
@@ -319,7 +319,7 @@ class _Group:
         return Cause(self._named(repaired), found.trial.cause, found.trial.todo), repaired
 
     def _repaired(self, found: Diagnosis, rows: Integers) -> Integers:
-        """Those of some photos that a change repairs."""
+        """Return the photos that a change repairs."""
         if found.trial is None:
             return rows[:0]
         evidence = self.evidence.chosen(rows)
@@ -327,24 +327,24 @@ class _Group:
         return rows[self._fits(scores(changed, tracked=evidence.tracked), rows)]
 
     def _fits(self, after: Floats, rows: Integers) -> Booleans:
-        """Whether photos fit that did not, by their scores after a change."""
+        """Return a mask of the photos that fit only after a change, by their scores."""
         before = scores(self.agreement, tracked=self.evidence.tracked)[rows]
         return np.asarray((after > before + _FITS_BETTER) & (after > self._fitting))
 
     @property
     def _fitting(self) -> float:
-        """The score of a photo that fits."""
+        """The least score of a photo that fits."""
         return max(_FITS * self.better, LEAST)
 
     def _fitting_others(self, rows: Integers, candidates: Integers) -> Integers:
-        """Those of some cameras that fit the photo of another one, of some candidates."""
+        """Return the cameras that fit the photo of another camera among the candidates."""
         others = self.views[candidates]
         fitting = []
         for row in rows:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # By chance one of many photos fits a few points.
+            # One of many photos may fit a few points by chance.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

@@ -1,4 +1,4 @@
-"""Contract checks of operators as the training step sees them: from K gradients to one."""
+"""Contract checks of operators in the training step, where they reduce K gradients to one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -39,7 +39,7 @@ Gradients = dict[str, Tensor | None]
 
 
 def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
-    """The gradients of K = `views` views: usual ones, conflicting ones, and an untouched block."""
+    """Make gradients of `views` views: ordinary, conflicting, and without one block."""
     rng = np.random.default_rng([views, seed])
 
     def gradient(shape: tuple[int, ...]) -> Tensor:
@@ -48,7 +48,7 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
     found: list[Gradients] = [
         {name: gradient(shape) for name, shape in _SHAPES.items()} for _ in range(views)
     ]
-    # The last view does not see the network; for a single view it is seen all the same.
+    # The last view does not see the network, except if it is the only view.
     if views > 1:
         found[-1] |= {"net.weight": None, "net.bias": None}
     return found
@@ -57,11 +57,11 @@ def sample_gradients(views: int, seed: int = 0) -> list[Gradients]:
 def aggregate_context(
     gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateContext:
-    """What the hook offers for these gradients.
+    """Make the context of the aggregation hook for these gradients.
 
     Args:
         gradients: The gradients of each view.
-        summed: Whether only their sum is known, as in a run in which nobody needs them apart.
+        summed: True to offer only their sum, as in a run without consumers of separate gradients.
     """
     views = len(gradients)
     rng = np.random.default_rng(views)
@@ -79,7 +79,7 @@ def aggregate_context(
 def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients:
     total = SummedGradients.empty(BLOCKS, len(gradients))
     for view in gradients:
-        # The sum takes them over and writes to them.
+        # The sum takes ownership of the tensors and modifies them.
         total.add({name: None if each is None else each.clone() for name, each in view.items()})
     return total
 
@@ -87,7 +87,7 @@ def _summed(gradients: Sequence[Mapping[str, Tensor | None]]) -> SummedGradients
 def aggregated(
     operator: Operator, gradients: Sequence[Mapping[str, Tensor | None]], *, summed: bool = False
 ) -> AggregateResult:
-    """What the operator answers at the hook; see `aggregate_context`."""
+    """Return the operator's answer at the hook; see `aggregate_context`."""
     return _answer(operator, aggregate_context(gradients, summed=summed))
 
 
@@ -100,9 +100,9 @@ def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
 
 
 def every_tensor_is_answered(make: Make[Operator]) -> None:
-    """The answer holds a finite gradient of the right shape for every tensor.
+    """The answer contains a finite gradient of the right shape for every tensor.
 
-    An operator that does not say `separate = True` makes the same gradients of the sum alone.
+    An operator without `separate = True` computes the same gradients from the sum alone.
     """
     operator = make()
     for views in admitted(operator.views):
@@ -129,7 +129,7 @@ def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]
 
 
 def absent_views_have_no_weight(make: Make[Operator]) -> None:
-    """A view without a gradient has no influence: not seen, all zero, or not finite is the same."""
+    """A view without a valid gradient (not seen, all zero or not finite) has no influence."""
     operator = make()
     for views in admitted(operator.views):
         answers = []
@@ -153,7 +153,7 @@ def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
-    """The views' gradients are the same afterwards: diagnostics look at them, too."""
+    """The views' gradients do not change, because diagnostics read them afterwards."""
     operator = make()
     for views in admitted(operator.views):
         gradients, copies = sample_gradients(views), sample_gradients(views)
@@ -166,7 +166,7 @@ def gradients_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_aggregation(make: Make[Operator]) -> None:
-    """Two calls with one seed give the same bits and states that survive a checkpoint."""
+    """Two calls with one seed give the same bits, and their states survive a checkpoint."""
     for views in admitted(make().views):
         with global_randomness_untouched():
             one = aggregated(make(), sample_gradients(views))
@@ -180,9 +180,9 @@ def same_seed_same_aggregation(make: Make[Operator]) -> None:
 
 
 def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
-    """K equal gradients in a neutral context get finite weights, the same ones each time.
+    """K equal gradients in a neutral context get finite weights, equal in every call.
 
-    Regularisers and the optimizer follow their sum.
+    The scale of regularisers and of the optimizer depends on the sum of these weights.
     """
     for views in admitted(make().views):
         context = aggregate_context(sample_gradients(views))
@@ -199,7 +199,7 @@ def states_stay_bounded(make: Make[Operator]) -> None:
 
 
 def _states(operator: Operator, context: AggregateContext) -> Iterator[PluginState]:
-    """The operator's state after each step of a run without an end."""
+    """Yield the operator's state after each step of an endless run."""
     states: Mapping[str, PluginState] = {}
     for step in count(1):
         states = _answer(operator, replace(context, step=step, states=states)).states

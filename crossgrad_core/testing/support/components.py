@@ -1,4 +1,4 @@
-"""Checks that every component must pass, whatever its slot."""
+"""Checks that components of every slot must pass."""
 
 from pydantic import ValidationError
 
@@ -10,7 +10,7 @@ from crossgrad_core.wording import in_one_line, listed, sentences
 
 
 def options_are_frozen(make: Make[Component]) -> None:
-    """An option cannot be changed afterwards, and the component can be hashed."""
+    """Options cannot be changed after construction, and the component can be hashed."""
     component = make()
     require(component.model_config.get("frozen"), "the model is not frozen: keep `frozen=True`")
     try:
@@ -22,7 +22,7 @@ def options_are_frozen(make: Make[Component]) -> None:
 
 
 def unknown_options_are_refused(make: Make[Component]) -> None:
-    """A misspelt option is an error, not ignored."""
+    """A misspelt option raises an error."""
     component = make()
     surprise = {**component.model_dump(), "no_such_option_": 1}
     try:
@@ -33,7 +33,7 @@ def unknown_options_are_refused(make: Make[Component]) -> None:
 
 
 def options_survive_the_configuration_file(make: Make[Component]) -> None:
-    """Written to config.yaml and read again, the options are the same."""
+    """Options that are written to config.yaml and read again are equal."""
     component = make()
     try:
         again = type(component).model_validate(component.model_dump(mode="json"))
@@ -43,7 +43,7 @@ def options_survive_the_configuration_file(make: Make[Component]) -> None:
 
 
 def options_are_described(make: Make[Component]) -> None:
-    """`crossgrad plugins show` can say what each option does."""
+    """`crossgrad plugins show` can describe each option."""
     fields = type(make()).model_fields
     silent = [name for name, field in fields.items() if not field.description]
     require(
@@ -58,7 +58,7 @@ def options_can_be_set(make: Make[Component]) -> None:
 
 
 def hooks_exist(make: Make[Component]) -> None:
-    """Every hook that it implements exists, is marked and takes the hook's arguments."""
+    """Every hook that the component implements exists, is marked and takes the hook's arguments."""
     try:
         make_manager({"component": make()})
     except UserError as error:

@@ -1,8 +1,8 @@
 """Building blocks of contract checks.
 
-A check is a plain function `check(make)`: `make()` gives a fresh component with default options;
-the check raises `ContractError` with a sentence for the author of the component. Checks need
-neither pytest nor hypothesis; with pytest they are two lines:
+A check is a plain function `check(make)`. `make()` returns a fresh component with default options.
+The check raises `ContractError` with a sentence for the author of the component. Checks need
+neither pytest nor hypothesis. With pytest, a few lines run them:
 
     @pytest.mark.parametrize("check", OPERATOR_CHECKS)
     def test_contract(check):
@@ -26,35 +26,35 @@ from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)
 
-#: Gives a fresh component with default options.
+#: Returns a fresh component with default options.
 Make = Callable[[], C]
-#: Raises `ContractError` where a component breaks the contract, `SkipTest` where it cannot be told.
+#: Raises `ContractError` if a component breaks the contract, `SkipTest` if it cannot be decided.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that checks try where they are admitted.
+#: Numbers of views per step that checks try if the component admits them.
 VIEW_COUNTS = range(1, 7)
 
 
 class ContractError(AssertionError):
-    """A component breaks the contract of its slot; the text says how."""
+    """A broken contract of a component; the text describes the violation."""
 
 
 def require(holds: object, otherwise: str) -> None:
-    """Raises `ContractError(otherwise)` unless a condition holds (also under `python -O`)."""
+    """Raise `ContractError(otherwise)` unless a condition holds (also under `python -O`)."""
     if not holds:
         raise ContractError(otherwise)
 
 
 def cannot_tell(reason: str) -> SkipTest:
-    """To be raised where a check does not apply to a component; pytest counts it as skipped."""
+    """Return the exception for a check that does not apply; pytest reports it as skipped."""
     return SkipTest(reason)
 
 
 def admitted(views: ViewCounts) -> tuple[int, ...]:
-    """The numbers of views per step that checks try.
+    """Return the numbers of views per step that checks try.
 
     Raises:
-        ContractError: None of the usual ones is admitted.
+        ContractError: No number from `VIEW_COUNTS` is admitted.
     """
     found = tuple(count for count in VIEW_COUNTS if views.admits(count))
     require(found, f"no number of views from 1 to {max(VIEW_COUNTS)} is admitted: {views}")
@@ -62,7 +62,7 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
 
 
 def revived(state: PluginState) -> PluginState:
-    """The state as a checkpoint gives it back: values through JSON, tensors copied.
+    """Return the state as loaded from a checkpoint: values through JSON, tensors copied.
 
     Raises:
         ContractError: The values do not survive JSON.
@@ -80,7 +80,7 @@ def revived(state: PluginState) -> PluginState:
 
 
 def same_state(one: PluginState, other: PluginState) -> bool:
-    """Whether two states hold the same values and the same bits."""
+    """Return True if two states contain the same values and the same bits."""
     return (
         dict(one.values) == dict(other.values)
         and _same_tensors(one.tensors, other.tensors)
@@ -90,7 +90,7 @@ def same_state(one: PluginState, other: PluginState) -> bool:
 
 @contextmanager
 def global_randomness_untouched() -> Iterator[None]:
-    """Raises `ContractError` where the block draws from a global random number generator."""
+    """Raise `ContractError` if the block draws from a global random number generator."""
     before = _global_states()
     yield
     for name, state in _global_states().items():

@@ -1,7 +1,7 @@
-"""Costs of a plugin: its state, the time of its hooks, and the memory that they keep.
+"""Measurement of a plugin's costs: its state, the time of its hooks, and its memory.
 
 The size of a state may depend on the numbers of views and primitives, and on a window of the last
-steps. A state that grows with every step makes each checkpoint larger than the one before.
+steps. A state that grows with every step makes each checkpoint larger than the checkpoint before.
 """
 
 import gc
@@ -17,14 +17,14 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Steps of the first look, which is enough for a state that does not grow.
+#: Steps of the first measurement, which is enough for a state that does not grow.
 _FEW = 16
-#: Length of each of the three further windows: states with a shorter memory stop growing there.
+#: Length of each of the three further windows: states with a shorter history stop growing there.
 _WINDOW = 1000
 
 
 def size_of(state: PluginState) -> int:
-    """How many numbers, letters and names a state holds; rows of primitives count by columns."""
+    """Count the numbers, letters and names in a state; per-primitive tensors count one row."""
     rows = sum(tensor[:1].numel() for tensor in state.per_primitive.values())
     return _size(state.values) + sum(each.numel() for each in state.tensors.values()) + rows
 
@@ -40,10 +40,10 @@ def _size(value: object) -> int:
 
 
 def require_bounded(sizes: Iterable[int], method: str) -> None:
-    """Requires that the state of a run stops growing.
+    """Require that the state of a run stops growing.
 
     Args:
-        sizes: Size of the state after each step of a long run, measured as it is asked for.
+        sizes: Size of the state after each step of a long run, computed lazily.
         method: Name of the method that returns the state.
     """
     steps = iter(sizes)
@@ -64,7 +64,7 @@ def _largest(sizes: Iterator[int], steps: int) -> int:
 
 
 def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None:
-    """Writes the wall time of the fastest call of each hook into `seconds`, as calls are made."""
+    """Write the wall time of the fastest call of each hook into `seconds` during calls."""
     begun: list[float] = []
 
     def before(*_: object) -> None:
@@ -79,7 +79,7 @@ def time_hooks(manager: pluggy.PluginManager, seconds: dict[str, float]) -> None
 
 @contextmanager
 def traced_memory() -> Iterator[Callable[[], int]]:
-    """Gives a function that says how many bytes are held by Python, NumPy and tensors."""
+    """Yield a function that returns the bytes allocated by Python, NumPy and tensors."""
     traced = tracemalloc.is_tracing()
     if not traced:
         tracemalloc.start()
@@ -91,11 +91,11 @@ def traced_memory() -> Iterator[Callable[[], int]]:
 
 
 def _tensors() -> int:
-    """Bytes of all tensors that are alive; torch allocates them where Python does not look."""
+    """Return the bytes of all live tensors; tracemalloc does not see torch's allocations."""
     gc.collect()
     storages = {}
     for each in gc.get_objects():
-        # Not `isinstance`, which asks objects that answer with warnings.
+        # `isinstance` is avoided, because some objects answer it with warnings.
         if issubclass(type(each), Tensor) and not each.is_sparse:
             storage = each.untyped_storage()
             storages[storage.data_ptr()] = storage.nbytes()

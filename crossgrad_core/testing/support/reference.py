@@ -1,8 +1,8 @@
 """Contract checks of rasterizers against rasterizer `torch` in float64, the readable rule set.
 
-Inputs are usual ones, cameras that look past the middle, and Gaussians at the ends of what training
-makes. A pixel may differ by a few Gaussians at the edge of their footprint, where rounding decides
-whether they are drawn, and by a multiple of what the reference itself loses in float32.
+Inputs are ordinary Gaussians, off-centre cameras, and Gaussians at the extremes of training. A
+pixel may differ for two reasons: rounding decides whether a few Gaussians are drawn at the edge of
+their footprint, and float32 has a rounding error, measured on the reference.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -25,11 +25,11 @@ from crossgrad_core.testing.support.contract import Check, ContractError, Make, 
 _PIXEL = 0.02
 #: Largest mean difference of pixels, and relative difference of gradients, from the reference.
 _MEAN, _GRADIENT = 2e-4, 2e-2
-#: So many times the rounding of the reference in float32 may be that of another one.
+#: Largest ratio of a rasterizer's rounding error to the reference's rounding error in float32.
 _ROUNDINGS = 8.0
-#: Colours of the background: no two channels alike.
+#: Colour of the background, with three different channels.
 _BACKGROUND = (0.1, 0.5, 0.9)
-#: How the pixels of each output are worked out.
+#: How the pixels of each output are computed.
 _RULES = {
     "image": "blend front to back over the background, by the common rules",
     "alpha": "alpha is 1 minus the transmittance",
@@ -38,10 +38,10 @@ _RULES = {
 
 
 def device_of(rasterizer: Rasterizer) -> torch.device:
-    """Where the checks run.
+    """Return the device of the checks.
 
     Raises:
-        SkipTest: The rasterizer needs a device that is not there.
+        SkipTest: The rasterizer needs a device that is not available.
     """
     if "cpu" in rasterizer.devices:
         return torch.device("cpu")
@@ -51,7 +51,7 @@ def device_of(rasterizer: Rasterizer) -> torch.device:
 
 
 def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The tensors that are given, by name."""
+    """Return the tensors that are not None, by name."""
     found = {each.name: getattr(gaussians, each.name) for each in fields(gaussians)}
     return {name: value for name, value in found.items() if isinstance(value, Tensor)}
 
@@ -59,7 +59,7 @@ def tensors_of(gaussians: Gaussians) -> dict[str, Tensor]:
 def moved(
     gaussians: Gaussians, device: torch.device, dtype: torch.dtype = torch.float32
 ) -> Gaussians:
-    """Copies on a device, as leaves with gradients."""
+    """Copy Gaussians to a device, as leaves with gradients."""
     leaves: dict[str, Any] = {
         name: tensor.detach().clone().to(device, dtype).requires_grad_()
         for name, tensor in tensors_of(gaussians).items()
@@ -69,10 +69,10 @@ def moved(
 
 @dataclass(frozen=True)
 class _Case:
-    """Gaussians, a camera and options to draw with.
+    """Gaussians, a camera and options for one render.
 
     Attributes:
-        name: What is special about it.
+        name: The special property of the case.
         gaussians: The Gaussians, float32.
         camera: The camera.
         options: Options of the rasterizer.
@@ -130,7 +130,7 @@ def _options() -> Iterator[_Case]:
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
     yield _Case("option dilation = 2", some, options={"dilation": 2.0})
     depths = _depths(some, camera).sort().values
-    # In the widest gap, so that rounding leaves every centre on its side.
+    # The value is in the widest gap, so that rounding moves no centre to the other side.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4
@@ -148,8 +148,8 @@ class _Drawn:
     """The outputs and gradients of one render, float64 on the CPU.
 
     Attributes:
-        pixels: Image, alpha and, where it provides it, depth.
-        gradients: Those by the Gaussians' tensors, and those of the screen statistics.
+        pixels: Image, alpha and, if provided, depth.
+        gradients: Gradients of the Gaussians' tensors and of the screen statistics.
     """
 
     pixels: Mapping[str, Tensor]
@@ -176,12 +176,12 @@ def _drawn(
 
 
 def _given(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
-    """The tensors that are there, float64 on the CPU."""
+    """Return the tensors that are not None, float64 on the CPU."""
     return {n: t.detach().cpu().double() for n, t in tensors.items() if t is not None}
 
 
 def _weighted(render: Render) -> Tensor:
-    """A weighted sum of all channels in which no two pixels count alike."""
+    """Return a weighted sum of all channels in which every pixel has a different weight."""
     channels = [render.image, render.alpha[..., None]]
     if render.depth is not None:
         channels.append(render.depth[..., None])
@@ -191,7 +191,7 @@ def _weighted(render: Render) -> Tensor:
 
 
 def _require_same(rasterizer: Rasterizer, case: _Case) -> None:
-    """Requires image, alpha, depth, gradients and statistics of the reference."""
+    """Require the reference's image, alpha, depth, gradients and statistics."""
     shared = {name: getattr(rasterizer, name) for name in Rasterizer.model_fields}
     reference = build(Rasterizer, REFERENCE_RASTERIZER, shared)
     outputs = rasterizer.provides & {"depth", "abs_gradient"}
@@ -209,7 +209,7 @@ def _require_pixels(
 ) -> None:
     require(name in drawn, f"{case}: render gives no {name}")
     error, lost = (drawn[name] - expected).abs(), (rounded - expected).abs()
-    # The depth of a Gaussian at the edge counts as much as its distance.
+    # The depth error of a Gaussian at the edge is proportional to its distance.
     size = max(1.0, float(expected.abs().max()))
     most = _PIXEL * size + _ROUNDINGS * float(lost.max())
     mean = _MEAN * size + _ROUNDINGS * float(lost.mean())
@@ -244,12 +244,12 @@ def the_reference_draws_the_same(make: Make[Rasterizer]) -> None:
 
 
 def the_camera_is_heeded(make: Make[Rasterizer]) -> None:
-    """Pose, focal lengths, principal point and size of the camera are those that it is given."""
+    """The render uses the pose, focal lengths, principal point and size of the given camera."""
     _require_all(make(), _cameras)
 
 
 def extreme_gaussians_are_drawn_alike(make: Make[Rasterizer]) -> None:
-    """Opaque, transparent, thin, huge and tiny Gaussians are drawn as the reference draws them."""
+    """Opaque, transparent, thin, huge and tiny Gaussians are rendered like the reference."""
     _require_all(make(), _extremes)
 
 
@@ -259,13 +259,13 @@ def _require_all(rasterizer: Rasterizer, cases: Callable[[], Iterator[_Case]]) -
 
 
 def its_options_are_heeded(make: Make[Rasterizer]) -> None:
-    """`max_alpha`, `near` and `dilation` change what is drawn as the rules say, or are fixed."""
+    """`max_alpha`, `near` and `dilation` have the effect that the rules define, or are fixed."""
     rasterizer, tried = make(), 0
     for case in _options():
         try:
             changed = type(rasterizer).model_validate({**rasterizer.model_dump(), **case.options})
         except ValidationError:
-            continue  # It has one value and says so.
+            continue  # It supports one value only and reports this.
         tried += 1
         _require_same(changed, case)
     if not tried:
@@ -273,7 +273,7 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
 
 
 def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
-    """`render_views` gives what `render` gives of each view, with its own background."""
+    """`render_views` gives the same images as `render` for each view, with its own background."""
     rasterizer = make()
     device = device_of(rasterizer)
     some = [moved(sample_gaussians(number), device) for number in (30, 30, 12)]

@@ -1,7 +1,7 @@
-"""Contexts of hooks without a run: parameters, Gaussians, renders on request, records of views.
+"""Contexts of hooks without a run: parameters, Gaussians, renders on request, view records.
 
-A run brings rows of some tensors up to date only when a hook reads them, so its objects are no
-plain dictionaries and Gaussians.
+A run updates rows of some tensors only if a hook reads them, so its objects are not plain
+dictionaries and Gaussians.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ def renders_of(
     rasterizer: Rasterizer,
     parameters: Mapping[str, Tensor],
 ) -> RenderOnRequest:
-    """What a context offers as `render`, over black, without an exposure, with the usual loss."""
+    """Make the `render` function of a context: black background, no exposure, default loss."""
     loss = build(Loss, LOSS, {})
 
     def render(
@@ -65,14 +65,14 @@ def renders_of(
 
 
 def parameters_in_a_run(parameters: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """The same tensors in the mapping that a context of a run holds."""
+    """Return the same tensors in the mapping type of a run's context."""
     return TrainState(tensors=dict(parameters), moments=AdamState(), rngs={}).current
 
 
 def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
-    """The same Gaussians, whose tensors that the backbone passes on are brought when they are read.
+    """Return the same Gaussians with on-demand rows for tensors that the backbone passes through.
 
-    Nothing is late here, so bringing rows does nothing.
+    All rows are up to date here, so bringing rows has no effect.
     """
     fields = frozenset(f for f in backbone.passthrough if getattr(gaussians, f) is not None)
     return replace(gaussians, on_demand=OnDemand(fields, lambda _: None)).whole()
@@ -81,14 +81,14 @@ def gaussians_in_a_run(gaussians: Gaussians, backbone: Backbone) -> Gaussians:
 def view_record(
     view: View, gaussians: Gaussians, screen: Screen, index: int = 0, scale: float = 1.0
 ) -> ViewRecord:
-    """The record of a view that was drawn with these statistics, over black, beside a black photo.
+    """Make the record of a view with these statistics, over black, with a black photo.
 
     Args:
         view: The view.
-        gaussians: What was drawn.
-        screen: Its statistics in pixels of the render, gradients included.
+        gaussians: The rendered Gaussians.
+        screen: Their statistics in pixels of the render, gradients included.
         index: Position of the view in `scene.train_views`.
-        scale: Sides of the render over those of the photo.
+        scale: Side of the render divided by the side of the photo.
     """
     camera = camera_at(view.camera, scale)
     image = torch.zeros(camera.height, camera.width, 3)

@@ -1,4 +1,4 @@
-"""Short runs on the sample scene: refused before training with the reasons, or trained."""
+"""Short runs on the sample scene, which are refused with reasons or trained."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state
 from crossgrad_core.wording import listed
 
-#: Losses of images in [0, 1] are far below it.
+#: Upper limit of losses; losses of images in [0, 1] are far below it.
 _LARGEST_LOSS = 10.0
 
 
@@ -31,7 +31,7 @@ class ShortRun:
 
     Attributes:
         before: Parameters before the first step.
-        early: Parameters after it.
+        early: Parameters after the first step.
         after: Parameters at the end.
         records: The record of each step.
     """
@@ -43,19 +43,19 @@ class ShortRun:
 
     @property
     def losses(self) -> list[float]:
-        """The losses of all views of all steps."""
+        """The losses of all views in all steps."""
         return [loss for record in self.records for loss in record.losses]
 
 
 def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
-    """The reasons for which a run is refused before training; empty where it is not.
+    """Return the reasons to refuse a run before training; empty if it is accepted.
 
-    A combination is refused if a component objects (`crossgrad_validate_selection`), or if what
-    its components declare does not fit: numbers of views, tensors, statistics, devices.
+    A combination is refused if a component objects (`crossgrad_validate_selection`), or if the
+    declarations of its components do not fit: numbers of views, tensors, statistics, devices.
     """
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")
-    # What the manager would gather; registering with it would take most of the time.
+    # The manager would collect the same answers; registration with it would take most of the time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.plugins.values(), *observers)
     asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
@@ -64,16 +64,16 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
 
 
 def setup_of(config: RunConfig) -> Setup:
-    """The run of a configuration on the sample scene.
+    """Assemble the run of a configuration on the sample scene.
 
     Raises:
-        IncompatibleSelectionError: It is refused.
+        IncompatibleSelectionError: The configuration is refused.
     """
     return assemble(config, sample_scene(), "none")
 
 
 def train(setup: Setup, steps: int) -> ShortRun:
-    """Takes the first steps of a run, from its beginning."""
+    """Train the first steps of a run."""
     state = first_state(setup)
     stages, records = [_copied(state.parameters)], []
     for _ in range(steps):
@@ -88,7 +88,7 @@ def _copied(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def require_sound(run: ShortRun) -> None:
-    """Requires that losses and parameters are finite, and that the first step changes something."""
+    """Require finite losses and parameters, and that the first step changes a parameter."""
     for step, record in enumerate(run.records, 1):
         good = all(0.0 <= loss < _LARGEST_LOSS for loss in record.losses)
         require(good, f"step {step}: the losses are {record.losses}; expected 0 to 10")
@@ -99,7 +99,7 @@ def require_sound(run: ShortRun) -> None:
 
 
 def require_repeated(run: ShortRun, again: ShortRun) -> None:
-    """Requires that two runs with one seed are the same to the bit."""
+    """Require that two runs with one seed are equal to the bit."""
     for step, (one, other) in enumerate(zip(run.records, again.records, strict=True), 1):
         for what in ("views", "losses", "counts"):
             found = getattr(one, what), getattr(other, what)
@@ -114,11 +114,11 @@ def require_repeated(run: ShortRun, again: ShortRun) -> None:
 
 
 def try_out(config: RunConfig, steps: int) -> None:
-    """Trains a run for some steps, twice, and looks at what is left.
+    """Train a run for some steps, twice, and check the results.
 
     Raises:
         ContractError: A loss or parameter is not finite, nothing is trained, or the runs differ.
-        UserError: The run cannot begin, or a plugin gives a wrong answer.
+        UserError: The run cannot start, or a plugin gives a wrong answer.
     """
     setup = setup_of(config)
     with on_one_thread():

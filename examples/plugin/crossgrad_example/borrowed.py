@@ -1,4 +1,4 @@
-"""Another rasterizer under a name of one's own: a place to put faster kernels."""
+"""A rasterizer that calls another rasterizer: a starting point for faster kernels."""
 
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
 
 
 class Borrowed(Rasterizer):
-    """Draws with another rasterizer."""
+    """A rasterizer that renders with another rasterizer."""
 
     provides: ClassVar[frozenset[str]] = frozenset(
         {"depth", "pixels", "abs_gradient", "directions"}

@@ -8,7 +8,7 @@ from crossgrad_core.plugin import Field, Loss, unit_range
 
 
 class Charbonnier(Loss):
-    """The mean of sqrt(d^2 + e^2) - e over the pixels that count, d the difference."""
+    """Mean of sqrt(d^2 + e^2) - e over the pixels that count, with the difference d."""
 
     epsilon: float = Field(0.01, gt=0, description="e: below it the loss is quadratic")
 

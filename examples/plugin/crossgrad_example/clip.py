@@ -1,4 +1,4 @@
-"""Gradient clipping, block by block: a wrapper of the aggregation hook."""
+"""Gradient clipping per block: a wrapper of the aggregation hook."""
 
 from collections.abc import Generator
 from dataclasses import replace
@@ -15,12 +15,12 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Under this name the state is kept from step to step and in checkpoints.
+#: Name of the state, which is kept from step to step and in checkpoints.
 STATE = "clip"
 
 
 class Clip(Observer):
-    """Shortens the aggregated gradient of a block to `max_norm` where it is longer."""
+    """A wrapper that shortens a block's aggregated gradient to `max_norm` if it is longer."""
 
     max_norm: float = Field(1.0, gt=0.0, description="largest length of a block's gradient")
 
@@ -28,7 +28,7 @@ class Clip(Observer):
     def crossgrad_aggregate_gradients(
         self, context: AggregateContext
     ) -> Generator[None, AggregateResult, AggregateResult]:
-        """Lets the operator answer, then replaces its answer."""
+        """Let the operator answer, then replace its answer."""
         aggregated = yield
         gradients, clipped = dict(aggregated.gradients), 0
         for block in context.blocks:

@@ -1,4 +1,4 @@
-"""Small photos first."""
+"""A resolution that starts with small photos."""
 
 from typing_extensions import override
 
@@ -6,7 +6,7 @@ from crossgrad_core.plugin import Field, PluginState, Resolution, ScaleContext
 
 
 class CoarseFirst(Resolution):
-    """Renders and compares at a smaller scale in the first part of the run."""
+    """A smaller scale for rendering and comparison in the first part of the run."""
 
     scale: float = Field(0.5, gt=0, le=1, description="scale of the first part")
     share: float = Field(0.25, ge=0, le=1, description="share of the steps that it takes")

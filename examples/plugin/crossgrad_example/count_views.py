@@ -1,4 +1,4 @@
-"""`crossgrad count-views SCENE`."""
+"""The command `crossgrad count-views SCENE`."""
 
 from pathlib import Path
 from typing import Annotated

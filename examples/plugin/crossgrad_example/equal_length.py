@@ -1,4 +1,4 @@
-"""Every view counts alike, however long its gradient is."""
+"""An operator in which every view has the same influence, however long its gradient is."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from crossgrad_core.plugin import OperatorContext, Weighting
 
 
 class EqualLength(Weighting):
-    """Brings the K gradients of a block to their mean length, then adds them."""
+    """An operator that scales the K gradients of a block to their mean length and adds them."""
 
     def weights(
         self, gramians: NDArray[np.float64], context: OperatorContext

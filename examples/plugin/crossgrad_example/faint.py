@@ -1,4 +1,4 @@
-"""Removes Gaussians that have become transparent; adds none."""
+"""A densifier that removes transparent Gaussians and adds none."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from crossgrad_core.plugin import NO_EDIT, Densifier, DensifyContext, Edit, Fiel
 
 
 class Faint(Densifier):
-    """Removes primitives that have become transparent."""
+    """A densifier that removes primitives that have become transparent."""
 
     tensors: ClassVar[frozenset[str]] = frozenset({"opacities"})
     resets: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""One gain per photo."""
+"""An exposure with one gain per photo."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Exposure, Field, LearningRate, PerPhoto, Scene
 
 
 class Gain(Exposure):
-    """Multiplies the render by 2^stops; the stops of all photos have a mean of zero."""
+    """An exposure that multiplies the render by 2^stops; the mean of all stops is zero."""
 
     lr: float = Field(0.01, gt=0, description="learning rate, stops")
 

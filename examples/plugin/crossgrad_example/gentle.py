@@ -1,4 +1,4 @@
-"""A recipe that changes one row of another one."""
+"""A recipe that changes one row of another recipe."""
 
 from typing_extensions import override
 
@@ -6,7 +6,7 @@ from crossgrad_core.plugin import Decision, Facts, Recipe, build_component, with
 
 
 class Gentle(Recipe):
-    """Decides as `auto` does, but at the published learning rates."""
+    """A recipe that decides like `auto`, but at the published learning rates."""
 
     @override
     def decide(self, facts: Facts) -> list[Decision]:

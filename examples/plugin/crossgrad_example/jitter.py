@@ -1,4 +1,4 @@
-"""A rule: training views see the Gaussians at slightly moved positions."""
+"""A rule that moves the Gaussians slightly in training views."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from crossgrad_core.plugin import Field, GaussiansContext, GaussiansResult, Rule
 
 
 class Jitter(Rule):
-    """Moves the Gaussians of each training view at random, which smooths what they learn."""
+    """A rule that moves the Gaussians of each training view at random, which smooths the result."""
 
     size: float = Field(1e-3, gt=0, description="standard deviation, in scene extents")
 

@@ -1,4 +1,4 @@
-"""The worst pixel of a view."""
+"""A metric: the largest error of a view."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ from crossgrad_core.plugin import Compared, Figure, Metric
 
 
 class LargestError(Metric):
-    """The largest difference of any channel of any pixel that counts, grey levels."""
+    """The largest difference over all channels and pixels that count, in grey levels."""
 
     figure: ClassVar[Figure] = Figure(
         "largest_error", "largest error", form=".0f", definition="grey levels, mean over images"

@@ -1,4 +1,4 @@
-"""The views that were rendered least often come first."""
+"""A sampler that draws the least often rendered views first."""
 
 from typing import ClassVar, cast
 
@@ -9,7 +9,7 @@ from crossgrad_core.plugin import PluginState, SampleContext, Sampler, ViewSampl
 
 
 class LeastSeen(Sampler):
-    """Draws the K training views that were rendered least often, ties at random."""
+    """A sampler that draws the K least often rendered training views, ties at random."""
 
     default_views: ClassVar[int] = 2
 

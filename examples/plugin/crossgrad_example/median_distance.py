@@ -1,4 +1,4 @@
-"""Near and far by the median distance from the mean camera."""
+"""A grouping into near and far by the median distance from the mean camera."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from crossgrad_core.plugin import (
 
 
 class MedianDistance(Grouping):
-    """near where a camera is at most the median distance from the mean camera, else far."""
+    """Views are near if the camera is within the median distance of the mean camera, else far."""
 
     @override
     def fit(

@@ -1,4 +1,4 @@
-"""Photos with poses in one JSON file."""
+"""A reader for photos with poses in one JSON file."""
 
 import json
 from collections.abc import Mapping
@@ -13,13 +13,13 @@ from crossgrad_core.scene.build import build_scene
 from crossgrad_core.scene.calibration import Calibration
 from crossgrad_core.scene.raw import RawScene, RawView
 
-#: The file of poses within a scene: a list of `{"name", "size": [w, h], "pinhole": [fx, fy, cx,
+#: Name of the pose file in a scene: a list of `{"name", "size": [w, h], "pinhole": [fx, fy, cx,
 #: cy], "world_to_camera": 4 x 4}`; photos are in the folder images/.
 POSES = "poses.json"
 
 
 class Poses(Reader):
-    """Photos with poses in one JSON file, without points (`--init random`)."""
+    """A reader for photos with poses in one JSON file, without points (`--init random`)."""
 
     @override
     def accepts(self, path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""A dome over the scene, for what no photo's point stands for."""
+"""An initializer that adds a dome over the scene, for parts without SfM points."""
 
 import numpy as np
 from typing_extensions import override
@@ -14,7 +14,7 @@ class Sky(Initializer):
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
-        # A spiral of equal areas: the golden angle from one point to the next.
+        # A spiral with equal areas: neighbouring points differ by the golden angle.
         height = (np.arange(self.count) + 0.5) / self.count
         angle = np.arange(self.count) * np.pi * (3.0 - np.sqrt(5.0))
         flat = np.sqrt(1.0 - height**2)

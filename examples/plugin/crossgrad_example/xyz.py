@@ -1,4 +1,4 @@
-"""Centres as lines of text."""
+"""An exporter of centres as lines of text."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Exporter, Gaussians, Similarity
 
 
 class Xyz(Exporter):
-    """Writes the centres alone, one `x y z` per line, for programs that know points only."""
+    """An exporter that writes only the centres, one `x y z` per line, for point-cloud programs."""
 
     suffix: ClassVar[str] = "xyz"
 

@@ -1,4 +1,4 @@
-"""The wrapper's effect on the operator's answer."""
+"""Tests of the wrapper's effect on the operator's answer."""
 
 import pytest
 import torch

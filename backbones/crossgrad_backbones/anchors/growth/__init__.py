@@ -1,1 +1,1 @@
-"""How anchors grow and are pruned (Scaffold-GS)."""
+"""Growth and pruning of anchors (Scaffold-GS)."""

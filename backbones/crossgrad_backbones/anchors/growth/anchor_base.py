@@ -1,4 +1,4 @@
-"""Base of the densifiers of anchors: statistics, pruning, and the edit that adds anchors."""
+"""Base class of the anchor densifiers: statistics, pruning, and the edit that adds anchors."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -22,14 +22,14 @@ from crossgrad_core.plugin import (
     screen_statistics,
 )
 
-#: Sums per anchor [P]: of the opacities of its Gaussians, and of the views that decoded it.
+#: Sums per anchor [P]: opacities of its Gaussians, and number of views that decoded it.
 OPACITY, VIEWS = "opacity", "views"
-#: Sums per offset [P, k]: of the gradient norms of its Gaussian, and of the renders showing it.
+#: Sums per offset [P, k]: gradient norms of its Gaussian, and number of renders that show it.
 GRADIENT, RENDERS = "gradient", "renders"
 
 
 def observed(context: DensifyContext, state: PluginState) -> PluginState:
-    """The sums with the views of this step added.
+    """Add the views of this step to the sums.
 
     Source: Scaffold-GS, section 3.3; methods of section 2.5.
     """
@@ -68,18 +68,18 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
 
 @dataclass(frozen=True)
 class GrowthRequest:
-    """New anchors at offsets of the present ones.
+    """A request for new anchors at offsets of the present anchors.
 
     Attributes:
         gradient: [P, k] mean gradient norm of each offset, NDC.
-        eligible: [P, k] bool, offsets that were seen often enough to be judged.
+        eligible: [P, k] bool, offsets that were seen often enough for a decision.
     """
 
     gradient: Tensor
     eligible: Tensor
 
     def among(self, may_grow: Tensor | None) -> "GrowthRequest":
-        """That of the anchors that may grow [P]; None: all may."""
+        """Restrict the request to the anchors that may grow [P]; None for all anchors."""
         if may_grow is None:
             return self
         return replace(self, eligible=self.eligible & may_grow[:, None])
@@ -91,11 +91,11 @@ class NewAnchors:
 
     Attributes:
         positions: [M, 3] local units.
-        cells: [M] edge of the cell that each was made for, local units.
+        cells: [M] edge of the cell of each anchor, local units.
         features: [M, F].
-        parents: [M] int64, an anchor whose offset asked for it.
-        strength: [M] the largest gradient that asked for it.
-        further: Tensor name -> [M, ...], other tensors that are not those of the parents.
+        parents: [M] int64, an anchor whose offset requested the new anchor.
+        strength: [M] the largest gradient that requested the new anchor.
+        further: Tensor name -> [M, ...], other tensors that are not copied from the parents.
     """
 
     positions: Tensor
@@ -109,7 +109,7 @@ class NewAnchors:
         return int(self.positions.shape[0])
 
     def limited(self, room: int) -> tuple["NewAnchors", int]:
-        """The strongest `room` of them in their order, and how many were left out."""
+        """Return the strongest `room` anchors in their order, and the number left out."""
         left_out = max(0, len(self) - room)
         if left_out == 0:
             return self, 0
@@ -117,7 +117,7 @@ class NewAnchors:
         return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """These, then others, which have the same further tensors."""
+        """Append other anchors with the same further tensors."""
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
             torch.cat([self.cells, more.cells]),
@@ -128,7 +128,7 @@ class NewAnchors:
         )
 
     def at(self, rows: Tensor) -> "NewAnchors":
-        """Those at `rows` [R]."""
+        """Return the anchors at `rows` [R]."""
         return NewAnchors(
             self.positions[rows],
             self.cells[rows],
@@ -140,11 +140,11 @@ class NewAnchors:
 
 
 class AnchorDensifier(Densifier):
-    """Adds anchors where offsets have large gradients; removes those that stay transparent.
+    """A densifier that adds anchors at large offset gradients and removes transparent anchors.
 
-    A method says which anchors it adds; the rest is that of Scaffold-GS. Counters of an offset or
-    an anchor are cleared once it was seen often enough to be judged, so that what is rarely seen
-    keeps gathering.
+    A subclass decides which anchors are added; everything else follows Scaffold-GS. Counters of an
+    offset or an anchor are cleared after a decision about it. A rarely seen anchor therefore keeps
+    its counters until it has been seen often enough.
     """
 
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
@@ -164,16 +164,16 @@ class AnchorDensifier(Densifier):
     def grown(
         self, context: DensifyContext, parameters: Parameters, request: GrowthRequest
     ) -> NewAnchors:
-        """The anchors to be added, given what their offsets ask for.
+        """Return the anchors to be added for the requests of the offsets.
 
         Args:
             context: The step.
             parameters: Its parameters, detached.
-            request: What the offsets ask for.
+            request: The requests of the offsets.
         """
 
     def changed(self, parameters: Parameters, request: GrowthRequest) -> Mapping[str, Tensor]:
-        """New rows of tensors [P, ...] of the present anchors; by default the capped scales."""
+        """Return new rows of tensors [P, ...] of the present anchors; by default capped scales."""
         scales = parameters["scales"]
         capped = scales[:, 3:].clamp(max=self.largest_log_scale)
         return {"scales": torch.cat([scales[:, :3], capped], 1)}
@@ -210,7 +210,7 @@ class AnchorDensifier(Densifier):
 def edit_of(
     parameters: Parameters, changed: Mapping[str, Tensor], pruned: Tensor, new: NewAnchors
 ) -> Edit:
-    """The edit that changes rows of the present anchors, removes `pruned` [P] and adds `new`."""
+    """Make the edit that changes present anchors, removes `pruned` [P] and adds `new`."""
     really = {n: rows for n, rows in changed.items() if not torch.equal(rows, parameters[n])}
     if len(new) == 0 and not bool(pruned.any()):
         return Edit(values={name: Rows(rows, keep_moments=True) for name, rows in really.items()})
@@ -227,7 +227,7 @@ def edit_of(
 
 
 def _first_values(parameters: Parameters, new: NewAnchors) -> dict[str, Tensor]:
-    """What new anchors start with; other tensors are those of their parents."""
+    """Return initial values of new anchors; other tensors are copied from their parents."""
     scales, offsets = parameters["scales"], parameters["offsets"]
     return {
         "anchors": new.positions,
@@ -239,18 +239,18 @@ def _first_values(parameters: Parameters, new: NewAnchors) -> dict[str, Tensor]:
 
 
 def _cleared(state: PluginState, eligible: Tensor, judged: Tensor) -> dict[str, Tensor]:
-    """The sums, zero for offsets that were eligible and anchors that were judged."""
+    """Return the sums, cleared for eligible offsets and for anchors with a decision."""
     done = {GRADIENT: eligible, RENDERS: eligible, OPACITY: judged, VIEWS: judged}
     return {name: state.per_primitive[name].masked_fill(done[name], 0.0) for name in done}
 
 
 def offset_means(parameters: Mapping[str, Tensor], anchor: Tensor, slot: Tensor) -> Tensor:
-    """[N, 3] means of the Gaussians `slot` [N] of anchors `anchor` [N]."""
+    """Return the means [N, 3] of the Gaussians `slot` [N] of anchors `anchor` [N]."""
     stretch = torch.exp(parameters["scales"][anchor, :3])
     return parameters["anchors"][anchor] + parameters["offsets"][anchor, slot] * stretch
 
 
 def largest(rows: Tensor, group: Tensor, groups: int) -> Tensor:
-    """[groups, F] elementwise largest of the rows [N, F] of each group; none is empty."""
+    """Return the elementwise maximum [groups, F] of the rows [N, F] of each non-empty group."""
     largest = rows.new_full((groups, rows.shape[1]), -torch.inf)
     return largest.scatter_reduce_(0, group[:, None].expand_as(rows), rows, "amax")

@@ -23,12 +23,12 @@ from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selectio
 
 @dataclass(frozen=True)
 class Level:
-    """One size of cells.
+    """One cell size.
 
     Attributes:
         cell: Edge of a cell, local units.
-        threshold: Least gradient that grows into it, NDC norm.
-        keep: Probability with which a candidate is kept.
+        threshold: Least gradient that adds an anchor, NDC norm.
+        keep: Probability of keeping a candidate.
     """
 
     cell: float
@@ -43,17 +43,17 @@ def grown(
     levels: tuple[Level, ...],
     rng: np.random.Generator,
 ) -> NewAnchors:
-    """New anchors from the offsets of the present ones, level by level.
+    """Return new anchors from the offsets of the present anchors, level by level.
 
-    A level is skipped once none before it has added an anchor. Anchors of this call take their
-    cells but do not grow themselves.
+    Growth stops at the first level if that level adds no anchor. New anchors of this call occupy
+    their cells but do not grow themselves.
 
     Args:
         parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6].
         gradient: [P, k] mean gradient norm of each offset.
         eligible: [P, k] bool, offsets that were seen often enough.
         levels: From coarse to fine.
-        rng: Draws which candidates are kept.
+        rng: Draws the candidates that are kept.
 
     Source: Scaffold-GS, section 3.3; methods of section 2.6.
     """
@@ -74,7 +74,7 @@ def _at_level(
     level: Level,
     rng: np.random.Generator,
 ) -> NewAnchors:
-    """New anchors of one level, where no present one [N, 3] is in the cell."""
+    """Return new anchors of one level in cells without a present anchor [N, 3]."""
     anchor, slot = (eligible & (gradient >= level.threshold)).nonzero().unbind(1)
     kept = torch.from_numpy(rng.random(len(anchor)) < level.keep).to(anchor.device)
     anchor, slot = anchor[kept], slot[kept]
@@ -93,7 +93,7 @@ def _at_level(
 
 
 class AnchorControl(AnchorDensifier):
-    """Grows anchors into free cells of three sizes, coarse ones first."""
+    """A densifier that grows anchors into free cells of several sizes, coarse cells first."""
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {"voxel_size"}
 
@@ -126,7 +126,7 @@ class AnchorControl(AnchorDensifier):
         return grown(parameters, request.gradient, request.eligible, levels, context.rng)
 
     def _levels(self, voxel: float) -> tuple[Level, ...]:
-        """The levels of growth for voxels of that edge."""
+        """Return the growth levels for voxels with this edge."""
         return tuple(
             Level(
                 cell=voxel * max(1, self.coarsest // self.refinement**level),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Anchors that one thread takes at a time.
+#: Anchors that one thread processes at a time.
 SHARE = 4096
 
 
@@ -24,19 +24,19 @@ def in_frustum(
     reach: np.float32,
     inside: NDArray[np.bool_],
 ) -> None:
-    """Which anchors pass; the formulas are those of the plain filter.
+    """Write a mask of the anchors that pass, with the same formulas as the plain filter.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         positions: [P, 3].
         log_scales: [P, 3 or more].
         pose: [3, 4] world to camera.
         axes: [2, 6] for x and y: focal length, centre, least and largest slope of the Jacobian,
-            first and last place that counts (pixels).
+            first and last position that counts (pixels).
         near: Least depth.
         dilation: Added to the variances, px^2.
         reach: Extent of a footprint, standard deviations.
-        inside: [P] written.
+        inside: [P] output.
     """
     count = len(positions)
     parts = (count + SHARE - 1) // SHARE
@@ -53,7 +53,7 @@ def in_frustum(
                 along = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
                 slope = along / depth
                 place = focal * slope + center
-                # What has its centre in the image needs no second look.
+                # A centre inside the image needs no further test.
                 if axes[k, 4] <= place <= axes[k, 5]:
                     continue
                 clamped = min(max(slope, axes[k, 2]), axes[k, 3])

@@ -1,9 +1,9 @@
-"""Kernels of the networks: around matrix products, and from outputs to Gaussians.
+"""Kernels before and after the matrix products of the networks, up to the Gaussians.
 
-All arrays are rows of floats in C order: A anchors that are seen, k slots each, P anchors in all, G
-Gaussians with positive opacity. Kernels work on a stretch of n anchors from `first` on, for which
-alone there are raw numbers. Anchors are divided into shares of a fixed size, and every share writes
-its own rows, so that no bit depends on the number of threads.
+All arrays are rows of floats in C order: A anchors in view, k slots each, P anchors in total, G
+Gaussians with positive opacity. A kernel processes a stretch of n anchors starting at `first`; raw
+values exist only for this stretch. Anchors are divided into shares of a fixed size. Every share
+writes its own rows, so the bits do not depend on the number of threads.
 """
 
 from typing import TypeAlias
@@ -17,13 +17,13 @@ from crossgrad_core.numerics.jobs import Jobs, next_job
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
-#: Rows that one thread takes at a time.
+#: Rows that one thread processes at a time.
 SHARE = 256
 
 
 @kernel
 def join(jobs: Jobs, features: _Floats, rows: _Ints, views: _Floats, out: _Floats) -> None:
-    """Writes [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
+    """Write [A, F + V]: rows [A] of the features [Q, F], then the views [A, V]."""
     anchors, feature, view = len(rows), features.shape[1], views.shape[1]
     parts = (anchors + SHARE - 1) // SHARE
     part = next_job(jobs, parts)
@@ -44,14 +44,14 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 def rectify_back(
     jobs: Jobs, first: int, anchors: int, column: int, hidden: _Floats, gradient: _Floats
 ) -> None:
-    """Clears the gradient in place where the rectified numbers are 0.
+    """Set the gradient to 0, in place, for hidden values that are 0.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         anchors: n.
-        column: Column of `hidden` that belongs to the first one of the gradient.
-        hidden: [A, 3 H] rectified numbers.
+        column: Column of `hidden` that corresponds to the gradient's first column.
+        hidden: [A, 3 H] rectified values.
         gradient: [n or more, H or 3 H].
     """
     width = gradient.shape[1]
@@ -68,7 +68,7 @@ def rectify_back(
 
 @kernel
 def count(opacities: _Floats, starts: _Ints) -> None:
-    """Numbers the positive opacities [A, k]: those of anchor a begin at starts[a]; [A + 1]."""
+    """Write [A + 1] starts: the positive opacities [A, k] of anchor a begin at starts[a]."""
     anchors, slots = opacities.shape
     total = 0
     for a in range(anchors):
@@ -99,10 +99,10 @@ def gather(
     out_opacities: _Floats,
     out_colors: _Floats,
 ) -> None:
-    """Writes what belongs to the Gaussians of positive opacity.
+    """Write the values of the Gaussians with positive opacity.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         covariances: [n, 7 k] raw.
         colors: [n, 3 k] raw.
@@ -166,10 +166,10 @@ def scatter(
     v_colors: _Floats,
     out_offsets: _Floats,
 ) -> None:
-    """Gradients of all inputs from those of all outputs.
+    """Compute the gradients of all inputs from the gradients of all outputs.
 
     Args:
-        jobs: From `share`.
+        jobs: From `parallel` or `serial`.
         first: The first anchor.
         anchors: n.
         rows: [A].
@@ -177,18 +177,18 @@ def scatter(
         slot: [G].
         spreads: [A, 6].
         shares: [G, 3] scales divided by the anchor's size.
-        v_scales: [G, 3] gradient by the scales.
+        v_scales: [G, 3] gradient of the scales.
         out_log_scales: [P, 6] zero, written at `rows`.
-        raw: [n or more, 11 k] written: gradient by the raw opacities, covariances and colours.
+        raw: [n or more, 11 k] output: gradient of the raw opacities, covariances and colours.
         tanhs: [A, k] opacities before the factor.
-        factors: [A] what multiplied them.
+        factors: [A] their factors.
         offsets: [P, k, 3].
         colors: [G, 3] as drawn.
-        v_means: [G, 3] gradient by the means.
-        v_quats: [G, 4] gradient by the quaternions.
-        v_opacities: [G] gradient by the opacities.
-        v_colors: [G, 3] gradient by the colours.
-        out_offsets: [P, k, 3] zero, written at the slots of `rows` that are drawn.
+        v_means: [G, 3] gradient of the means.
+        v_quats: [G, 4] gradient of the quaternions.
+        v_opacities: [G] gradient of the opacities.
+        v_colors: [G, 3] gradient of the colours.
+        out_offsets: [P, k, 3] zero, written at the drawn slots of `rows`.
     """
     slots = tanhs.shape[1]
     to_colors = (1 + COVARIANCE) * slots
@@ -232,7 +232,7 @@ def scatter_scales(
     out_log_scales: _Floats,
     raw: _Floats,
 ) -> None:
-    """As `scatter` where only the scales have a gradient; `raw` [n, 7 k] is by covariances."""
+    """Run `scatter` for scale gradients only; `raw` [n, 7 k] is the covariances' gradient."""
     parts = (anchors + SHARE - 1) // SHARE
     part = next_job(jobs, parts)
     while part < parts:
