@@ -72,7 +72,8 @@ def assembled(monkeypatch):
 
     def make(**settings):
         chosen = {name: ComponentChoice(name=value) for name, value in settings.items()}
-        return assembling.assemble(RunConfig(steps=10, **chosen), sample_scene(), "none")
+        config = RunConfig(steps=10, plan="off", **chosen)
+        return assembling.assemble(config, sample_scene(), "none")
 
     monkeypatch.setattr(selecting, "build", build_own)
     for module in (deciding, selecting):
