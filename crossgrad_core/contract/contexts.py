@@ -507,9 +507,9 @@ class OperatorContext:
             weight 0.
         unit: Unit roundoff of the gradients' type. No result needs a smaller relative error.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
-            removed. The sum of Gramian and residual has twice the digits. This takes another,
-            slower pass over the gradients; it is for Gramians so close to singular that their
-            rounding affects the result. None if unknown.
+            removed. Gramian plus residual gives twice the digits. This needs another, slower pass
+            over the gradients; it is for Gramians so close to singular that their rounding affects
+            the result. None if unknown.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

@@ -82,8 +82,7 @@ class SeparateGradients(Gradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         """Return [B, K, K], the parts of the Gramians that rounding removed.
 
-        The sum of Gramian and residual has twice the digits. The call takes ten times as long as
-        `gramians`.
+        Gramian plus residual gives twice the digits. The call is ten times as slow as `gramians`.
         """
 
     @override

@@ -163,7 +163,7 @@ def transformed(
     Operators that contain other operators call them through this function.
 
     Raises:
-        UserError: The result has a wrong type or shape. A wrong type names the method.
+        UserError: The result has a wrong type or shape.
     """
     answer = operator.transform(gramians, context, state, rng)
     matrices, state = with_state(answer, np.ndarray, operator, "transform")

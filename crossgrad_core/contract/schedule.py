@@ -60,7 +60,7 @@ ONE_BY_ONE: Final = ViewsPerStep()
 
 @dataclass(frozen=True)
 class ViewsPerStepSpec:
-    """K over a run of any length: one number, or several numbers and the shares where they begin.
+    """K over a run of any length: one number, or several numbers with the shares of their start.
 
     Attributes:
         counts: The values of K.

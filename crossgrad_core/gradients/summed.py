@@ -105,10 +105,10 @@ class SummedGradients(Gradients):
         return gradients
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Adds the gradients of one more view, and takes them over: they are written to.
+        """Add the gradients of one more view; this object then owns and overwrites them.
 
         Raises:
-            RuntimeError: All views that were to come are there.
+            RuntimeError: All expected views were already added.
         """
         if self._views == self._expected:
             raise RuntimeError(f"one view more than the {self._expected} that were to come")

@@ -39,7 +39,7 @@ def recipe_of(config: RunConfig) -> Recipe:
 
 
 def is_given(config: RunConfig, setting: str) -> bool:
-    """Return True if a setting, or an option of a component, has a value already."""
+    """Return True if a setting, or an option of a component, already has a value."""
     name, _, option = setting.partition(".")
     value = getattr(config, name, None)
     if name == RULES:

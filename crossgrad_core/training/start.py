@@ -100,7 +100,7 @@ def compile_all(loss: ComponentChoice) -> None:
 def compile_rows() -> None:
     """Compile the kernels for optimizer steps of sparse rows with dummy data."""
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
-    # One row, then another row with deferred steps, then so many rows that all rows take the step.
+    # One row, then another row with deferred steps, then enough rows for the kernel for all rows.
     for rows in ([1], [4], [1, 4, 6]):
         grad = sparse_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
         late.step(

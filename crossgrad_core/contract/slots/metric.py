@@ -21,7 +21,7 @@ class Compared:
         view: The view.
         render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
         photo: [H, W, 3] uint8.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+        mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
         drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None if
             only the rounded render is known.
         points: [S, 3] SfM points that the view observed, local frame; may be empty.

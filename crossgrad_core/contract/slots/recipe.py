@@ -114,7 +114,7 @@ class Recipe(Component):
 
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
-            the length. What the user sets wins.
+            the length. Settings of the user override them.
         rasterizer_options: Options that a rasterizer must have to be chosen for this recipe.
     """
 

@@ -30,7 +30,7 @@ class Rule(Component):
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         """Return why the rule would change nothing in this run; empty if it would change something.
 
-        A new run is refused if the user asks for a rule that would change nothing.
+        A new run is refused if the user selects a rule that would change nothing.
         """
         return ""
 

@@ -23,7 +23,7 @@ def reduce_by_area(
     Args:
         image: [H, 3 W], contiguous.
         kept: [H, W], pixels that count; [0, 0] if all pixels count.
-        small: [h, w, 3], h <= H and w <= W: the means, 0 where nothing counts.
+        small: [h, w, 3], h <= H and w <= W: the means; 0 if no pixel of the area counts.
         counts: [h, w], new pixels that count.
     """
     masked = kept.size > 0
