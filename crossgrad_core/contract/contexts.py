@@ -145,7 +145,7 @@ class RequestedRender(RenderedView):
 
 
 class RenderOnRequest(Protocol):
-    """Renders training views with the parameters as they are now."""
+    """A function that renders training views with the present parameters."""
 
     def __call__(
         self,

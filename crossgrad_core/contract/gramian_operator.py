@@ -22,7 +22,7 @@ _NARROW: Final = 1e-12
 
 
 class MatrixOperator(Operator):
-    """Replaces the K gradients G of each block by M G and adds the rows of M G.
+    """An operator that replaces the K gradients G of each block by M G and adds the rows of M G.
 
     It can be a link of a chain and can be used for single blocks.
     """

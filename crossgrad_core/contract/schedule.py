@@ -13,7 +13,7 @@ _FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1.
 
 @dataclass(frozen=True)
 class ViewsPerStep:
-    """K, the number of views, of every step of a run of known length.
+    """The number of views K of each step in a run of known length.
 
     Attributes:
         starts: Number of steps after which each K begins; ascending, the first is 0.

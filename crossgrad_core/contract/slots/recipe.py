@@ -110,7 +110,7 @@ class Facts:
 
 
 class Recipe(Component):
-    """Decides every setting that the user leaves open.
+    """A rule set that decides every setting that the user leaves open.
 
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
