@@ -1,4 +1,4 @@
-"""The fully resolved configuration of a run: one schema for command line, file and results."""
+"""The configuration of a run: one schema for command line, file and results."""
 
 from collections.abc import Container, Mapping
 from pathlib import Path
@@ -19,26 +19,26 @@ from crossgrad_core.contract.flags import CONFIGURATION, MACHINE, PARTS, RESULTS
 from crossgrad_core.contract.scene_options import SceneOptions
 from crossgrad_core.contract.schedule import ScheduleMode, Unit, ViewsPerStepSpec
 
-#: Name of a choice that the run makes at its start.
+#: Value of a setting that the run chooses at its start.
 AUTO: Final = "auto"
 #: Settings of a run that do not change its training.
 CHANGEABLE: Final = frozenset({"device", "threads", "stop_after"})
-#: How primitives grow: as density control requests, or along a budget that follows the length.
+#: Growth of primitives: as density control requests, or by a budget for the length of the run.
 Growth: TypeAlias = Literal["unbounded", "budget"]
 
 
-#: Settings of earlier versions -> what they are called now.
+#: Old name of a setting -> its present name.
 _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """What a setting is called now; the old name stays where the new one stands beside it."""
+    """Return the present name of a setting; if `beside` contains that name, keep the old name."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 
 
 class ComponentChoice(BaseModel):
-    """A component by name with its options; the options are validated by the component itself."""
+    """A component by name with its options; the component itself validates the options."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
@@ -58,9 +58,9 @@ class ComponentChoice(BaseModel):
 
 
 class RunConfig(BaseModel):
-    """Everything that determines a run.
+    """All settings that determine a run.
 
-    `None` leaves a setting to the recipe, whose decision is written to config.yaml.
+    `None` leaves a setting to the recipe; the recipe's decision is written to config.yaml.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -338,7 +338,7 @@ class RunConfig(BaseModel):
     @field_validator("rules", mode="before")
     @classmethod
     def _rules(cls, value: object) -> object:
-        """Options for each rule; `true` and nothing stand for a rule with its defaults."""
+        """Return the options of each rule; `true` or no value means a rule with its defaults."""
         if not isinstance(value, Mapping):
             return value
         return {name: {} if each in (True, None) else each for name, each in value.items()}
@@ -346,7 +346,7 @@ class RunConfig(BaseModel):
     @field_validator("views_per_step")
     @classmethod
     def _views_per_step(cls, value: int | str | None) -> int | str | None:
-        """A number as a number, and a change of K in its one form."""
+        """Return a constant K as a number, and a varying K as text in the standard form."""
         if value is None:
             return None
         return ViewsPerStepSpec.parsed(str(value)).setting
@@ -366,7 +366,7 @@ class RunConfig(BaseModel):
 
     @property
     def view_plan(self) -> ViewsPerStepSpec | None:
-        """How many views the steps have; None where it is left to the sampler."""
+        """Views per step over the run; None if the sampler decides."""
         return (
             None
             if self.views_per_step is None
@@ -384,5 +384,5 @@ class RunConfig(BaseModel):
 
     @property
     def operators(self) -> tuple[ComponentChoice, ...]:
-        """The links of the operator chain; one for a single operator."""
+        """The operators of the chain; a single element without a chain."""
         return self.operator if isinstance(self.operator, tuple) else (self.operator,)

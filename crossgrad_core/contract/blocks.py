@@ -1,4 +1,4 @@
-"""Parameters of a backbone and the named blocks that operators and the optimizer work on."""
+"""Parameters of a backbone, and the named blocks that operators and the optimizer work on."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -20,10 +20,11 @@ class LearningRate:
     """A log-linear learning rate from `initial` to `final` over the schedule's length; 0 stays 0.
 
     Attributes:
-        initial: At the first step.
-        final: At the end of the schedule; None: `initial`.
-        few_passes: What it is multiplied by, beside all others of the backbone, in a run that shows
-            each photo a few times (docs/schedules.md); positive.
+        initial: Rate at the first step.
+        final: Rate at the end of the schedule; None means `initial`.
+        few_passes: Factor for this rate in a run with few passes over the photos
+            (docs/schedules.md), in addition to the factors for all rates of the backbone.
+            Positive.
 
     Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
     """
@@ -33,11 +34,11 @@ class LearningRate:
     few_passes: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuses rates that no schedule can follow.
+        """Check that a schedule can follow the rates.
 
         Raises:
-            ValueError: A rate is negative or not finite, or fades to 0, which no logarithm has; or
-                `few_passes` is no positive number.
+            ValueError: A rate is negative or not finite, or decays to 0, or `few_passes` is not
+                positive.
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
         if not all(0.0 <= rate < inf for rate in rates):
@@ -53,7 +54,7 @@ class LearningRate:
         return self.final is not None and self.initial not in {0.0, self.final}
 
     def at(self, progress: float) -> float:
-        """The rate when a share `progress` of the schedule is over (clipped to [0, 1])."""
+        """Return the rate after a share `progress` of the schedule (clipped to [0, 1])."""
         if self.final is None or not self.decays:
             return self.initial
         u = min(max(progress, 0.0), 1.0)
@@ -66,12 +67,13 @@ class Block:
 
     Attributes:
         name: Name of the block.
-        tensors: Names of its tensors in `Parameters`; a single-tensor block carries its name.
-        per_primitive: Whether the first dimension of every tensor counts primitives.
+        tensors: Names of its tensors in `Parameters`. A block with one tensor uses the tensor's
+            name.
+        per_primitive: True if the first dimension of every tensor is the number of primitives.
         kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
-        lr: Learning rate of all its tensors; 0 freezes the block: its tensors get no gradient,
-            may be of any type, and take part in topology edits and checkpoints only.
-        rests: Whether its tensors are details of the colour, such as spherical harmonics of higher
+        lr: Learning rate of all its tensors. 0 freezes the block: its tensors get no gradient, may
+            have any type, and are used in topology edits and checkpoints only.
+        rests: True if its tensors are details of the colour, such as spherical harmonics of higher
             degrees, that need not learn in every step.
     """
 
@@ -83,11 +85,11 @@ class Block:
     rests: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses what only later would go wrong.
+        """Check the fields early, before an error would appear later in training.
 
         Raises:
-            ValueError: The kind is none.
-            TypeError: The names of the tensors are no tuple, or the rate is a bare number.
+            ValueError: The kind is not one of `BlockKind`.
+            TypeError: The names of the tensors are not a tuple, or the rate is a plain number.
         """
         if self.kind not in get_args(BlockKind):
             kinds = get_args(BlockKind)
@@ -97,12 +99,12 @@ class Block:
 
     @property
     def frozen(self) -> bool:
-        """Whether training leaves the block as it is."""
+        """Whether training leaves the block unchanged."""
         return self.lr.initial == 0.0
 
 
 def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> int:
-    """The number of primitives, read off the first per-primitive tensor."""
+    """Return the number of primitives, taken from the first per-primitive tensor."""
     for block in blocks:
         if block.per_primitive:
             return int(parameters[block.tensors[0]].shape[0])
@@ -111,7 +113,7 @@ def primitives_of(blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -
 
 #: Names of states that belong to the components of slots.
 SLOTS: Final = frozenset({"densifier", "operator", "resolution", "sampler"})
-#: These and the core's own: no other plugin may use them.
+#: Names of states that belong to the slots and the core; no other plugin may use them.
 TAKEN: Final = SLOTS | {"budget", "grouping", "photos", "thinned"}
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
@@ -120,14 +122,14 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 class PluginState:
     """The state of one plugin between steps.
 
-    Its size must not depend on the number of steps, because every checkpoint holds it: keep sums,
-    or a window of at most 1,000 steps.
+    Its size must not depend on the number of steps, because every checkpoint contains it. Store
+    sums, or a window of at most 1,000 steps.
 
     Attributes:
         values: Plain numbers, strings, lists and dictionaries (must survive JSON).
         tensors: Tensors of any shape.
-        per_primitive: Tensors whose first dimension is the number of primitives; topology edits
-            gather their rows along with the parameters (rows of new primitives start at zero).
+        per_primitive: Tensors whose first dimension is the number of primitives. Topology edits
+            gather their rows together with the parameters (rows of new primitives start at zero).
     """
 
     values: Mapping[str, Json] = field(default_factory=dict)
@@ -141,7 +143,7 @@ class PluginState:
         return PluginState(values, tensors, rows)
 
     def to(self, device: torch.device) -> "PluginState":
-        """The state with its tensors on a device."""
+        """Return the state with its tensors on a device."""
         tensors, rows = (
             {name: tensor.to(device) for name, tensor in each.items()}
             for each in (self.tensors, self.per_primitive)
@@ -149,10 +151,10 @@ class PluginState:
         return PluginState(self.values, tensors, rows)
 
     def gathered(self, source: Tensor, fresh: Tensor) -> "PluginState":
-        """The state after a topology edit.
+        """Return the state after a topology edit.
 
         Args:
-            source: [M] int64, for each new primitive the old one whose row it takes over.
+            source: [M] int64, for each new primitive the old primitive whose row it copies.
             fresh: [M] bool, primitives whose rows start at zero.
         """
         rows = {name: carried(old, source, fresh) for name, old in self.per_primitive.items()}
@@ -160,18 +162,18 @@ class PluginState:
 
 
 def carried(old: Tensor, source: Tensor, fresh: Tensor) -> Tensor:
-    """Rows of `old` at `source` [M], with the rows marked in `fresh` [M] set to zero."""
-    # A plugin may keep its numbers elsewhere than the run does.
+    """Return the rows of `old` at `source` [M]; rows marked in `fresh` [M] are zero."""
+    # A plugin may store its tensors on another device than the run.
     source, fresh = source.to(old.device), fresh.to(old.device)
-    # Copies whole rows; to index with a tensor goes element by element.
+    # `index_select` copies whole rows; indexing with a tensor copies single elements.
     new = old.index_select(0, source)
-    # On a GPU the number of the marked rows would be waited for.
+    # On a GPU `nonzero` would wait for the number of marked rows.
     marked = fresh.nonzero()[:, 0] if fresh.is_cpu else fresh
     new[marked] = torch.zeros((), dtype=old.dtype, device=old.device)
     return new
 
 
-#: The state of a plugin that has none yet; read-only, because all runs of a process share it.
+#: The state of a plugin before it stores one; read-only, because all runs of a process share it.
 EMPTY_STATE = PluginState(MappingProxyType({}), MappingProxyType({}), MappingProxyType({}))
 
 
@@ -182,7 +184,7 @@ class Rows:
     Attributes:
         rows: [R] int64 row indices *after* the edit; None means every row.
         values: [R, ...] values.
-        keep_moments: Whether the optimizer's moments of these rows survive.
+        keep_moments: True if the optimizer's moments of these rows are kept.
     """
 
     values: Tensor
@@ -194,15 +196,15 @@ class Rows:
 class Edit:
     """A change of the set of primitives and of their values.
 
-    New primitive j takes over every per-primitive row of old primitive `source[j]`: parameters,
-    optimizer moments, statistics. That one gather expresses duplicate, split, relocate, remove and
-    append; `fresh` marks rows that start with zero moments and statistics.
+    New primitive j copies every per-primitive row of old primitive `source[j]`: parameters,
+    optimizer moments, statistics. This single gather can duplicate, split, relocate, remove and
+    append primitives. `fresh` marks rows that start with zero moments and statistics.
 
     Attributes:
-        source: [M] int64 old index of each new primitive; None where the set stays as it is.
+        source: [M] int64 old index of each new primitive; None if the set does not change.
         fresh: [M] bool; None means that no row is fresh.
         values: Tensor name -> rows to overwrite after the gather.
-        counts: What happened, for the log (`cloned`, `split`, `pruned`, `reset` ...).
+        counts: Numbers of events, for the log (`cloned`, `split`, `pruned`, `reset` ...).
     """
 
     source: Tensor | None = None
@@ -212,21 +214,21 @@ class Edit:
 
     @property
     def is_empty(self) -> bool:
-        """Whether it changes nothing and counts nothing."""
+        """Whether the edit changes nothing and counts nothing."""
         return self.keeps_rows and not self.values and not self.counts
 
     @property
     def keeps_rows(self) -> bool:
-        """Whether all primitives stay, and none begins afresh."""
+        """Whether all primitives stay and no row is fresh."""
         return self.source is None and self.fresh is None
 
 
-#: The explicit answer of a densifier that changes nothing in this step.
+#: The explicit result of a densifier that changes nothing in this step.
 NO_EDIT = Edit()
 
 
 def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> str:
-    """What of an edit does not fit the parameters, in words; empty where all does."""
+    """Return a description of what in an edit does not fit the parameters; empty if all fits."""
     before = primitives_of(blocks, parameters)
     if wrong := _no_set(edit, before):
         return wrong
@@ -241,7 +243,7 @@ def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Te
 
 
 def _no_set(edit: Edit, before: int) -> str:
-    """Why an edit of so many primitives gives no new set of them; empty where it does."""
+    """Return why `source` or `fresh` does not fit `before` primitives; empty if both fit."""
     source, fresh = edit.source, edit.fresh
     if source is not None and (wrong := _no_list(source, torch.int64)):
         return f"source is {wrong}"
@@ -256,7 +258,7 @@ def _no_set(edit: Edit, before: int) -> str:
 
 
 def _no_list(found: object, dtype: torch.dtype) -> str:
-    """What something is that should be a one-dimensional tensor of a type; empty where it is."""
+    """Return how an object differs from a 1-D tensor of a dtype; empty if it is such a tensor."""
     if not isinstance(found, Tensor):
         return f"of type {type(found).__module__}.{type(found).__name__}, not a tensor"
     good = found.ndim == 1 and found.dtype == dtype
@@ -264,13 +266,13 @@ def _no_list(found: object, dtype: torch.dtype) -> str:
 
 
 def _no_values(new: object, count: int, width: torch.Size) -> str:
-    """Why something does not replace rows, of so many, of a width; empty where it does."""
+    """Return why `new` cannot replace rows of a [count, *width] tensor; empty if it can."""
     if not isinstance(new, Rows) or not isinstance(new.values, Tensor):
         return f"{type(new).__name__}, not Rows of a tensor"
     if new.rows is not None:
         if wrong := _no_list(new.rows, torch.int64):
             return f"rows are {wrong}"
-        # On a GPU a look would be waited for.
+        # On a GPU this check would wait for the device.
         if new.rows.is_cpu and ((new.rows < 0) | (new.rows >= count)).any():
             return f"rows leave 0 to {count - 1}"
         count = len(new.rows)
@@ -279,13 +281,13 @@ def _no_values(new: object, count: int, width: torch.Size) -> str:
 
 
 def _fits(values: Tensor, shape: tuple[int, ...]) -> bool:
-    """Whether values can be written to a tensor of a shape."""
+    """Return True if values can be written to a tensor of this shape."""
     pairs = zip(reversed(values.shape), reversed(shape), strict=False)
     return values.ndim <= len(shape) and all(own in (1, size) for own, size in pairs)
 
 
 def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """`source` [M] and `fresh` [M] of an edit with the defaults filled in."""
+    """Return `source` [M] and `fresh` [M] of an edit, with defaults in place of None."""
     source = edit.source
     if source is None:
         source = torch.arange(primitives, device=device)
@@ -298,9 +300,10 @@ def gather_indices(edit: Edit, primitives: int, device: torch.device) -> tuple[T
 def apply_to_parameters(
     edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]
 ) -> Parameters:
-    """The parameters after an edit: new leaf tensors that require gradients where the old ones did.
+    """Return the parameters after an edit.
 
-    What an edit does not change is passed on as the same object.
+    Changed tensors are new leaf tensors that require gradients if the old tensors did. A tensor
+    that the edit does not change is returned as the same object.
     """
     new = dict(parameters)
     for block in blocks:
@@ -316,7 +319,7 @@ def _edited(edit: Edit, name: str, old: Tensor) -> Tensor:
         return old
     if edit.source is None:
         tensor = old.detach().clone()
-    else:  # A plugin may list rows elsewhere than the parameters are.
+    else:  # A plugin may list rows on another device than the parameters.
         tensor = old.detach().index_select(0, edit.source.to(old.device))
     if overwrite is not None:
         rows = slice(None) if overwrite.rows is None else overwrite.rows
@@ -325,7 +328,7 @@ def _edited(edit: Edit, name: str, old: Tensor) -> Tensor:
 
 
 def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
-    """An optimizer moment of the per-primitive tensor `name` after an edit.
+    """Return an optimizer moment of the per-primitive tensor `name` after an edit.
 
     Rows that are fresh, and rows overwritten without `keep_moments`, start at zero.
     """
@@ -342,7 +345,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
 EPS: Final = 1e-15
 #: Decay of the first and of the second moment (3DGS).
 BETAS: Final = (0.9, 0.999)
-#: More views than this leave the first moment no memory under the batch rule.
+#: With more views than this, the batch rule would set the decay of the first moment to 0.
 MOST_VIEWS: Final = 10
 
 
@@ -353,7 +356,7 @@ class AdamState:
     Attributes:
         exp_avg: First moments, each shaped like its parameter.
         exp_avg_sq: Second moments, each shaped like its parameter.
-        steps: How many gradients each tensor has seen.
+        steps: How many gradients each tensor has received.
     """
 
     exp_avg: dict[str, Tensor] = field(default_factory=dict)
@@ -363,12 +366,12 @@ class AdamState:
 
 @dataclass(frozen=True)
 class AdamRule:
-    """How Adam averages.
+    """The averaging rule of Adam.
 
     Attributes:
         betas: Decay of the first and the second moment, each in [0, 1).
         eps: Added to the root of the second moment.
-        age: What a tensor's count of steps is multiplied by before its bias is corrected.
+        age: Factor for a tensor's count of steps in the bias correction.
     """
 
     betas: tuple[float, float] = BETAS
@@ -379,15 +382,15 @@ class AdamRule:
     def for_views(
         cls, views: int, age: float = 1.0, betas: tuple[float, float] = BETAS
     ) -> "AdamRule":
-        """The batch rule: moments forget as much per view as with one view per step.
+        """Return the batch rule: moments decay as much per view as with one view per step.
 
-        Learning rates times sqrt(K) belong to it.
+        The batch rule also multiplies learning rates by sqrt(K); the caller does this.
 
         Args:
             views: K, at most `MOST_VIEWS`.
-            age: Steps of K views that draw as many as the run has, over its steps; not 1 where K
-                changed.
-            betas: With one view per step.
+            age: Number of steps that would draw the run's views with K views each, divided by the
+                run's number of steps; not 1 if K changed.
+            betas: Decays with one view per step.
 
         Source: gsplat; Malladi et al. 2022 (square-root scaling), K views for K batches.
         """

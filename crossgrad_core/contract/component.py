@@ -1,4 +1,4 @@
-"""Components: frozen pydantic models whose fields are their options, and hook marks."""
+"""Components (frozen pydantic models whose fields are their options) and hook markers."""
 
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
@@ -18,10 +18,10 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 class Component(BaseModel):
-    """Base of everything that fills a slot.
+    """Base class of everything that fills a slot.
 
-    The fields are the options (typed, bounded, documented); running state is never kept here but
-    passed in and returned as `PluginState`.
+    The fields are the options (typed, bounded, documented). A component never stores running state;
+    the state is passed in and returned as `PluginState`.
 
     Attributes:
         slot: The slot that the component fills; set by the slot's base class.
@@ -35,10 +35,10 @@ class Component(BaseModel):
 
 
 def answered(answer: object, kind: type[A], component: Component, method: str) -> A:
-    """What a method of a component answered, if it is of its kind.
+    """Return the result of a component's method after a check of its type.
 
     Raises:
-        UserError: It is not; names the method.
+        UserError: The result has another type. The message names the method.
     """
     if isinstance(answer, kind):
         return answer
@@ -48,10 +48,10 @@ def answered(answer: object, kind: type[A], component: Component, method: str) -
 def pair(
     answer: object, first: type[A], second: type[B], component: Component, method: str
 ) -> tuple[A, B]:
-    """The two parts of what a method of a component answered.
+    """Return the two parts of the result of a component's method.
 
     Raises:
-        UserError: It is no pair of these types; names the method.
+        UserError: The result is not a pair of these types. The message names the method.
     """
     match answer:
         case (one, other) if isinstance(one, first) and isinstance(other, second):
@@ -63,7 +63,7 @@ def pair(
 def with_state(
     answer: object, kind: type[A], component: Component, method: str
 ) -> tuple[A, PluginState]:
-    """As `pair`, of something and the new state."""
+    """Return a result and the new state, checked as in `pair`."""
     return pair(answer, kind, PluginState, component, method)
 
 
@@ -81,7 +81,7 @@ def _wrong_answer(component: Component, method: str, expected: str, answer: obje
 
 @dataclass(frozen=True)
 class ViewCounts:
-    """For which numbers K of views per step something has a meaning.
+    """The numbers K of views per step that a component supports.
 
     Attributes:
         minimum: Smallest K.
@@ -94,7 +94,7 @@ class ViewCounts:
     multiple_of: int = 1
 
     def admits(self, views: int) -> bool:
-        """Whether K = `views` has a meaning."""
+        """Return True if K = `views` is supported."""
         above = self.maximum is not None and views > self.maximum
         return views >= self.minimum and not above and views % self.multiple_of == 0
 

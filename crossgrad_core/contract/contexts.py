@@ -1,4 +1,4 @@
-"""Arguments and answers of the hooks."""
+"""Arguments and results of the hooks."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -38,7 +38,7 @@ class ViewSample:
 
     Attributes:
         views: K positions in `scene.train_views`.
-        labels: K group labels, or None where the sampler has no groups.
+        labels: K group labels, or None if the sampler uses no groups.
     """
 
     views: tuple[int, ...]
@@ -47,19 +47,18 @@ class ViewSample:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderedView:
-    """A training view as it was rendered, beside what the render is compared with.
+    """A rendered training view, together with the photo that the render is compared with.
 
     Attributes:
         view: The view.
-        camera: The camera that it was rendered with: that of the view in another size where `scale`
-            is not 1.
-        scale: Sides of the render over those of the photo as trained.
-        gaussians: What was drawn.
-        screen: Screen statistics in pixels of the render, gradients included where a backward pass
-            has run; read in units of the full photo through `contract.screen_statistics`.
-        image: [H, W, 3] the image that is compared: the render after exposure.
-        photo: [H, W, 3] uint8 the photo that it is compared with, in the size of the render.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel does.
+        camera: The camera of the render: the view's camera, resized if `scale` is not 1.
+        scale: Side length of the render divided by the side length of the photo as trained.
+        gaussians: The Gaussians that were drawn.
+        screen: Screen statistics in pixels of the render, with gradients if a backward pass has
+            run. `contract.screen_statistics` converts them to units of the full photo.
+        image: [H, W, 3] the image that is compared with the photo: the render after exposure.
+        photo: [H, W, 3] uint8 photo, in the size of the render.
+        mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
 
     view: View
@@ -78,9 +77,9 @@ class ViewRecord(RenderedView):
 
     Attributes:
         index: Position in `scene.train_views`.
-        label: Its group label, or None.
-        loss: Its own photometric loss.
-        background: [3] RGB that it was drawn over.
+        label: Group label of the view, or None.
+        loss: Photometric loss of this view.
+        background: [3] RGB background of the render.
     """
 
     index: int
@@ -91,20 +90,20 @@ class ViewRecord(RenderedView):
 
 @dataclass(frozen=True)
 class StepRecord:
-    """The record of a step; observers see it, samplers see the last one.
+    """The record of a step. Observers receive it; samplers receive the record of the last step.
 
     Attributes:
         step: 1-based number of the step.
         views: Positions in `scene.train_views`.
-        names: Their names.
-        labels: Their group labels, or None.
-        losses: Their photometric losses, in order.
-        primitives: Number after the step.
+        names: Names of the views.
+        labels: Group labels of the views, or None.
+        losses: Photometric losses of the views, in the same order.
+        primitives: Number of primitives after the step.
         counts: Counted events: `zero`, `disjoint`, `dropped`, `conflict` blocks of the aggregation,
             `cloned`, `split`, `pruned`, `reset` primitives of the densification.
         train_seconds: Training seconds since the start of the run, this step included.
-        scales: The scales at which the views were rendered and compared; empty where all had their
-            full size.
+        scales: The scales at which the views were rendered and compared; empty if all views had
+            their full size.
     """
 
     step: int
@@ -118,12 +117,12 @@ class StepRecord:
     scales: tuple[float, ...] = ()
 
 
-#: The photo [H, W, 3] uint8 of a view and its mask [H, W] bool, None where every pixel counts.
+#: View -> its photo [H, W, 3] uint8 and its mask [H, W] bool (None if every pixel counts).
 PhotoOf = Callable[[View], tuple[Tensor, Tensor | None]]
 
 
 def decoded(view: View) -> tuple[Tensor, Tensor | None]:
-    """The photo and the mask of a view, decoded off any clock."""
+    """Decode and return the photo and the mask of a view, without counting the time."""
     return view.photo.image(), view.photo.mask()
 
 
@@ -132,8 +131,8 @@ class RequestedRender(RenderedView):
     """A training view as it was rendered on request, through the run's exposure and loss.
 
     Attributes:
-        render: What the rasterizer made of it.
-        measure: Works out `loss`.
+        render: The output of the rasterizer.
+        measure: Computes `loss`.
     """
 
     render: Render
@@ -141,12 +140,12 @@ class RequestedRender(RenderedView):
 
     @cached_property
     def loss(self) -> Tensor:
-        """The run's photometric loss, pixel weights included; worked out when it is asked for."""
+        """The run's photometric loss, including pixel weights; computed at first access."""
         return self.measure()
 
 
 class RenderOnRequest(Protocol):
-    """Renders training views with the parameters as they are now."""
+    """A function that renders training views with the present parameters."""
 
     def __call__(
         self,
@@ -155,31 +154,31 @@ class RenderOnRequest(Protocol):
         outputs: frozenset[str] = frozenset(),
         background: Tensor | None = None,
     ) -> RequestedRender:
-        """The view as rendered.
+        """Return the rendered view.
 
-        The render is part of a graph where gradients are on (`torch.enable_grad()`); a densifier
-        that needs none asks under `torch.no_grad()`.
+        The render is part of a graph if gradients are enabled (`torch.enable_grad()`). A densifier
+        that needs no gradients calls this under `torch.no_grad()`.
 
         Args:
             view: Position in `scene.train_views`.
-            scale: In (0, 1]: sides of the render over those of the photo.
+            scale: Side length of the render divided by the side length of the photo, in (0, 1].
             outputs: Optional outputs of the rasterizer.
-            background: [3] RGB; None takes that of evaluated views.
+            background: [3] RGB; None uses the background of evaluated views.
         """
         ...
 
 
 def no_renders(*_asked: object, **_named: object) -> RequestedRender:
-    """Stands where nothing can be rendered; raises RuntimeError."""
+    """Raise RuntimeError: the default for contexts that cannot render views."""
     raise RuntimeError("this context belongs to no run: there is nothing to render views with")
 
 
-#: A view and its render [H, W, 3] -> the image as the view's camera would have taken it.
+#: A view and its render [H, W, 3] -> the image as the camera of the view would have recorded it.
 ExposedBy = Callable[[View, Tensor], Tensor]
 
 
 def unexposed(_view: View, image: Tensor) -> Tensor:
-    """The image as it is."""
+    """Return the image unchanged."""
     return image
 
 
@@ -192,9 +191,9 @@ class StepContext:
         schedule: The schedule of the run.
         scene: The scene.
         states: State of every plugin by the plugin's name; read only.
-        rng: The generator of the hook. Every random number of a plugin must come from it.
-        photo: Gives the photo and the mask of a view on the run's device. The time for decoding
-            them counts as loading; `view.photo` would decode them in training time.
+        rng: The random generator of the hook. Every random number of a plugin must come from it.
+        photo: Returns the photo and the mask of a view on the run's device. The time for decoding
+            counts as loading time; `view.photo` would decode in training time.
     """
 
     step: int
@@ -205,19 +204,19 @@ class StepContext:
     photo: PhotoOf = field(default=decoded, kw_only=True)
 
     def state(self, plugin: str) -> PluginState:
-        """The state that the plugin of that name returned last; empty at first."""
+        """Return the state that the plugin of this name returned last; empty at first."""
         return self.states.get(plugin, EMPTY_STATE)
 
 
 @dataclass(frozen=True, eq=False)
 class SampleContext(StepContext):
-    """For `crossgrad_sample_views`.
+    """The context of `crossgrad_sample_views`.
 
     Attributes:
         views_per_step: K of this step.
-        groups: Label of each training view, or None where no grouping was made.
+        groups: Label of each training view, or None if the run has no grouping.
         centers: [N, 3] float64 camera centres of the training views, local frame.
-        last: Record of the step before, None in the first one.
+        last: Record of the previous step; None in the first step.
     """
 
     views_per_step: int
@@ -228,11 +227,11 @@ class SampleContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class ScaleContext(StepContext):
-    """For `crossgrad_choose_scales`.
+    """The context of `crossgrad_choose_scales`.
 
     Attributes:
         draw: The views of the step.
-        last: Record of the step before, None in the first one.
+        last: Record of the previous step; None in the first step.
     """
 
     draw: ViewSample
@@ -246,15 +245,15 @@ class ScaleContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class PixelContext(StepContext):
-    """For `crossgrad_pixel_weights`.
+    """The context of `crossgrad_pixel_weights`.
 
     Attributes:
         index: Position of the view in `scene.train_views`.
         view: The view.
-        camera: The camera that it is rendered with.
-        scale: Sides of the render over those of the photo as trained.
-        target: [H, W, 3] uint8 the photo that the render is compared with, in its size.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
+        camera: The camera of the render.
+        scale: Side length of the render divided by the side length of the photo as trained.
+        target: [H, W, 3] uint8 photo that the render is compared with, in the size of the render.
+        mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
     """
 
     index: int
@@ -267,16 +266,16 @@ class PixelContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class AggregateContext(StepContext):
-    """For `crossgrad_aggregate_gradients`.
+    """The context of `crossgrad_aggregate_gradients`.
 
     Attributes:
-        gradients: The gradients of the K views: apart where the operator or a plugin asks for it.
+        gradients: The gradients of the K views; separate if the operator or a plugin requires it.
         losses: [K] float64 photometric losses.
         labels: K group labels, or None.
         distances: [K] float64 distance of each camera from the mean training camera, local units.
-        reference_distance: Median of these distances over all training cameras.
+        reference_distance: Median of this distance over all training cameras.
         blocks: The blocks, in the order of every Gramian's first dimension.
-        scales: K scales at which losses and gradients were taken; empty where all are 1.
+        scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 
     gradients: Gradients
@@ -289,10 +288,10 @@ class AggregateContext(StepContext):
 
     @property
     def separate(self) -> SeparateGradients:
-        """The gradients, of each view by itself.
+        """The separate gradients of each view.
 
         Raises:
-            TypeError: They were accumulated, because no plugin said that single views matter.
+            TypeError: The gradients were accumulated, because no plugin needs separate gradients.
         """
         if isinstance(self.gradients, SeparateGradients):
             return self.gradients
@@ -304,13 +303,14 @@ class AggregateContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class RegularizeContext(StepContext):
-    """For `crossgrad_regularize`: called once per view, and once per step with `gaussians` None.
+    """The context of `crossgrad_regularize`.
 
     Attributes:
         parameters: The parameters, requiring gradients.
         backbone: The backbone.
-        gaussians: What the backbone decoded for this view, with its graph; None in the step's call.
-        view: The view; None in the step's call.
+        gaussians: The Gaussians that the backbone decoded for this view, with their graph; None in
+            the call per step.
+        view: The view; None in the call per step.
     """
 
     parameters: Mapping[str, Tensor]
@@ -321,19 +321,20 @@ class RegularizeContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class DensifyContext(StepContext):
-    """For `crossgrad_densify`, called after every step.
+    """The context of `crossgrad_densify`, which is called after every step.
 
     Attributes:
-        parameters: The parameters; to be changed through the answered edit only.
+        parameters: The parameters. Only the returned edit may change them.
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
-        share: Number of these over that of all views of the step; 1 but for `--densify-views`.
+        share: Number of `views` divided by the number of all views of the step; 1 unless
+            `--densify-views` changes it.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
-        may_grow: [P] bool, the primitives that may grow; None where all may.
-        render: Renders a training view of the densifier's choice: on the training clock, and
-            counted among the rendered views.
+        may_grow: [P] bool, the primitives that may grow; None if all may grow.
+        render: Renders a training view that the densifier chooses. The render counts as training
+            time and as a rendered view.
     """
 
     parameters: Mapping[str, Tensor]
@@ -349,13 +350,13 @@ class DensifyContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class AfterStepContext(StepContext):
-    """For `crossgrad_after_optimizer`, `crossgrad_after_step` and `crossgrad_step_done`.
+    """The context of the hooks `crossgrad_after_optimizer`, `_after_step` and `_step_done`.
 
     Attributes:
-        parameters: The parameters; to be changed through the answered edit only.
+        parameters: The parameters. Only the returned edit may change them.
         backbone: The backbone.
         means_lr: Current learning rate of the primitives' positions.
-        edited: Whether density control changed the set of primitives in this step already.
+        edited: Whether density control has already changed the set of primitives in this step.
     """
 
     parameters: Mapping[str, Tensor]
@@ -366,35 +367,35 @@ class AfterStepContext(StepContext):
 
 @dataclass(frozen=True)
 class Answer:
-    """The part common to the answers of all hooks: new states by plugin name."""
+    """The common part of the results of all hooks: new states by plugin name."""
 
     states: Mapping[str, PluginState] = field(default_factory=dict, kw_only=True)
 
     def with_state(self, plugin: str, state: PluginState) -> Self:
-        """The same answer with a new state for the plugin of that name."""
+        """Return the same result with a new state for the plugin of this name."""
         return replace(self, states={**self.states, plugin: state})
 
 
 @dataclass(frozen=True)
 class SampleResult(Answer):
-    """Answer of `crossgrad_sample_views`."""
+    """Result of `crossgrad_sample_views`."""
 
     draw: ViewSample
 
 
 @dataclass(frozen=True)
 class ScaleResult(Answer):
-    """Answer of `crossgrad_choose_scales`: one scale in (0, 1] for each drawn view."""
+    """Result of `crossgrad_choose_scales`: one scale in (0, 1] for each drawn view."""
 
     scales: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class AggregateResult(Answer):
-    """Answer of `crossgrad_aggregate_gradients`.
+    """Result of `crossgrad_aggregate_gradients`.
 
     Attributes:
-        gradients: Tensor name -> gradient, None where the optimizer must skip the tensor.
+        gradients: Tensor name -> gradient; None if the optimizer must skip the tensor.
         counts: Counted events of this step.
     """
 
@@ -404,14 +405,14 @@ class AggregateResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class RegularizeResult(Answer):
-    """Answer of `crossgrad_regularize`: a scalar to be minimised besides the photometric loss."""
+    """Result of `crossgrad_regularize`: a scalar to add to the photometric loss."""
 
     loss: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class DensifyResult(Answer):
-    """Answer of the hooks that edit primitives, such as `crossgrad_densify`: may be NO_EDIT."""
+    """Result of the hooks that edit primitives, such as `crossgrad_densify`; may be NO_EDIT."""
 
     edit: Edit
 
@@ -421,12 +422,12 @@ class RunInfo:
     """The run at its start, for observers.
 
     Attributes:
-        folder: The output folder; None where nothing is written.
+        folder: The output folder; None if nothing is written.
         scene: The scene.
         config: The resolved configuration as plain data.
         schedule: The schedule.
         blocks: The blocks of the backbone.
-        notes: What was chosen or left out, and why.
+        notes: Messages about choices and omissions, with reasons.
         decisions: The table of decided settings.
     """
 
@@ -441,22 +442,22 @@ class RunInfo:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The model between two steps, for those who measure it. Nothing in it may be changed.
+    """The model between two steps, for plugins that measure it. Nothing in it may be changed.
 
     Attributes:
-        phase: The moment, as training decodes in it; `phase.step` is the last complete step.
+        phase: The phase in which training decodes; `phase.step` is the last complete step.
         scene: The scene.
         backbone: The backbone.
         rasterizer: The rasterizer.
         parameters: The parameters.
         adam: The optimizer's moments.
-        rule: How Adam averages in the next step.
-        background: [3] RGB that evaluated views are drawn over.
+        rule: The averaging rule of Adam in the next step.
+        background: [3] RGB background of evaluated views.
         loss: The photometric loss.
         groups: Group label of each training view, or None.
-        exposed: What the run's exposure makes of a render [H, W, 3] of a view; it goes before the
-            loss.
-        render: Renders a training view of the observer's choice; off the clock, and not counted.
+        exposed: Applies the run's exposure to a render [H, W, 3] of a view, before the loss.
+        render: Renders a training view that the observer chooses. The render counts neither as
+            training time nor as a rendered view.
     """
 
     phase: Phase
@@ -490,24 +491,26 @@ class EvaluationReport:
 
 @dataclass(frozen=True, eq=False)
 class OperatorContext:
-    """The context of a Gramian operator, besides the Gramians.
+    """The context of a Gramian operator, in addition to the Gramians.
 
     Attributes:
         step: 1-based number of the step.
         blocks: [B] name of each Gramian's block (`geometry`, `appearance` under granularity
             `kind`, `all` under `global`; under `gaussian` one name for all rows of a block).
-        kinds: [B] kind of each.
-        losses: [K] float64.
+        kinds: [B] kind of each block.
+        losses: [K] float64 photometric losses.
         labels: K group labels, or None.
         distances: [K] float64 camera distances from the mean training camera, local units.
-        reference_distance: Their median over all training cameras.
+        reference_distance: Median of this distance over all training cameras.
         present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
-            columns of the others are zero in the Gramian; an operator must give them weight 0.
-        unit: Unit roundoff of the gradients' type: no result needs to be closer.
-        rounding_residuals: Works out [B, K, K], what rounding to float64 took from the Gramians.
-            Both together have twice the digits. It takes another, slower pass over the gradients,
-            for Gramians so close to singular that their own rounding shows. None if unknown.
-        scales: K scales at which losses and gradients were taken; empty where all are 1.
+            columns of all other views are zero in the Gramian; an operator must give these views
+            weight 0.
+        unit: Unit roundoff of the gradients' type. No result needs a smaller relative error.
+        rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
+            removed. Gramian plus residual gives twice the digits. This needs another, slower pass
+            over the gradients; it is for Gramians so close to singular that their rounding affects
+            the result. None if unknown.
+        scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 
     step: int

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
-#: Settings that follow the length if the clock makes a run longer or shorter.
+#: Settings that change with the length if the clock makes a run longer or shorter.
 FOLLOWING: Final = ("rate_factor", "growth", "max_gaussians", "min_refinements", "sh_start")
 
 
@@ -15,8 +15,8 @@ class Decision:
     Attributes:
         setting: A setting of a run, or an option of a component, such as `densifier.division`.
         value: Its value.
-        because: Why, in a few words.
-        evidence: The facts or the results that the reason rests on.
+        because: The reason, in a few words.
+        evidence: The facts or the results that support the reason.
         override: The option that sets another value; empty if the value is the published one, which
             the terminal does not report.
     """
@@ -34,8 +34,8 @@ class Length:
 
     Attributes:
         planned: Steps that the run was planned with.
-        total: Steps that it has now, after the clock made it longer or shorter.
-        start: Primitives at the start; None before they are counted.
+        total: Present number of steps, after the clock made the run longer or shorter.
+        start: Number of primitives at the start; None before they are counted.
     """
 
     planned: int
@@ -48,5 +48,5 @@ Decide: TypeAlias = Callable[[Length], tuple[Decision, ...]]
 
 
 def repeats(_: Length) -> tuple[Decision, ...]:
-    """The table of a run that repeats another one: nothing is open."""
+    """Return the empty table of a run that repeats another run: no setting is left to decide."""
     return ()

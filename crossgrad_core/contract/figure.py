@@ -1,20 +1,20 @@
-"""A figure of the results: its name and how it is shown. Imports nothing heavy."""
+"""A figure of the results: its name and its format. Imports no large package."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of a view, of which results hold means.
+    """One figure that is measured for each view; results contain its means.
 
     Attributes:
         name: Its name in every file of results, such as a column of metrics.csv.
-        label: What tables call it.
-        form: How tables format it.
-        per_regime: Whether metrics.csv has a column of it for every regime.
-        definition: How it is computed, for summary.json; empty where the name says it all.
-        undefined: Why a view that has pixels to compare may have none.
-        falls: Whether less of it is better.
+        label: Its name in tables.
+        form: Its number format in tables.
+        per_regime: True if metrics.csv contains one column of this figure for every regime.
+        definition: How it is computed, for summary.json; empty if the name is clear enough.
+        undefined: Why the figure may be undefined for a view that has pixels to compare.
+        falls: True if a lower value is better.
     """
 
     name: str
@@ -26,5 +26,5 @@ class Figure:
     falls: bool = False
 
     def column(self, regime: str) -> str:
-        """Its column in metrics.csv for one regime."""
+        """Return the name of its column in metrics.csv for one regime."""
         return f"{self.name}_{regime}"

@@ -1,9 +1,9 @@
-"""How a setting appears on the command line; stands beside its type and bounds in the schema."""
+"""How a setting appears on the command line, next to its type and bounds in the schema."""
 
 from dataclasses import dataclass
 from typing import Final
 
-#: Headings of the help, in its order.
+#: Headings of the help text, in their order.
 CONFIGURATION: Final = "Configuration"
 PARTS: Final = "Components (`crossgrad plugins list` shows the names)"
 TRAINING: Final = "Training"
@@ -15,13 +15,14 @@ HEADINGS: Final = (CONFIGURATION, PARTS, TRAINING, SCENE, MACHINE, RESULTS)
 
 @dataclass(frozen=True)
 class Flag:
-    """The option of a setting; its type and its help are those of the field.
+    """The command-line option of a setting; type and help text come from the field.
 
     Attributes:
-        metavar: What the help shows for its value.
-        heading: Heading under which the help lists it, one of `HEADINGS`; empty for an argument.
-        name: Its name without dashes, where it is not the setting's.
-        common: Whether `--help` shows it; `--help-all` shows every option.
+        metavar: The placeholder for its value in the help text.
+        heading: Heading under which the help text lists the option, one of `HEADINGS`; empty for
+            an argument.
+        name: Its name without dashes, if it differs from the name of the setting.
+        common: True if `--help` shows it; `--help-all` shows every option.
     """
 
     metavar: str

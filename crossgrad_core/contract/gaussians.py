@@ -1,4 +1,4 @@
-"""Gaussians, which every backbone decodes to, and renders, which every rasterizer returns."""
+"""Gaussians, the output of every backbone, and renders, the output of every rasterizer."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,11 +16,11 @@ _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest"
 
 @dataclass(frozen=True)
 class OnDemand:
-    """Tensors of which only those rows are up to date that were asked for.
+    """Tensors whose rows are updated on demand: only requested rows are up to date.
 
     Attributes:
-        fields: Which fields of the Gaussians they are.
-        bring: [R] int32 rows, each once, or None for all -> brings these up to date, in place.
+        fields: The fields of the Gaussians that contain these tensors.
+        bring: Updates rows in place; its argument is [R] int32 rows, each once, or None for all.
     """
 
     fields: frozenset[str]
@@ -31,8 +31,8 @@ class OnDemand:
 class Gaussians:
     """N coloured 3-D Gaussians in the local frame of the scene.
 
-    Colour is either `colors` (RGB as drawn) or spherical harmonics `sh_dc`, `sh_rest` evaluated at
-    `sh_degree`; exactly one of the two is given.
+    Colour is either `colors` (RGB as drawn) or spherical harmonics `sh_dc`, `sh_rest`, evaluated at
+    `sh_degree`. Exactly one of `colors` and `sh_dc` is given.
 
     Attributes:
         means: [N, 3] centres, local units.
@@ -44,15 +44,16 @@ class Gaussians:
         sh_rest: [N, B - 1, 3] higher bands (B = 4, 9 or 16), None at degree 0.
         sh_degree: Active degree, 0 to 3.
         response: How a Gaussian fills a pixel.
-        dilation: Added to both diagonal entries of the 2-D covariance, px^2; None takes the
-            rasterizer's own.
-        origin: [N] int64, the primitive of each Gaussian; None where Gaussian i is primitive i.
-        slot: [N] int64, which of its primitive's Gaussians each one is; None where there is one.
-        decoded: [P] bool, the primitives that were decoded for this view, whether or not they gave
-            a Gaussian; None where all were.
-        on_demand: Tensors whose rows must be asked for before they are read; the gradients of these
-            are by rows, sparse. None where all is there. Only rasterizers with `sparse_rows`
-            get it.
+        dilation: Added to both diagonal entries of the 2-D covariance, px^2; None uses the dilation
+            of the rasterizer.
+        origin: [N] int64, the primitive of each Gaussian; None if Gaussian i is primitive i.
+        slot: [N] int64, index of each Gaussian among the Gaussians of its primitive; None if every
+            primitive gives one Gaussian.
+        decoded: [P] bool, the primitives that were decoded for this view, with or without a
+            resulting Gaussian; None if all were decoded.
+        on_demand: Tensors whose rows must be requested before they are read. The gradients of these
+            tensors are sparse, by rows. None if all rows are up to date. Only rasterizers with
+            `sparse_rows` receive it.
     """
 
     means: Tensor
@@ -74,21 +75,21 @@ class Gaussians:
         return int(self.means.shape[0])
 
     def floats(self) -> list[Tensor]:
-        """The floating-point tensors that are given, in the order of the fields."""
+        """Return the floating-point tensors that are given, in the order of the fields."""
         return [t for t in (getattr(self, name) for name in _FLOATS) if t is not None]
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
-        """The same Gaussians with `function` applied to every floating-point tensor."""
+        """Return the same Gaussians with `function` applied to every floating-point tensor."""
         tensors = {name: getattr(self, name) for name in _FLOATS}
         mapped: dict[str, Any] = {n: function(t) for n, t in tensors.items() if t is not None}
         return replace(self, **mapped)
 
     def detached(self) -> "Gaussians":
-        """The same Gaussians without their graph."""
+        """Return the same Gaussians without their graph."""
         return self.mapped(torch.Tensor.detach)
 
     def misfit(self) -> str | None:
-        """What is wrong with the shape of a tensor, such as `colors is [5, 1], not [5, 3]`."""
+        """Return the first misfit, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
         if (self.colors is None) == (self.sh_dc is None):
             return "both or none of colors and sh_dc are given"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree
@@ -114,14 +115,14 @@ class Gaussians:
         return None
 
     def whole(self) -> "Gaussians":
-        """The same Gaussians for those who know nothing of rows on demand."""
+        """Return the same Gaussians for code that does not support rows on demand."""
         return self if self.on_demand is None else _Whole(**vars(self))
 
 
 class _Whole(Gaussians):
-    """Gaussians that bring all rows of a tensor up to date when it is read.
+    """Gaussians that update all rows of a tensor when the tensor is read.
 
-    A copy of them, however it is made, is plain Gaussians whose rows are all up to date.
+    Every kind of copy is a plain `Gaussians` object whose rows are all up to date.
     """
 
     @override
@@ -151,23 +152,25 @@ class Screen:
     The gradient fields are None until the render's backward pass has run.
 
     Attributes:
-        radii: [N] int32, pixels; 0 where the Gaussian touches no pixel.
-        pixels: [N] int32, pixels in which the Gaussian was blended; None unless asked for.
+        radii: [N] int32, pixels; 0 if the Gaussian touches no pixel.
+        pixels: [N] int32, pixels in which the Gaussian was blended; None unless requested.
         mean_gradient: [N, 2] gradient of the loss by the projected mean, per pixel unit.
-        abs_gradient: [N, 2] the same with absolute values summed over pixels; None unless asked.
-        directions: [N, 6, 5] the pixels' gradients by the projected mean, in bins along the longest
-            axis; None unless asked. The axis is that of the largest scale (the first of equals)
-            on the image plane: a pixel whose centre is d from the projected mean is at
-            t = d . a / |a|^2, with a the projection of one standard deviation, undilated, and at
-            t = 0 where a is shorter than 1e-6 px. Bins end before -2, -1, 0, 1, 2 and never. Of
-            the pixels of a bin whose gradient is not 0 there are the sum of the directions (x
-            and y; unit vectors of the gradient in NDC units, that is times width and height),
-            the sums of |x| and |y| of the gradient itself (per pixel unit; over all bins they
-            are `abs_gradient`), and their number.
+        abs_gradient: [N, 2] the same gradient with absolute values summed over pixels; None unless
+            requested.
+        directions: [N, 6, 5] the pixels' gradients by the projected mean, in 6 bins along the
+            longest axis; None unless requested. The axis is the axis of the largest scale (the
+            first one of equal scales), projected to the image plane. Let a be the undilated
+            projection of one standard deviation along it. A pixel whose centre has the offset d
+            from the projected mean is at t = d . a / |a|^2, or at t = 0 if a is shorter than
+            1e-6 px. The upper ends of the bins are -2, -1, 0, 1, 2 and infinity. Each bin contains
+            5 numbers of its pixels whose gradient is not 0: the sum of the directions (x and y;
+            unit vectors of the gradient in NDC units, that is times width and height), the sums of
+            |x| and |y| of the gradient itself (per pixel unit; summed over all bins they are
+            `abs_gradient`), and the number of these pixels.
         count: [H, W] bool -> [N] int32, in how many of these pixels the Gaussian was blended; None
-            unless asked for. It keeps alive what it needs of the render.
-        rows: [R] int64, sorted, among which is every Gaussian with a radius; None where the
-            rasterizer has no such list.
+            unless requested. It keeps the data of the render alive that it needs.
+        rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
+            rasterizer gives no such list.
     """
 
     radii: Tensor
@@ -185,7 +188,7 @@ class Render:
 
     Attributes:
         image: [H, W, 3] linear blend over the background, not clamped.
-        alpha: [H, W] accumulated opacity, 1 - transmittance.
+        alpha: [H, W] accumulated opacity, which is 1 - transmittance.
         depth: [H, W] sum of weight times camera depth (not divided by alpha), or None.
         screen: Statistics for density control.
     """

@@ -1,4 +1,4 @@
-"""Gradients of K views, opaque to operators: Gramians, weighted sums, element-wise maps."""
+"""Gradients of K views, which operators use through Gramians, weighted sums and maps only."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -9,108 +9,111 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
-#: What one Gramian covers: each block, all blocks of a kind, everything, each Gaussian of a block.
+#: Extent of one Gramian: a block, all blocks of a kind, all blocks, or one Gaussian of a block.
 Granularity = Literal["block", "kind", "global", "gaussian"]
-#: K tensors (None where a view does not touch the tensor) -> one tensor or None.
+#: Tensor name and K tensors (None if a view does not touch the tensor) -> one tensor or None.
 Elementwise = Callable[[str, Sequence[Tensor | None]], Tensor | None]
 
 
 class Gradients(ABC):
-    """The gradients of one step, block by block, whether views are kept apart or not.
+    """The gradients of one step, block by block, either separate for each view or accumulated.
 
-    A view that is not finite for a block is left out of it.
+    A view whose gradient of a block is not finite is left out of this block.
     """
 
     @property
     @abstractmethod
     def views(self) -> int:
-        """K."""
+        """The number of views, K."""
 
     @abstractmethod
     def present(self) -> NDArray[np.bool_]:
-        """[B, K], views whose gradient of the block is finite and not exactly zero."""
+        """Return [B, K], True for views whose gradient of the block is finite and not zero."""
 
     @abstractmethod
     def finite(self) -> NDArray[np.bool_]:
-        """[B, K], views whose gradient of the block is finite."""
+        """Return [B, K], True for views whose gradient of the block is finite."""
 
     def is_judged(self, name: str, gradient: Tensor) -> bool:
-        """Whether `finite` is known to hold for this very tensor as it is: no need to look again.
+        """Return True if this gradient tensor object is known to be finite and needs no new check.
 
         Args:
-            name: Of the tensor that it is the gradient of.
-            gradient: As `total` gave it, or anything else.
+            name: Name of the parameter tensor.
+            gradient: A gradient of this parameter, as `total` returned it or any other tensor.
         """
         return False
 
     @abstractmethod
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        """Tensor name -> plain sum in the order of the views (the bits of accumulation).
+        """Return the sum over the views for each tensor, in the order of the views.
+
+        The bits are the same as with accumulation in the backward passes.
 
         Args:
-            divisor: What the sums are then divided by; K gives the mean without a further pass.
+            divisor: The sums are divided by this number; K gives the mean without a further pass.
 
         Returns:
-            None for tensors that no view touches, or whose views are all non-finite. Sparse, with
-            sorted rows, where the views' gradients are (`Gaussians.on_demand`).
+            Tensor name -> sum; None for tensors that no view touches, or whose views are all
+            non-finite. Sparse, with sorted rows, if the views' gradients are sparse
+            (`Gaussians.on_demand`).
         """
 
 
 class SeparateGradients(Gradients):
-    """The gradients of the K views of one step, each of them known: opaque to operators.
+    """The separate gradients of the K views of one step; operators do not see their elements.
 
-    `elementwise` gives and wants dense tensors.
+    `elementwise` passes dense tensors to its function and expects dense tensors.
     """
 
     @abstractmethod
     def names(self, granularity: Granularity) -> tuple[str, ...]:
-        """[B] name of the block (or kind) that each Gramian belongs to."""
+        """Return [B] names of the block (or kind) that each Gramian belongs to."""
 
     @property
     @abstractmethod
     def unit(self) -> float:
-        """Smallest unit roundoff of the gradients' types: what results can be right to."""
+        """Smallest unit roundoff of the gradients' types, which limits the accuracy of results."""
 
     @abstractmethod
     def gramians(self, granularity: Granularity) -> NDArray[np.float64]:
-        """[B, K, K] float64 Gramians; views with a non-finite gradient have zero rows."""
+        """Return [B, K, K] float64 Gramians; views with a non-finite gradient have zero rows."""
 
     @abstractmethod
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
-        """[B, K, K] what rounding took from the Gramians: the sum of both has twice the digits.
+        """Return [B, K, K], the parts of the Gramians that rounding removed.
 
-        Takes ten times as long as the Gramians.
+        Gramian plus residual gives twice the digits. The call is ten times as slow as `gramians`.
         """
 
     @override
     @abstractmethod
     def present(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
-        """[B, K], views whose gradient is finite and not exactly zero."""
+        """Return [B, K], True for views whose gradient is finite and not exactly zero."""
 
     @override
     @abstractmethod
     def finite(self, granularity: Granularity = "block") -> NDArray[np.bool_]:
-        """[B, K], views whose gradient is finite."""
+        """Return [B, K], True for views whose gradient is finite."""
 
     @abstractmethod
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
-        """[B, K, K], pairs of views whose gradients share a non-zero element's place."""
+        """Return [B, K, K], True for pairs of views with a common non-zero gradient element."""
 
     @abstractmethod
     def combine(
         self, weights: NDArray[np.float64], granularity: Granularity
     ) -> Mapping[str, Tensor | None]:
-        """Tensor name -> sum over views of weight times gradient.
+        """Return the sum over views of weight times gradient, for each tensor.
 
         Args:
-            weights: [B, K]; a view that is not finite for a block is left out whatever its weight.
-            granularity: The one that `weights` was computed for.
+            weights: [B, K]; a view that is not finite for a block is left out, whatever its weight.
+            granularity: The granularity that `weights` was computed for.
 
         Returns:
-            None for tensors that no view touches, or whose views are all non-finite; sparse where
-            those of `total` are.
+            Tensor name -> sum; None for tensors that no view touches, or whose views are all
+            non-finite. Sparse if the result of `total` is sparse.
         """
 
     @abstractmethod
     def elementwise(self, function: Elementwise) -> Mapping[str, Tensor | None]:
-        """Applies `function(tensor name, K gradients)` to every tensor."""
+        """Apply `function(tensor name, K gradients)` to every tensor and return the results."""

@@ -1,4 +1,4 @@
-"""Operators that see the gradients of K views through their dot products only."""
+"""Operators that use only the dot products of the gradients of K views."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from crossgrad_core.contract.gradients import Granularity, SeparateGradients
 from crossgrad_core.contract.slots.operator import Operator
 from crossgrad_core.errors import UserError
 
-#: Gradients whose unit roundoff is below this show the rounding of float64 weights.
+#: If the unit roundoff of gradients is below this, the rounding of float64 weights matters.
 _NARROW: Final = 1e-12
 
 
 class MatrixOperator(Operator):
-    """Replaces the K gradients G of each block by M G and adds the rows of M G.
+    """An operator that replaces the K gradients G of each block by M G and adds the rows of M G.
 
-    It can be a link of a chain and serve single blocks.
+    It can be a link of a chain and can be used for single blocks.
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -37,17 +37,17 @@ class MatrixOperator(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        """The matrices M.
+        """Return the matrices M.
 
         Args:
             gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.
             context: See `OperatorContext`.
-            state: What this operator returned last.
+            state: The state that this operator returned last.
             rng: The only source of random numbers.
 
         Returns:
-            [B, R, K] float64 matrices M (R is the operator's choice) and the new state. A chain of
-            operators multiplies them: the next link sees M Gram M^T.
+            [B, R, K] float64 matrices M (the operator chooses R) and the new state. A chain of
+            operators multiplies the matrices: the next link receives M Gram M^T.
         """
 
     @override
@@ -61,8 +61,8 @@ class GramianOperator(MatrixOperator):
     """An operator whose matrices depend on the Gramians.
 
     Attributes:
-        granularity: What one Gramian covers: each block's tensors, all geometry / all appearance
-            blocks, everything, or each Gaussian's row of a block.
+        granularity: Extent of one Gramian: each block's tensors, all geometry / all appearance
+            blocks, all blocks, or each Gaussian's row of a block.
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -70,7 +70,7 @@ class GramianOperator(MatrixOperator):
     granularity: Granularity = Field("block", description="what one Gramian covers")
 
     def reads_gramians(self) -> bool:
-        """Whether the Gramians make a difference with these options; else granularity does not."""
+        """Return True if the result depends on the Gramians; if not, granularity has no effect."""
         return True
 
     @override
@@ -81,16 +81,16 @@ class GramianOperator(MatrixOperator):
 
 
 class Weighting(GramianOperator):
-    """A Gramian operator that gives each view one weight per block, from this step alone.
+    """A Gramian operator that gives each view one weight per block, without memory of past steps.
 
-    In a chain the next link sees the K weighted gradients.
+    In a chain, the next link receives the K weighted gradients.
     """
 
     @abstractmethod
     def weights(
         self, gramians: NDArray[np.float64], context: OperatorContext
     ) -> NDArray[np.float64]:
-        """[B, K] float64 weights of the K gradients; their weighted sum is the result.
+        """Return [B, K] float64 weights of the K gradients; the result is their weighted sum.
 
         Args:
             gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.
@@ -112,7 +112,7 @@ class Weighting(GramianOperator):
 
 
 def diagonals(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[B, K, K] matrices that multiply each of K gradients by its weight; `weights` is [B, K]."""
+    """Return diagonal matrices [B, K, K] that apply one weight of `weights` [B, K] per gradient."""
     blocks, views = weights.shape
     matrices = np.zeros((blocks, views, views))
     matrices.reshape(blocks, -1)[:, :: views + 1] = weights
@@ -125,15 +125,18 @@ def aggregate_by_gramians(
     context: AggregateContext,
     state: PluginState,
 ) -> tuple[AggregateResult, PluginState]:
-    """One pass for the Gramians of all blocks, one small solve, one pass for the weighted sums.
+    """Aggregate gradients with the matrices of an operator.
 
-    Counts blocks (Gramians, under other granularities) in which some view's gradient is exactly
-    zero or absent (`zero`), some pair of non-zero gradients shares no element (`disjoint`), some
-    view was left out because it is not finite (`dropped`), or some pair has a negative dot product
-    (`conflict`).
+    This takes one pass for the Gramians of all blocks, one small solve, and one pass for the
+    weighted sums.
+
+    The result counts the blocks (Gramians, under other granularities) with at least one of these:
+    a view with a gradient that is exactly zero or absent (`zero`), a pair of non-zero gradients
+    without a common element (`disjoint`), a view left out because it is not finite (`dropped`), a
+    pair with a negative dot product (`conflict`).
 
     Raises:
-        UserError: The operator answered with weights that are not finite.
+        UserError: The operator returned weights that are not finite.
     """
     gradients = context.separate
     gramians = gradients.gramians(granularity)
@@ -143,7 +146,7 @@ def aggregate_by_gramians(
     weights = np.where(present, _added_rows(matrices, gradients.unit), 0.0)
     if not np.isfinite(weights).all():
         raise _not_finite(operator, given, weights)
-    # Before the sum, which may overwrite the gradients: two whose product is 0 are looked at again.
+    # Count before the sum, because the sum may overwrite gradients that the count reads again.
     counts = _counts(gradients, granularity, gramians, present)
     return AggregateResult(gradients.combine(weights, granularity), counts), state
 
@@ -155,10 +158,12 @@ def transformed(
     state: PluginState,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], PluginState]:
-    """What `transform` of an operator answers; operators that hold others ask these by it.
+    """Return the checked result of an operator's `transform`.
+
+    Operators that contain other operators call them through this function.
 
     Raises:
-        UserError: The answer is none that has a meaning: it names the method.
+        UserError: The result has a wrong type or shape.
     """
     answer = operator.transform(gramians, context, state, rng)
     matrices, state = with_state(answer, np.ndarray, operator, "transform")
@@ -168,9 +173,10 @@ def transformed(
 
 
 def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float64]:
-    """[B, K] the sum over R of matrices [B, R, K]; row by row, as numpy is slow at short sums.
+    """Return [B, K], the sum over R of matrices [B, R, K].
 
-    Weights for gradients in float64 are compensated for what each addition loses (Neumaier 1974).
+    The sum is taken row by row, because NumPy is slow at short sums. For gradients in float64, the
+    rounding errors of the additions are compensated (Neumaier 1974).
     """
     total = np.zeros((matrices.shape[0], matrices.shape[2]))
     lost = np.zeros_like(total)
@@ -186,7 +192,7 @@ def _added_rows(matrices: NDArray[np.float64], unit: float) -> NDArray[np.float6
 def operator_context(
     context: AggregateContext, granularity: Granularity, present: NDArray[np.bool_]
 ) -> OperatorContext:
-    """What a Gramian operator may know, from what the hook is offered."""
+    """Return the context of a Gramian operator, made from the context of the hook."""
     names = context.separate.names(granularity)
     return OperatorContext(
         step=context.step,
@@ -206,14 +212,14 @@ def operator_context(
 def _kinds(
     names: Sequence[str], blocks: Sequence[Block], granularity: Granularity
 ) -> tuple[BlockKind, ...]:
-    """Kinds of blocks; groups are named by their kind, the whole is neutral."""
+    """Return the kinds of blocks. A group is named by its kind; `all` is neutral."""
     known: dict[str, BlockKind] = {
         "geometry": "geometry",
         "appearance": "appearance",
         "neutral": "neutral",
         "all": "neutral",
     }
-    if granularity in {"block", "gaussian"}:  # A block may be called as a group is.
+    if granularity in {"block", "gaussian"}:  # A block may have the same name as a group.
         known = {block.name: block.kind for block in blocks}
     return tuple(map(known.__getitem__, names))
 
@@ -238,7 +244,7 @@ def _counts(
 
 
 def _some(flags: NDArray[np.bool_]) -> int:
-    """In how many blocks any flag is set."""
+    """Return the number of blocks in which any flag is set."""
     return int(flags.reshape(len(flags), -1).any(axis=1).sum()) if flags.size else 0
 
 

@@ -1,9 +1,9 @@
 """The hooks: specifications that plugins implement or wrap.
 
-The three hooks of a training step, `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and
-`crossgrad_densify`, stop at the first answer: the selected component gives it. Any other plugin may
-wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A first-result hook
-must answer with a value; None is an error.
+Three hooks of a training step stop at the first result, which the selected component returns:
+`crossgrad_sample_views`, `crossgrad_aggregate_gradients` and `crossgrad_densify`. Any other plugin
+may wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A first-result
+hook must return a value; None is an error.
 """
 
 from collections.abc import Mapping
@@ -44,85 +44,90 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_validate_selection(self, selection: "Selection") -> "list[str] | None":
-        """Before training: reasons why this selection of components cannot work.
+        """Return reasons why this selection of components cannot work; called before training.
 
-        Every plugin is asked; one reason is enough to refuse the run.
+        All plugins answer this hook. A single reason is enough to refuse the run.
         """
 
     @hookspec
     def crossgrad_run_start(self, run: "RunInfo") -> None:
-        """Event: the scene is read, the components are chosen, no step is taken yet."""
+        """Event: the scene was read and the components were chosen; no step was taken yet."""
 
     @hookspec
     def crossgrad_update_intervals(self, blocks: "tuple[Block, ...]") -> "Mapping[str, int] | None":
-        """Tensors that learn in one of N steps only, by name -> N.
+        """Return tensor name -> N for tensors that learn in only one of N steps.
 
-        Every plugin is asked once per run. In its steps such a tensor has sqrt(N) times its rate.
+        All plugins answer this hook, once per run. In the steps in which such a tensor learns, its
+        learning rate is multiplied by sqrt(N).
         """
 
     @hookspec(firstresult=True)
     def crossgrad_sample_views(self, context: "SampleContext") -> "SampleResult | None":
-        """Hook 1: the K views of this step. Answered by the selected sampler."""
+        """Hook 1: return the K views of this step (sampler slot)."""
 
     @hookspec(firstresult=True)
     def crossgrad_choose_scales(self, context: "ScaleContext") -> "ScaleResult | None":
-        """The scale at which each drawn view is rendered and compared. The selected resolution."""
+        """Return the scale at which each drawn view is rendered and compared (resolution slot)."""
 
     @hookspec
     def crossgrad_view_gaussians(self, context: "GaussiansContext") -> "GaussiansResult | None":
-        """The Gaussians that a training view is rendered from, if others than the decoded ones.
+        """Return the Gaussians for the render of a training view, if not the decoded Gaussians.
 
-        Every plugin is asked in turn, once per view, about what the one before it answered.
+        All plugins are called in turn, once per view. Each plugin gets the Gaussians that the
+        previous plugin returned.
         """
 
     @hookspec
     def crossgrad_pixel_weights(self, context: "PixelContext") -> "Tensor | None":
-        """How much each pixel of a view counts in its loss, [H, W], not negative.
+        """Return the weight of each pixel of a view in its loss, [H, W], not negative.
 
-        Every plugin is asked, once per view; None means "all alike". Answers multiply.
+        All plugins answer this hook, once per view; None means equal weights. The results are
+        multiplied.
         """
 
     @hookspec
     def crossgrad_regularize(self, context: "RegularizeContext") -> "RegularizeResult | None":
-        """Loss terms besides the photometric one, per view or per step.
+        """Return a loss term in addition to the photometric loss, per view or per step.
 
-        Every plugin is asked, once per view (`context.gaussians` given) and once per step (None);
-        None means "no term here". The gradients join after aggregation.
+        All plugins answer this hook, once per view (`context.gaussians` given) and once per step
+        (`context.gaussians` is None). The result None means that there is no term. The gradients
+        are added after aggregation.
         """
 
     @hookspec(firstresult=True)
     def crossgrad_aggregate_gradients(
         self, context: "AggregateContext"
     ) -> "AggregateResult | None":
-        """Hook 2: one gradient per tensor from the gradients of K views. The selected operator."""
+        """Hook 2: return one gradient per tensor from the gradients of K views (operator slot)."""
 
     @hookspec
     def crossgrad_rate_factor(
         self, rate: "LearningRate", step: int, schedule: "Schedule"
     ) -> float | None:
-        """A factor for a learning rate of the backbone in a step, not negative.
+        """Return a factor for a learning rate of the backbone in a step, not negative.
 
-        Every plugin is asked for each block; None means "as it is". Answers multiply.
+        All plugins answer this hook, for each block; None means no change. The results are
+        multiplied.
         """
 
     @hookspec
     def crossgrad_after_optimizer(self, context: "AfterStepContext") -> "DensifyResult | None":
-        """After the optimizer and before density control: an edit that overwrites values; or None.
+        """Return an edit of values after the optimizer and before density control; or None.
 
-        Every plugin is asked in turn. The set of primitives stays.
+        All plugins are called in turn. The set of primitives must not change.
         """
 
     @hookspec(firstresult=True)
     def crossgrad_densify(self, context: "DensifyContext") -> "DensifyResult | None":
-        """Hook 3: the edit of this step, or NO_EDIT. Answered by the selected densifier."""
+        """Hook 3: return the edit of this step, or NO_EDIT (densifier slot)."""
 
     @hookspec
     def crossgrad_after_step(self, context: "AfterStepContext") -> "DensifyResult | None":
-        """After optimizer and density control: an edit for noise, clamps, filters; or None."""
+        """Return an edit (noise, clamps, filters) after optimizer and density control; or None."""
 
     @hookspec
     def crossgrad_step_done(self, context: "AfterStepContext") -> "Answer | None":
-        """The parameters after a complete step, for states that follow them, such as an average.
+        """Return new states that follow the parameters after a complete step, such as an average.
 
         `context.edited` is True if the set of primitives changed in this step, or if density
         control overwrote values.
@@ -134,19 +139,19 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_model_ready(self, model: "Model") -> None:
-        """Event: the step is complete, and this is the model now. Read only; off the clock."""
+        """Event: the step is complete. The model is read only; the time does not count."""
 
     @hookspec
     def crossgrad_eval_parameters(
         self, states: "Mapping[str, PluginState]", step: int
     ) -> "Mapping[str, Tensor] | None":
-        """Tensors that evaluations and exports show in place of the parameters of these names."""
+        """Return tensors that replace parameters of the same names in evaluations and exports."""
 
     @hookspec
     def crossgrad_final_edit(self, model: "Model") -> "FinalEdit | None":
-        """The edit of a finished run, before it is evaluated and exported; or None.
+        """Return the edit of a finished run, before it is evaluated and exported; or None.
 
-        Every plugin is asked in turn. `model.parameters` are those that evaluations show.
+        All plugins are called in turn. `model.parameters` are the parameters that evaluations use.
         """
 
     @hookspec
@@ -155,11 +160,11 @@ class HookSpecs:
 
     @hookspec
     def crossgrad_length_changed(self, step: int, total: int) -> None:
-        """Event: after `step`, a run with a time budget is to have `total` steps in all."""
+        """Event: after `step`, the length of a run with a time budget changed to `total` steps."""
 
     @hookspec
     def crossgrad_log(self, text: str) -> None:
-        """Event: the run says something to the user (one line of plain text)."""
+        """Event: the run reports a message to the user (one line of plain text)."""
 
     @hookspec
     def crossgrad_run_end(self, status: str) -> None:

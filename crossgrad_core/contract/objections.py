@@ -1,4 +1,4 @@
-"""Objections to a selection: combinations that cannot work, options that do nothing."""
+"""Objections to a selection: combinations that cannot work, and options without effect."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,7 +10,7 @@ from crossgrad_core.contract.slots.rasterizer import Rasterizer
 
 
 def objections_to(selection: Selection) -> list[str]:
-    """Why the selection cannot work, for components of any author."""
+    """Return reasons why the selection cannot work, for components of any author."""
     return [
         *_of_the_sampler(selection),
         *objections_to_views(selection.operator, selection),
@@ -21,7 +21,7 @@ def objections_to(selection: Selection) -> list[str]:
 
 
 def objections_to_views(operator: Operator, selection: Selection) -> list[str]:
-    """Numbers of views for which the operator, named as the selection's, means nothing."""
+    """Return one objection for each number of views that the operator does not support."""
     name, needed, found = selection.names["operator"], operator.views, []
     for views in selection.views.counts:
         counts = sorted(selection.sampler.counts(views))
@@ -85,7 +85,7 @@ def _of_the_resolution(selection: Selection) -> Iterator[str]:
 
 
 def unused_options(component: Component, selection: Selection) -> Mapping[str, str]:
-    """Options of a component that would change nothing: name -> why, and the way out."""
+    """Return options of a component that would change nothing: name -> reason and remedy."""
     idle: dict[str, str] = {}
     if isinstance(component, GramianOperator) and not component.reads_gramians():
         idle["granularity"] = "this operator looks at no Gramians; leave it out"
@@ -98,7 +98,7 @@ def unused_options(component: Component, selection: Selection) -> Mapping[str, s
 
 
 def set_for_nothing(component: Component, selection: Selection) -> dict[str, str]:
-    """The idle options that were set to something else than their default."""
+    """Return the unused options that were set to a value other than their default."""
     fields = type(component).model_fields
     return {
         name: why

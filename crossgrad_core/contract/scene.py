@@ -30,30 +30,31 @@ class Similarity:
     scale: float
 
     def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the input frame in the local frame."""
+        """Return [N, 3] points of the input frame in the local frame."""
         return (points - self.offset) * self.scale
 
     def to_input(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the local frame in the input frame."""
+        """Return [N, 3] points of the local frame in the input frame."""
         return points / self.scale + self.offset
 
 
-#: Those of the scene's files, and those that are trained in.
+#: Coordinates of the scene's files, and coordinates of training.
 INPUT, LOCAL = "input", "local"
 _KNOWN: Final = re.compile(rf"{INPUT}|{LOCAL}|enu|utm|epsg:[0-9]{{4,6}}")
-#: Begins the comment of a file that is in other coordinates than the scene's.
+#: Prefix of the comment in a file whose coordinates differ from the scene's coordinates.
 COORDINATES_TAG = "crossgrad_coordinates:"
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Gaussians on their way into a file.
+    """Gaussians that are about to be written to a file.
 
     Attributes:
-        gaussians: Of a frame that may be turned against the local one.
-        similarity: Maps that frame to the coordinates of the file.
-        facts: Of `.georef.json`, for programs that read the file; empty where nothing is known.
-        notes: What the user should know, one sentence each.
+        gaussians: Gaussians in a frame that may be rotated against the local frame.
+        similarity: Maps the frame of `gaussians` to the coordinates of the file.
+        facts: Contents of `.georef.json`, for programs that read the file; empty if nothing is
+            known.
+        notes: Messages for the user, one sentence each.
     """
 
     gaussians: Gaussians
@@ -63,20 +64,20 @@ class Placed:
 
 
 class Georeference(Protocol):
-    """A scene's place on Earth, as far as it is known."""
+    """The location of a scene on Earth, as far as it is known."""
 
     @property
     def note(self) -> str:
-        """The place and how well it is known, or why it is not, in a sentence."""
+        """One sentence: the location and its accuracy, or why the location is not known."""
         ...
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """Gaussians in coordinates that were asked for.
+        """Return Gaussians in the requested coordinates.
 
         Args:
-            gaussians: Of the local frame, without a graph.
+            gaussians: Gaussians in the local frame, without a graph.
             similarity: Maps the local frame back to the input frame.
-            coordinates: As `check_coordinates` takes them.
+            coordinates: A name that `check_coordinates` accepts.
 
         Raises:
             UserError: The scene cannot be put into these coordinates.
@@ -86,7 +87,7 @@ class Georeference(Protocol):
 
 @dataclass(frozen=True)
 class Unplaced:
-    """A scene whose place is not known.
+    """The georeference of a scene whose location is not known.
 
     Attributes:
         why: What is missing.
@@ -114,15 +115,15 @@ class Unplaced:
         )
 
 
-#: A scene of which nothing is known.
+#: The georeference of a scene without any information on its location.
 UNPLACED: Final = Unplaced()
 
 
 def check_coordinates(name: str) -> None:
-    """Refuses coordinates that do not exist.
+    """Check the name of output coordinates.
 
     Raises:
-        UserError: They are none of those that a file can be in.
+        UserError: A file cannot be written in coordinates of this name.
     """
     if not _KNOWN.fullmatch(name):
         raise UserError(
@@ -134,20 +135,22 @@ def check_coordinates(name: str) -> None:
         )
 
 
-#: Cameras without which none can be told to be stray.
+#: Minimum number of cameras for a search for stray cameras.
 _FEWEST: Final = 5
-#: Largest share of the cameras that is stray; one may be in any case.
+#: Largest share of stray cameras; a single stray camera is always possible.
 _MOST: Final = 0.1
-#: A stray camera is so many times farther from the middle than the others, and than the points.
+#: Distance of a stray camera from the middle, divided by the distance of all other cameras and of
+#: the points.
 _FAR: Final = 10.0
-#: Share of the points that the points' distance is taken of: single ones lie astray, too.
+#: Quantile of the points' distances, because single points may be stray, too.
 _OF_POINTS: Final = 0.9
 
 
 def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[N] which cameras are stray: ten times farther away than all others and than most points.
+    """Return [N], True for cameras ten times farther away than all others and than most points.
 
-    A camera that photographs the scene from afar is none, because the points show the scene's size.
+    A camera that photographs the scene from far away is not stray, because the points show the size
+    of the scene.
 
     Args:
         centers: [N, 3] camera centres.
@@ -160,7 +163,7 @@ def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDA
     away = np.linalg.norm(centers - middle, axis=1)
     most = max(1, int(_MOST * len(centers)))
     order = np.argsort(away)
-    # The widest gap among the farthest cameras separates those that are stray.
+    # The widest gap among the farthest cameras separates the stray cameras.
     ratios = away[order][-most:] / np.maximum(away[order][-most - 1 : -1], np.finfo(float).tiny)
     first = len(centers) - most + int(ratios.argmax())
     reach = away[order[first - 1]]
@@ -180,10 +183,10 @@ class Pinhole:
     Attributes:
         width: Pixels.
         height: Pixels.
-        fx: Focal length in pixels; likewise `fy`.
-        fy: See `fx`.
-        cx: Principal point in pixels from the left (top for `cy`) image border.
-        cy: See `cx`.
+        fx: Horizontal focal length in pixels.
+        fy: Vertical focal length in pixels.
+        cx: Principal point in pixels from the left image border.
+        cy: Principal point in pixels from the top image border.
     """
 
     width: int
@@ -194,7 +197,7 @@ class Pinhole:
     cy: float
 
     def resized(self, width: int, height: int) -> Self:
-        """The same calibration for an image resampled to `width` x `height`."""
+        """Return the same calibration for an image resampled to `width` x `height`."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -229,16 +232,16 @@ class Camera(Pinhole):
         return torch.tensor(rows, dtype=torch.float64)
 
     def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 3] points of the local frame in the camera's axes; the third number is the depth."""
+        """Return [N, 3] points of the local frame in camera coordinates; the third is the depth."""
         pose = self.world_to_camera.numpy()
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     def project(
         self, points: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """[N, 2] pixels (x right, y down) and [N] depths of [N, 3] points of the local frame.
+        """Return pixels [N, 2] (x right, y down) and depths [N] of points [N, 3] (local frame).
 
-        Pixels of points that do not lie in front of the camera mean nothing, but are numbers.
+        Pixels of points that are not in front of the camera are finite, but have no meaning.
         """
         x, y, depth = self.local(points).T
         inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
@@ -247,14 +250,14 @@ class Camera(Pinhole):
 
 
 class Photo(Protocol):
-    """A photo that is decoded when it is asked for."""
+    """A photo that is decoded on request."""
 
     def image(self) -> Tensor:
-        """[H, W, 3] uint8, RGB, in the size of the view's camera."""
+        """Return [H, W, 3] uint8, RGB, in the size of the view's camera."""
         ...
 
     def mask(self) -> Tensor | None:
-        """[H, W] bool, True where the pixel counts; None where every pixel counts."""
+        """Return [H, W] bool, True where the pixel counts; None if every pixel counts."""
         ...
 
 
@@ -265,8 +268,8 @@ class View:
     Attributes:
         name: Path relative to the image folder with forward slashes.
         camera: The camera, in the size of the photo as trained.
-        photo: The decoded-on-demand photo.
-        regime: Label under which results are reported.
+        photo: The photo, decoded on request.
+        regime: Label of the camera group under which results are reported.
         seen: [S] int64 indices of the SfM points that this view observed; may be empty.
     """
 
@@ -279,7 +282,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything a run knows about a place.
+    """A scene: its views, points and coordinate frames.
 
     Attributes:
         name: Short name, used for the output folder.
@@ -289,13 +292,14 @@ class Scene:
         points: [P, 3] float64 SfM points, local frame.
         point_colors: [P, 3] uint8 RGB.
         similarity: Maps the local frame back to the input frame.
-        notes: What was done to the input and why (undistorted, resized, images left out ...).
-        point_sizes: [P] standard deviations of the first Gaussians, local units; NaN where the
-            distance to neighbours tells. None: at all points.
-        point_opacities: [P] their opacities; NaN where the backbone's rule holds. None likewise.
-        georeference: Where on Earth it is.
-        files: Files that it was read from, except photos and masks.
-        check: Figures of the check of the scene against itself; None before the check.
+        notes: Changes to the input, with reasons (undistorted, resized, images left out ...).
+        point_sizes: [P] standard deviations of the first Gaussians, local units; NaN if the
+            distance to neighbours decides. None means NaN at all points.
+        point_opacities: [P] opacities of the first Gaussians; NaN if the backbone's rule decides.
+            None means NaN at all points.
+        georeference: Location of the scene on Earth.
+        files: Files that the scene was read from, except photos and masks.
+        check: Figures of the consistency check of the scene; None before the check.
     """
 
     name: str
@@ -313,7 +317,7 @@ class Scene:
     check: Mapping[str, Json] | None = None
 
     def with_points(self, rows: NDArray[np.int64]) -> "Scene":
-        """The scene with these of its points alone, [Q] rising; views know their new rows."""
+        """Return the scene with only the points in `rows` [Q] (ascending); views get new rows."""
         place = np.full(len(self.points), -1)
         place[rows] = np.arange(len(rows))
 
@@ -338,7 +342,7 @@ class Scene:
 
     @cached_property
     def train_pixels(self) -> float:
-        """Pixels of a training photo, mean; 0 without any."""
+        """Mean number of pixels of a training photo; 0 without training photos."""
         pixels = [view.camera.width * view.camera.height for view in self.train_views]
         return sum(pixels) / max(1, len(pixels))
 
@@ -369,36 +373,37 @@ class Scene:
 
 
 def centers_of(views: Sequence[View]) -> NDArray[np.float64]:
-    """[V, 3] float64 camera centres, local frame."""
+    """Return [V, 3] float64 camera centres, local frame."""
     if not views:
         return np.zeros((0, 3))
     return np.stack([view.camera.center.numpy() for view in views]).astype(np.float64)
 
 
-#: A median over fewer observed points says little; points in the image are taken instead.
+#: A median over fewer observed points is unreliable; points in the image are used instead.
 _FEWEST_SEEN = 3
 #: Points tested against the image of a view that observed too few.
 _MOST_TESTED = 50_000
-#: Of a length between cameras; what is behind them is rounding.
+#: Significant bits of a length between cameras; further bits are rounding errors.
 _BITS = 40
-#: Of a coordinate of the input, what its rounding and that of some sums with it may make.
+#: Relative error of an input coordinate from its rounding and the rounding of a few sums.
 _ROUNDED = 16 * float(np.finfo(np.float64).eps)
 
 
 def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] distance of each camera from the mean training camera centre, local units.
+    """Return [V], the distance of each camera from the mean training camera centre, local units.
 
-    Without what is rounding: a camera that stands there has 0, and equal distances are equal.
+    Rounding errors are removed: a camera at this centre has distance 0, and distances that differ
+    by rounding only become equal.
     """
     return without_rounding(scene, np.linalg.norm(centers_of(views) - scene.middle, axis=1))
 
 
 def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths [V] between camera centres, rounded to 2^-40 (1e-12) of the largest coordinate.
+    """Return lengths [V] between camera centres, rounded to 2^-40 of the largest coordinate.
 
-    What the mean of the training cameras is taken from differs by its rounding alone in layouts
-    that are regular, and a cut at the median, a rank or a logarithm would depend on it. Where the
-    scene's input has coordinates that are so large that they are rounded more, that decides.
+    In regular camera layouts, equal distances differ by the rounding of the mean camera centre. A
+    cut at the median, a rank or a logarithm would depend on this rounding. If the coordinates of
+    the scene's input are so large that their own rounding is coarser, that rounding decides.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
@@ -410,19 +415,20 @@ def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.f
 
 
 def footprint_of(scene: Scene, view: View) -> float:
-    """`footprint` of a view of the scene."""
+    """Return the `footprint` of a view of the scene."""
     return footprint(view.camera, scene.points, view.seen)
 
 
 def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int64]) -> float:
-    """Median of f / z [pixels per local unit] over the SfM points that a camera observed.
+    """Return the median of f / z [pixels per local unit] over a camera's observed SfM points.
 
-    Over those in its image where it observed fewer than 3 in front of it; NaN where there is none.
+    If the camera observed fewer than 3 points in front of it, all points in its image are used
+    instead; NaN if there are none.
 
     Args:
         camera: The camera, in the size of the photo as trained.
         points: [P, 3] SfM points, local frame.
-        seen: Rows of `points` that it observed.
+        seen: Rows of `points` that the camera observed.
     """
     depths = _in_front(camera, points[seen])[:, 2]
     if len(depths) < _FEWEST_SEEN:
@@ -440,7 +446,7 @@ def _in_front(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[P] whether a camera has points [P, 3] of the local frame in its image, seen or hidden."""
+    """Return [P], True for points [P, 3] (local frame) in a camera's image, even if hidden."""
     local = camera.local(points)
     front = local[:, 2] > 0.0
     depth = np.where(front, local[:, 2], 1.0)
@@ -449,19 +455,19 @@ def is_in_image(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_
 
 
 def masked(image: Tensor, mask: Tensor | None) -> Tensor:
-    """The image [H, W, C], 0 at masked-out pixels, so that not even a NaN leaks from them."""
+    """Return the image [H, W, C] with 0 at masked-out pixels, even if they contain NaN."""
     if mask is None:
         return image
     return torch.where(mask.unsqueeze(-1), image, image.new_zeros(()))
 
 
 def unit_range(image: Tensor, dtype: torch.dtype) -> Tensor:
-    """The image in `dtype`, 8-bit values divided by 255."""
+    """Return the image in `dtype`; 8-bit values are divided by 255."""
     return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """The image as uint8 on the CPU, clamped to [0, 1] and rounded; NaN becomes 0."""
+    """Return the image as uint8 on the CPU, clamped to [0, 1] and rounded; NaN becomes 0."""
     image = image.detach().cpu()
     if image.dtype == torch.uint8:
         return image

@@ -1,4 +1,4 @@
-"""Options of reading a scene."""
+"""Options for reading a scene."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +9,7 @@ from crossgrad_core.contract.flags import SCENE, Flag
 
 
 class SceneOptions(BaseModel):
-    """Options of reading, splitting and resizing."""
+    """Options for reading, splitting and resizing."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -57,5 +57,5 @@ class SceneOptions(BaseModel):
 
     @property
     def init_file(self) -> Path | None:
-        """The PLY file to start from, or None where there is none."""
+        """The PLY file to start from; None if the run starts from points."""
         return None if self.init in {"points", "random"} else Path(self.init)

@@ -1,4 +1,4 @@
-"""When things happen: counted in the views that the steps have drawn, or in the steps."""
+"""The schedule of a run, counted in drawn views or in steps."""
 
 from bisect import bisect_left
 from dataclasses import dataclass, replace
@@ -13,28 +13,28 @@ _FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1.
 
 @dataclass(frozen=True)
 class ViewsPerStep:
-    """K of every step of a run of known length.
+    """The number of views K of each step in a run of known length.
 
     Attributes:
-        starts: After so many steps each K begins; ascending, the first is 0.
-        counts: The Ks.
+        starts: Number of steps after which each K begins; ascending, the first is 0.
+        counts: The values of K.
     """
 
     starts: tuple[int, ...] = (0,)
     counts: tuple[int, ...] = (1,)
 
     def at(self, step: int) -> int:
-        """K of a step, 1-based."""
+        """Return K of a step (1-based)."""
         return self.counts[max(0, bisect_left(self.starts, step) - 1)]
 
     def views(self, step: int) -> int:
-        """Views drawn in all steps up to and including this one."""
+        """Return the number of views drawn in all steps up to and including this one."""
         ends = (*self.starts[1:], step)
         parts = zip(self.starts, ends, self.counts, strict=True)
         return sum(max(0, min(end, step) - start) * count for start, end, count in parts)
 
     def step_of(self, views: int) -> int:
-        """The step in which the view of that number, 1-based, is drawn; 0 for none."""
+        """Return the step that draws the view with this number (1-based); 0 for view 0."""
         start, count = self.starts[0], self.counts[0]
         for later, then in zip(self.starts[1:], self.counts[1:], strict=True):
             if self.views(later) >= views:
@@ -43,28 +43,28 @@ class ViewsPerStep:
         return start + max(0, -((self.views(start) - views) // count))
 
     def moved(self, wanted: "ViewsPerStep", step: int) -> "ViewsPerStep":
-        """This pace, changing when another one does, as far as that is still ahead.
+        """Return these values of K with the change points of another run, if they are still ahead.
 
         Args:
-            wanted: The pace of a run of another length.
-            step: The steps that are done.
+            wanted: K of a run of another length.
+            step: Number of completed steps.
         """
         pairs = zip(self.starts, wanted.starts, strict=True)
         starts = (old if old < step else max(step, new) for old, new in pairs)
         return ViewsPerStep(tuple(starts), self.counts)
 
 
-#: The pace of one view in every step.
+#: One view in every step.
 ONE_BY_ONE: Final = ViewsPerStep()
 
 
 @dataclass(frozen=True)
 class ViewsPerStepSpec:
-    """K over a run of any length: one number, or several with the share at which each begins.
+    """K over a run of any length: one number, or several numbers with the shares of their start.
 
     Attributes:
-        counts: The Ks.
-        shares: The share of the run's steps after which each of them begins, the first left out.
+        counts: The values of K.
+        shares: The share of the run's steps after which each K begins, except the first.
     """
 
     counts: tuple[int, ...] = (1,)
@@ -72,10 +72,10 @@ class ViewsPerStepSpec:
 
     @classmethod
     def parsed(cls, text: str) -> "ViewsPerStepSpec":
-        """The plan that `2` or `1..2@0.5` stands for.
+        """Return the specification that a text such as `2` or `1..2@0.5` describes.
 
         Raises:
-            ValueError: The text is none.
+            ValueError: The text does not describe a specification.
         """
         first, *others = text.split("..")
         try:
@@ -101,15 +101,15 @@ class ViewsPerStepSpec:
 
     @property
     def setting(self) -> int | str:
-        """The plan as a setting: a plain number where K does not change."""
+        """The specification as a setting: a plain number if K does not change."""
         return str(self) if self.shares else self.counts[0]
 
     def paced(self, total: int) -> ViewsPerStep:
-        """The pace of a run of `total` steps."""
+        """Return K of every step of a run of `total` steps."""
         return ViewsPerStep((0, *(round(share * total) for share in self.shares)), self.counts)
 
     def steps_of(self, views: int) -> int:
-        """The most steps that draw no more than `views` views."""
+        """Return the largest number of steps that draws at most `views` views."""
         fits, too_many = 0, views // min(self.counts) + 1
         while too_many - fits > 1:
             steps = (fits + too_many) // 2
@@ -124,47 +124,48 @@ class ViewsPerStepSpec:
 ONE_VIEW: Final = ViewsPerStepSpec()
 ScheduleMode = Literal["scaled", "absolute"]
 Unit = Literal["views", "steps"]
-#: The length that every published figure is written for (3DGS), which has one view per step.
+#: The length that all published numbers refer to (3DGS), with one view per step.
 REFERENCE = 30_000
-#: Views up to which what suits short runs is measured, and holds in full.
+#: Length in views up to which the settings for short runs apply in full.
 SHORT = 3_000
 #: Learning rates of colour, scale and opacity are not stretched with the run, so the first
-#: transient always takes some hundred steps. Gradients are large everywhere during it, and growing
-#: then copies Gaussians that only had to settle.
+#: transient always takes some hundred steps. Gradients are large everywhere during the transient.
+#: Growth in this time would copy Gaussians that only need to converge.
 SHORTEST_WARM_UP = 500
-#: The statistics of so much decide about growth, at least (the published interval).
+#: Shortest interval over which statistics for growth are collected (the published interval).
 SHORTEST_INTERVAL = 100
-#: The same for anchors, which count by offset and keep what was too rarely seen to be judged. Half
-#: the published interval: growth of anchors is what short runs lack (docs/benchmarks.md).
+#: The same for anchors, which count per offset and keep counts of offsets that were seen too
+#: rarely. Half the published interval, because short runs grow too few anchors
+#: (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
 #: Shorter runs have no opacity reset: they could not recover from one.
 SHORTEST_RUN_WITH_RESET = 10_000
-#: Where edits are counted in views, an interval is a pass over the training photos as far as that
-#: leaves room for so many edits.
+#: If edits are counted in views, an interval is one pass over the training photos, unless the run
+#: would then have fewer edits than this.
 USUAL_EDITS = 6
-#: A run that is to have edits however short it is has no shorter interval than this: what fewer
-#: views say of gradients makes nearly everything grow.
+#: Shortest interval of a run that must have a minimum number of edits. With statistics of fewer
+#: views, nearly every Gaussian would grow.
 LEAST_INTERVAL = 8
 
 
 def is_published(mode: ScheduleMode, reference: int | None) -> bool:
-    """Whether the numbers of a schedule are the published ones, whatever the length of the run."""
+    """Return True if a schedule uses the published numbers, whatever the length of the run."""
     return mode == "absolute" and reference is None
 
 
 @dataclass(frozen=True)
 class Counting:
-    """The unit in which a schedule counts, and the numbers that it needs for that.
+    """The unit in which a schedule counts, and the numbers that this requires.
 
     Attributes:
         unit: Whether the schedule's numbers are views or steps.
-        views: How many views the steps have.
-        photos: Training photos: an edit has the statistics of at least so many views, where the
-            run is long enough.
-        reference: For which length the schedule counts, where that is not the run's own or the
-            published one.
-        min_refinements: Edits of density control that any run makes at least, however short: a
-            short run shortens warm-up and interval for it. Used if the schedule counts views.
+        views: Number of views per step.
+        photos: Number of training photos. An edit uses the statistics of at least this many views
+            if the run is long enough.
+        schedule_length: Length that the schedule is written for; None for the length of the run
+            or the published length.
+        min_refinements: Minimum number of density control edits in a run of any length. A short run
+            shortens warm-up and interval for this. Used if the schedule counts views.
     """
 
     unit: Unit = "steps"
@@ -184,23 +185,26 @@ class Schedule:
     Attributes:
         mode: Whether the published schedule was stretched with the run.
         total: Length of the run, in steps.
-        length: The length that the schedule is written for: the run's own where it was stretched.
-        lr_until: The log-linear learning-rate decay ends here.
-        sh_interval: The SH degree grows by one at every multiple of it.
-        densify_from: Density control edits after this: where views are counted, at every interval
-            from it on, where steps are, at multiples of the interval ...
-        densify_until: ... and before this.
+        length: The length that the schedule is written for: the run's own length if it was
+            stretched.
+        lr_until: Count at which the log-linear learning-rate decay ends.
+        sh_interval: The SH degree grows by one at every multiple of this count.
+        densify_from: Density control edits after this count. If views are counted, the edits are
+            at this count plus multiples of the interval; if steps are counted, at multiples of the
+            interval.
+        densify_until: Density control edits before this count.
         densify_every: Interval of edits.
-        reset_every: Interval of opacity resets; None where there are none.
-        anchors_from: Anchor growing starts after this.
+        reset_every: Interval of opacity resets; None if there are no resets.
+        anchors_from: Anchor growing starts after this count.
         anchors_every: Interval of anchor growing.
-        coarse_until: Backbones that train from coarse to fine have all levels from here on.
+        coarse_until: Count from which backbones that train from coarse to fine use all levels.
         sh_from: SH degree at the first step.
-        sh_wait: The degree stays that of the first step before this.
-        counting: What is counted.
+        sh_wait: Count before which the SH degree does not grow.
+        counting: The unit of the counts.
         pace: K of every step.
         edits_before: Edits before `densify_from` in a run whose length followed the clock.
-        min_refinements: Edits that another length of the run leaves, if there is room for them.
+        min_refinements: Minimum number of edits that a change of length keeps, if the run is long
+            enough.
     """
 
     mode: ScheduleMode
@@ -226,10 +230,10 @@ class Schedule:
     def for_run(
         cls, total: int, mode: ScheduleMode = "scaled", counting: Counting = IN_STEPS
     ) -> "Schedule":
-        """The schedule of a run of `total` steps.
+        """Return the schedule of a run of `total` steps.
 
-        `scaled` stretches the published schedule to the run, with floors; `absolute` keeps the
-        published numbers whatever the length, or has those of the reference length.
+        `scaled` stretches the published schedule to the run, with lower bounds. `absolute` uses
+        the numbers of the published length, or of `counting.schedule_length`.
         """
         pace = counting.views.paced(total)
         own = pace.views(total) if counting.unit == "views" else total
@@ -240,7 +244,7 @@ class Schedule:
             length=length,
             lr_until=length,
             sh_interval=max(100, length // 30),
-            densify_from=0,  # The edits are planned below.
+            densify_from=0,  # `with_edits` plans the edits below.
             densify_until=0,
             densify_every=1,
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
@@ -257,16 +261,16 @@ class Schedule:
     def with_edits(
         self, *, until: int, start: int | None = None, every: int | None = None
     ) -> "Schedule":
-        """The schedule with another window of density control.
+        """Return the schedule with another window of density control.
 
-        Where edits are counted in views, interval and start are fitted to it: an interval is a pass
-        over the training photos, as far as that leaves room for `USUAL_EDITS`, and there are at
-        least `min_refinements`.
+        If edits are counted in views, interval and start are fitted to the window. An interval is
+        one pass over the training photos if this leaves at least `USUAL_EDITS` edits, and the
+        window contains at least `min_refinements` edits.
 
         Args:
-            until: Edits end before this.
-            start: They begin after this; by default where they do in 3DGS.
-            every: Their interval; by default that of 3DGS.
+            until: Edits end before this count.
+            start: Edits begin after this count; by default as in 3DGS.
+            every: Interval of edits; by default as in 3DGS.
         """
         start = max(self.length // 60, SHORTEST_WARM_UP) if start is None else start
         every = max(SHORTEST_INTERVAL, self.length // 300) if every is None else every
@@ -274,7 +278,7 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # A pass over more photos than there is room for does not shorten the warm-up.
+            # If one pass over the photos does not fit, it does not shorten the warm-up.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
@@ -285,50 +289,50 @@ class Schedule:
         return is_published(self.mode, self.counting.schedule_length)
 
     def counted(self, step: int) -> int:
-        """The count after a step: of the views drawn by then, or of the steps."""
+        """Return the count after a step: the number of views drawn so far, or of steps."""
         return self.pace.views(step) if self.counting.unit == "views" else step
 
     def step_of(self, count: int) -> int:
-        """The first step after which the count is at least `count`."""
+        """Return the first step after which the count is at least `count`."""
         return self.pace.step_of(count) if self.counting.unit == "views" else count
 
     def reaches(self, step: int, every: int) -> bool:
-        """Whether the count reaches a multiple of `every` in this step."""
+        """Return True if the count reaches a multiple of `every` in this step."""
         return self.counted(step) // every > self.counted(step - 1) // every
 
     def progress(self, step: int) -> float:
-        """The share of the learning-rate decay that is over after a step; above 1 behind it."""
+        """Return the completed share of the learning-rate decay after a step; may exceed 1."""
         return self.counted(step) / self.lr_until
 
     def edits(self, after: int = 0) -> int:
-        """Number of the run's steps behind step `after` that density control follows."""
+        """Return the number of steps after step `after` in which density control edits."""
         ahead = self._edits_ahead(after)
         if self.counting.unit == "steps" or self.densify_every >= max(self.pace.counts):
             return len(ahead)
         return len(self.edit_steps(after))
 
     def edit_steps(self, after: int = 0) -> list[int]:
-        """The steps behind step `after` that density control follows, in order."""
+        """Return the steps after step `after` in which density control edits, in order."""
         return sorted({self.step_of(count) for count in self._edits_ahead(after)})
 
     def _edits_ahead(self, after: int) -> range:
-        """The counts behind a step at which an edit is due."""
+        """Return the counts after a step at which an edit is due."""
         end = min(self.densify_until, self.counted(self.total) + 1)
         return range(self.next_edit(self.counted(after)), end, self.densify_every)
 
     @property
     def grows(self) -> bool:
-        """Whether density control edits at all, or has done so."""
+        """Whether density control makes or made any edit in this run."""
         return self.edits_before + self.edits() > 0
 
     @property
     def first_edit(self) -> int:
-        """The first step after which density control edits, where it edits at all."""
+        """The first step in which density control edits, if it makes any edit."""
         return self.step_of(self.next_edit(0))
 
     def next_edit(self, count: int) -> int:
-        """The count at which the first edit behind `count` is due, were there no end of them."""
-        # Steps are those that the interval divides, as published.
+        """Return the count of the first edit after `count`, without regard to the end of edits."""
+        # If steps are counted, edits are at multiples of the interval, as published.
         every, origin = self.densify_every, 0
         if self.counting.unit == "views":
             origin = self.densify_from
@@ -336,17 +340,16 @@ class Schedule:
         return origin + ((behind - origin) // every + 1) * every
 
     def with_length(self, wanted: "Schedule", step: int) -> "Schedule":
-        """This schedule with the length of another one, from the end of a step on.
+        """Return this schedule with the length of another schedule, from the end of a step on.
 
-        The ends of the run, of the learning-rate decay and of density control move as far as they
-        are still ahead, and so does a change of K. Intervals stay, so that nothing happens twice or
-        is left out; density control that is over does not come back, and no level closes that was
-        open, nor do harmonics go that were drawn. Edits that are counted in views are planned anew:
-        those that are left out before the first one, and the interval of the others where there
-        would be too few.
+        The ends of the run, of the learning-rate decay and of density control move if they are
+        still ahead, and so does a change of K. Intervals stay, so that no event happens twice or
+        is left out. Density control does not restart after its end, and open levels and drawn
+        harmonics stay. If a minimum number of edits is set, the remaining edits are planned
+        again: the start if no edit was made yet, and the interval if there would be too few.
 
         Args:
-            wanted: The schedule of a run that was as long from its start.
+            wanted: The schedule of a run that had this length from its start.
             step: The step that the run has reached.
         """
         count = self.counted(step)
@@ -368,29 +371,29 @@ class Schedule:
         return replace(longer, densify_until=max(count, wanted.densify_until))
 
     def sh_degree(self, step: int, maximum: int = 3) -> int:
-        """Active spherical-harmonics degree at a step."""
+        """Return the active spherical-harmonics degree at a step."""
         count = self.counted(step)
         more = count // self.sh_interval if count >= self.sh_wait else 0
         return min(maximum, self.sh_from + more)
 
     def densifies(self, step: int) -> bool:
-        """Whether density control edits the primitives after this step."""
+        """Return True if density control edits the primitives after this step."""
         edit = self.next_edit(self.counted(step - 1))
         return edit <= self.counted(step) and edit < self.densify_until
 
     def collects(self, step: int) -> bool:
-        """Whether densification statistics of this step are still needed."""
+        """Return True if densification statistics of this step are still needed."""
         return self.counted(step - 1) + 1 < self.densify_until
 
     def prunes_large(self, step: int) -> bool:
-        """Whether an edit after this step removes what is large in the world.
+        """Return True if an edit after this step removes primitives that are large in world space.
 
-        After the first opacity reset, as published, and never where there is none.
+        This is so after the first opacity reset, as published, and never in runs without resets.
         """
         return self.reset_every is not None and self.counted(step - 1) >= self.reset_every
 
     def resets(self, step: int) -> bool:
-        """Whether opacities are reset after this step."""
+        """Return True if opacities are reset after this step."""
         every = self.reset_every
         if every is None or not self.reaches(step, every):
             return False
@@ -398,7 +401,7 @@ class Schedule:
 
 
 def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedule:
-    """The schedule from the end of a step on, with the edits of a run of the wanted length."""
+    """Return the schedule from the end of a step on, with the edits of `wanted`."""
     now = schedule.counted(step)
     done = schedule.edits_before + schedule.edits() - schedule.edits(step)
     missing = max(0, schedule.min_refinements - done)
@@ -409,7 +412,7 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
         start = wanted.densify_from if wanted.next_edit(0) > now else now
     needed = start + missing * every + 1
     if missing and needed > until:
-        # A run that turns out far shorter than it was planned still has its edits.
+        # A run that becomes far shorter than planned still gets its edits.
         until = max(until, min(needed, (now + schedule.counted(schedule.total)) // 2))
         every = max(LEAST_INTERVAL, (until - 1 - start) // missing)
     return replace(
@@ -422,14 +425,14 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
 
 
 def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple[int, int]:
-    """Start and interval with which so many edits come no later than `last`, if they can.
+    """Return a start and an interval that place `edits` edits no later than `last`, if possible.
 
     Args:
         start: Wanted start.
-        last: Count of the last edit, at most.
+        last: Largest count of the last edit.
         every: Wanted interval.
-        photos: The interval is at least so long where that leaves enough edits.
-        edits: How many there are to be.
+        photos: The interval is at least this long if this leaves enough edits.
+        edits: Wanted number of edits.
     """
     wanted = start + edits * every
     if wanted > last:
@@ -442,7 +445,7 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
 
 @dataclass(frozen=True)
 class Phase:
-    """The moment in which a backbone decodes: step, schedule, training or evaluation."""
+    """The phase in which a backbone decodes: step, schedule, training or evaluation."""
 
     step: int
     training: bool
@@ -455,9 +458,10 @@ class Phase:
 
 
 def shortness(views: float) -> float:
-    """1 for runs of up to `SHORT` views, 0 for those as long as published, between them by the log.
+    """Return 1 for runs of up to `SHORT` views, 0 from the published length on.
 
-    What is right for short runs only fades with it.
+    In between, the value falls with the logarithm of the length. Settings that suit short runs only
+    fade out with this value.
     """
     short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
     return min(1.0, max(0.0, short))

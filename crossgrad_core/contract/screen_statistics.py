@@ -1,7 +1,7 @@
-"""Reading the screen statistics of a rendered view, whatever its scale, per primitive.
+"""Screen statistics of a rendered view at any scale, per Gaussian and per primitive.
 
-Everything is in units of the full photo: gradients per NDC unit, radii over the longer side, pixels
-of the photo as trained. A loss is a mean over pixels, so its gradients need no other factor.
+All values are in units of the full photo: gradients per NDC unit, radii divided by the longer side,
+pixels of the photo as trained. A loss is a mean over pixels, so its gradients need no other factor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,18 +14,18 @@ from crossgrad_core.contract.contexts import DensifyContext, RenderedView
 
 
 def half_size(record: RenderedView, like: Tensor) -> Tensor:
-    """[2] pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
+    """Return [2], the pixels of the render per NDC unit: W/2, H/2 (3DGS)."""
     camera = record.camera
     return torch.tensor([camera.width / 2, camera.height / 2]).to(like, non_blocking=True)
 
 
 def ndc_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """[N, 2] gradient of the view's loss by the projected mean, per NDC unit; [S, 2] of `rows`."""
+    """Return [N, 2] ([S, 2] for `rows`), the loss gradient by the projected mean, per NDC unit."""
     return _of_rows(record, record.screen.mean_gradient, rows)
 
 
 def ndc_abs_gradient(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """[N, 2] the pixels' absolute gradients by the projected mean, summed, per NDC unit."""
+    """Return [N, 2], the summed absolute pixel gradients by the projected mean, per NDC unit."""
     return _of_rows(record, record.screen.abs_gradient, rows)
 
 
@@ -36,9 +36,10 @@ def _of_rows(record: RenderedView, statistic: Tensor | None, rows: Tensor | None
 
 
 def directions(record: RenderedView) -> Tensor:
-    """[6, 5, N] `Screen.directions` with the absolute gradients per NDC unit; bins, then fields.
+    """Return `Screen.directions` as [6, 5, N], with the absolute gradients per NDC unit.
 
-    With the Gaussians last, sums over bins are sums of whole rows: much faster on the CPU.
+    The dimensions are bins, fields, Gaussians. With the Gaussians last, sums over bins are sums of
+    whole rows, which is much faster on the CPU.
     """
     found = _present(record.screen.directions)
     bins = found.permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
@@ -47,12 +48,12 @@ def directions(record: RenderedView) -> Tensor:
 
 
 def pixels(record: RenderedView) -> Tensor:
-    """[N] pixels of the full photo in which the Gaussian was blended, floating point."""
+    """Return [N], the pixels of the full photo in which the Gaussian was blended (float)."""
     return of_photo(record, _present(record.screen.pixels))
 
 
 def of_photo(record: RenderedView, counts: Tensor) -> Tensor:
-    """[N] numbers of pixels of the full photo, floating point, from those of the render."""
+    """Convert pixel counts [N] of the render to pixel counts of the full photo (float)."""
     found = counts.to(record.gaussians.means)
     if record.scale == 1.0:
         return found
@@ -61,22 +62,22 @@ def of_photo(record: RenderedView, counts: Tensor) -> Tensor:
 
 
 def radii(record: RenderedView) -> Tensor:
-    """[N] radius on the screen over the image's longer side; 0 where it touches no pixel."""
+    """Return [N], the screen radius divided by the longer image side; 0 if no pixel is touched."""
     camera = record.camera
     return record.screen.radii.to(record.gaussians.means) / max(camera.width, camera.height)
 
 
 def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """[N] 1 where the Gaussian touched a pixel, else 0."""
+    """Return [N], 1 if the Gaussian touched a pixel, else 0; for `rows` only if given."""
     radii = record.screen.radii
     radii = radii if rows is None else radii.index_select(0, rows)
     return (radii > 0).to(record.gaussians.means)
 
 
 def seen(record: RenderedView) -> Tensor | None:
-    """[S] int64 rows of the Gaussians that touched a pixel: for sums over these alone.
+    """Return [S] int64 rows of the Gaussians that touched a pixel, for sums over these rows.
 
-    None, which means all, on a GPU, where their number would be waited for.
+    On a GPU, return None, which means all rows, because the host would wait for their number.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:
@@ -84,7 +85,7 @@ def seen(record: RenderedView) -> Tensor | None:
     if rows is None:
         return radii.nonzero()[:, 0]
     drawn = radii.index_select(0, rows) > 0
-    # As a rule all of them.
+    # In most cases, all listed rows touch a pixel.
     return rows if bool(drawn.all()) else rows.masked_select(drawn)
 
 
@@ -95,7 +96,7 @@ def _present(statistic: Tensor | None) -> Tensor:
 
 
 def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> dict[str, Tensor]:
-    """Copies of the running sums [P] of these names, zeros at first."""
+    """Return copies of the running sums [P] with these names; zeros at first."""
     like = next(iter(state.per_primitive.values()), None)
     if like is None:
         backbone = context.backbone
@@ -107,7 +108,7 @@ def sums(context: DensifyContext, state: PluginState, names: Sequence[str]) -> d
 
 
 def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None = None) -> None:
-    """Adds a value of each Gaussian [N], or of those in `rows`, to its primitive's sum [P]."""
+    """Add a value of each Gaussian [N] (or of each one in `rows`) to its primitive's sum [P]."""
     origin = record.gaussians.origin
     if origin is not None:
         total.index_add_(0, origin if rows is None else origin.index_select(0, rows), values)
@@ -118,7 +119,7 @@ def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None
 
 
 def mean(statistics: Mapping[str, Tensor], total: str, count: str) -> Tensor:
-    """[P] quotient of two sums, 0 where the count is 0."""
+    """Return [P], the quotient of two sums; 0 where the count is 0."""
     counts = statistics[count]
     means = statistics[total] / counts.clamp(min=torch.finfo(counts.dtype).tiny)
     return torch.where(counts > 0, means, torch.zeros_like(means))

@@ -23,7 +23,7 @@ from crossgrad_core.contract.slots.sampler import Sampler
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen components of a run, for objections.
+    """The chosen components of a run, for the check of their combination.
 
     Attributes:
         backbone: The backbone.
@@ -32,19 +32,19 @@ class Selection:
         densifier: The densifier.
         rasterizer: The rasterizer.
         loss: The photometric loss.
-        exposure: What cameras do to light.
-        start: What is added to the points that a run begins with.
-        resolution: The scale of each view of a step.
-        exporter: What writes the trained scene to a file.
-        metrics: What is measured of held-out views, by name.
+        exposure: The exposure, which models how a camera changes light.
+        initializer: The initializer, which adds points at the start.
+        resolution: The resolution, which chooses the scale of each view of a step.
+        exporter: The exporter, which writes the trained scene to a file.
+        metrics: The metrics of held-out views, by name.
         rules: The rules that act during training, by name.
         names: Slot (singular word, `reader` included) -> name under which the component was chosen.
-        views_per_step: K; the largest one where it changes.
+        views_per_step: K; the largest K if it changes.
         device: Torch device type.
-        grouping: The grouping; None where the views have no groups.
-        labels: Labels that training views have by the grouping; None where it is not known yet, or
-            where there is no grouping.
-        view_plan: K over the run; None where it is always `views_per_step`.
+        grouping: The grouping; None if the run has no grouping.
+        labels: Labels that the grouping gives to training views; None if they are not known yet, or
+            without a grouping.
+        view_plan: K over the run; None if K is always `views_per_step`.
     """
 
     backbone: Backbone
@@ -73,7 +73,7 @@ class Selection:
 
     @property
     def components(self) -> dict[str, Component]:
-        """Slot (singular word) -> component, of the slots that are filled."""
+        """Slot (singular word) -> component, for the slots that are filled."""
         filled: dict[str, Component | None] = {
             "backbone": self.backbone,
             "sampler": self.sampler,
@@ -91,7 +91,7 @@ class Selection:
 
     @property
     def plugins(self) -> dict[str, object]:
-        """Name -> plugin of everything that trains: the components and the rules."""
+        """Name -> plugin, for the components and the rules."""
         return {**self.components, **{f"rule:{name}": each for name, each in self.rules.items()}}
 
 
@@ -100,8 +100,8 @@ class HasUnusedOptions(Protocol):
     """A component that knows which of its options would change nothing."""
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """Options that would change nothing in this selection: name -> why, and the way out.
+        """Return options that would change nothing in this selection: name -> reason and remedy.
 
-        A new run is refused where the user has set one of them to something else than its default.
+        A new run is refused if the user set one of these options to a value other than its default.
         """
         ...

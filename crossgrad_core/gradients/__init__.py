@@ -1,1 +1,1 @@
-"""The gradients of K views: Gramians, weighted sums and the passes behind them."""
+"""The gradients of K views: Gramians, weighted sums and the passes that compute them."""

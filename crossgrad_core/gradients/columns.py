@@ -1,6 +1,6 @@
-"""Passes over the gradients of K views: compiled for float32 on the CPU, torch for the rest.
+"""Columns of gradients: float32 on the CPU uses compiled passes, everything else uses torch.
 
-A *column* is the list of the K gradients of one tensor, None where a view does not touch it.
+A *column* is the list of the K gradients of one tensor; None if a view does not touch the tensor.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ Column: TypeAlias = Sequence[Tensor | None]
 
 
 def is_native(column: Column) -> bool:
-    """Whether the compiled passes take the column."""
+    """Return True if the compiled passes support the column."""
     for gradient in column:
         if gradient is not None and (gradient.dtype != torch.float32 or not gradient.is_cpu):
             return False
@@ -21,6 +21,6 @@ def is_native(column: Column) -> bool:
 
 
 def unit_roundoff(columns: Sequence[Column]) -> float:
-    """The smallest unit roundoff of the gradients' types, 2^-24 for float32 ones or none at all."""
+    """Return the smallest unit roundoff of the gradients' types; 2^-24 without gradients."""
     types = {gradient.dtype for column in columns for gradient in column if gradient is not None}
     return min(torch.finfo(kind).eps / 2 for kind in types or {torch.float32})

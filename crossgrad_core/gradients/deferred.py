@@ -1,7 +1,7 @@
-"""The running sum of the gradients of K views on a GPU, which is not waited for before it is read.
+"""The running sum of the gradients of K views on a GPU; the host waits only when it is read.
 
-`SummedGradients` looks at each view's gradients as they come, which on a GPU would stop the host K
-times for each tensor.
+`SummedGradients` checks the gradients of each view when they are added. On a GPU, this would make
+the host wait K times for each tensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,12 +21,13 @@ from crossgrad_core.gradients.finite import largest
 class DeferredSums(Gradients):
     """The sum of K views' gradients in the order of the views; single views are not kept.
 
-    What is not finite is left out on the device. `finite`, `present` and `total` read the largest
-    magnitudes of all views and tensors, in one transfer; the last view waits for that.
+    Gradients that are not finite are left out on the device. `finite`, `present` and `total` read
+    the largest magnitudes of all views and tensors, in one transfer. The last view is added after
+    this transfer.
 
     Args:
         blocks: The blocks.
-        views: K, the views to come.
+        views: K, the expected number of views.
     """
 
     def __init__(self, blocks: Sequence[Block], views: int) -> None:
@@ -38,10 +39,10 @@ class DeferredSums(Gradients):
         self._largest: list[dict[str, Tensor]] = []
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Adds the gradients of one more view, and takes them over: they are written to.
+        """Add the gradients of one more view; this object then owns and overwrites them.
 
         Raises:
-            RuntimeError: All views that were to come are there.
+            RuntimeError: All expected views were already added.
         """
         if len(self._largest) == self._expected:
             raise RuntimeError(f"one view more than the {self._expected} that were to come")
@@ -76,12 +77,12 @@ class DeferredSums(Gradients):
         return self._read[1]
 
     def _tensors_of(self, chosen: NDArray[np.bool_]) -> set[str]:
-        """The tensors of the chosen blocks [B]."""
+        """Return the tensors of the chosen blocks [B]."""
         blocks = zip(self._blocks, chosen.tolist(), strict=True)
         return {name for block, is_chosen in blocks if is_chosen for name in block.tensors}
 
     def _kept(self, name: str) -> Tensor:
-        """The last view's gradient, 0 where its block is not finite."""
+        """Return the last view's gradient of a tensor; 0 if its block is not finite."""
         block = next(block for block in self._blocks if name in block.tensors)
         sizes = [self._largest[-1][other] for other in block.tensors if other in self._last]
         gradient = self._last[name]
@@ -95,7 +96,7 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """[B, K] whether each view is finite, and whether it is also not zero; waits for it."""
+        """Two arrays [B, K]: views with finite gradients, and with non-zero ones among these."""
         found = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(found).tolist() if found else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

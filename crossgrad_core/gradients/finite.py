@@ -1,4 +1,4 @@
-"""Whether tensors are finite, and whether anything is in them, in one pass over each."""
+"""Checks of tensors for finite and non-zero elements, in one pass over each tensor."""
 
 from collections.abc import Sequence
 from math import inf, isfinite
@@ -12,12 +12,12 @@ from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.sparse_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
-#: Parts for so few of which no other thread is woken.
+#: Up to this many parts are processed by a single thread.
 _FEW: Final = 8
 
 
 def largest(tensor: Tensor) -> Tensor:
-    """The largest magnitude, a scalar on the tensor's device; NaN where an element is."""
+    """Return the largest magnitude, a scalar on the tensor's device; NaN if an element is NaN."""
     if not tensor.numel():
         return tensor.new_zeros(())
     size: Tensor = torch.linalg.vector_norm(tensor, inf)
@@ -25,17 +25,17 @@ def largest(tensor: Tensor) -> Tensor:
 
 
 def is_finite(tensor: Tensor) -> bool:
-    """Whether no element is NaN or infinite."""
+    """Return True if no element is NaN or infinite."""
     return finite_and_present(tensor)[0]
 
 
 def finite_and_present(tensor: Tensor | None) -> tuple[bool, bool]:
-    """Whether no element is NaN or infinite, and whether one is not 0; (True, False) for None."""
+    """Return whether all elements are finite and whether one is not 0; (True, False) for None."""
     return all_finite_and_present([tensor])[0]
 
 
 def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool, bool]]:
-    """`finite_and_present` of each tensor, in one call for those of the CPU that need no copy."""
+    """Return `finite_and_present` of each tensor; contiguous float32 CPU tensors share one call."""
     given = [None if t is None else _elements(t) for t in tensors]
     native = [t for t in given if t is not None and _is_native(t)]
     bits = iter(_largest_bits(native))
@@ -47,7 +47,7 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
             most = next(bits)
             found.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
-            value = float(largest(tensor))  # One pass, waited for once.
+            value = float(largest(tensor))  # One pass and one wait.
             found.append((isfinite(value), value > 0.0))
         else:
             found.append((bool(torch.isfinite(tensor).all()), bool(tensor.any())))
@@ -63,14 +63,14 @@ def _is_native(tensor: Tensor) -> bool:
 
 
 def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:
-    """The bits of the largest magnitude in each tensor, float32 on the CPU and contiguous."""
+    """Return the bits of the largest magnitude in each contiguous float32 CPU tensor."""
     if not tensors:
         return []
     from crossgrad_core.gradients.numba_kernels.largest import PART, largest_bits
     from crossgrad_core.numerics.jobs import parallel, serial
 
     sizes = np.array([tensor.numel() for tensor in tensors], np.int64)
-    # A tensor without elements has a part, too.
+    # An empty tensor also gets one part.
     starts = np.array([0, *np.maximum(1, -(-sizes // PART)).cumsum()], np.int64)
     found = np.empty(starts[-1], np.uint32)
     call = parallel if len(found) > _FEW else serial

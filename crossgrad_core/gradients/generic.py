@@ -1,4 +1,4 @@
-"""The same passes with torch: any device, any floating-point type, float64 arithmetic in pieces."""
+"""Passes over gradients with torch: any device and floating-point type, in float64 pieces."""
 
 from collections.abc import Iterator, Sequence
 
@@ -9,13 +9,13 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Elements of K gradients that are widened to float64 at a time. Short pieces on the CPU keep the
-#: rounding errors of long float64 sums small; a GPU wants long ones.
+#: Elements of K gradients that are converted to float64 at a time. Short pieces on the CPU keep the
+#: rounding errors of long float64 sums small; long pieces are faster on a GPU.
 PIECE = {"cpu": 1 << 14, "cuda": 1 << 22}
 
 
 def gramian(column: Column, scale: float = 1.0) -> Tensor:
-    """[K, K] float64 Gramian of `scale` times a column's gradients, on their device."""
+    """Return the [K, K] float64 Gramian of `scale` times a column's gradients, on their device."""
     first = _any(column)
     total = first.new_zeros((len(column), len(column)), dtype=torch.float64)
     partial = [wide @ wide.T for wide in pieces(column, scale)]
@@ -23,7 +23,7 @@ def gramian(column: Column, scale: float = 1.0) -> Tensor:
 
 
 def largest(column: Column) -> Tensor:
-    """[K] float64 largest magnitude of each gradient; 0 where absent or empty."""
+    """Return [K] float64, the largest magnitude of each gradient; 0 if absent or empty."""
     first = _any(column)
     zero = first.new_zeros((), dtype=torch.float64)
     return torch.stack(
@@ -38,14 +38,14 @@ def combine(
     out: Tensor,
     divisor: float = 1.0,
 ) -> None:
-    """Writes the weighted sum of a column: in float64 and rounded once, in the order given.
+    """Write the weighted sum of a column, in float64 and rounded once, in the given order.
 
     Args:
-        column: K gradients; a None is left out.
+        column: K gradients; None is left out.
         weights: [K].
-        plain: Whether to add without weights in the type of the gradients instead.
+        plain: Whether to add without weights, in the type of the gradients.
         out: The result; may be one of the gradients.
-        divisor: What a plain sum is divided by.
+        divisor: Divisor of a plain sum.
     """
     used = [
         (w, g.reshape(-1)) for w, g in zip(weights.tolist(), column, strict=True) if g is not None
@@ -68,13 +68,13 @@ def combine(
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
-    """Whether two views' gradients of a tensor share the place of a non-zero element."""
+    """Return True if two views' gradients of a tensor have a common non-zero element."""
     a, b = column[first], column[second]
     return a is not None and b is not None and bool(((a != 0) & (b != 0)).any())
 
 
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
-    """[N, K, K] Gramians of the rows of a block's tensors."""
+    """Return [N, K, K], the Gramians of the rows of a block's tensors."""
     views = len(columns[0])
     total = np.zeros((rows, views, views))
     for column in columns:
@@ -86,14 +86,14 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-    """Writes the row-wise weighted sum of a column; `weights` is [N, K], 0 leaves a row out."""
+    """Write the row-wise weighted sum of a column; `weights` is [N, K], and 0 leaves a row out."""
     rows = len(weights)
     total = torch.zeros_like(out, dtype=torch.float64).view(rows, -1)
     factors = torch.from_numpy(np.ascontiguousarray(weights.T)).to(out.device, non_blocking=True)
     for w, g in zip(factors, column, strict=True):
         if g is not None:
             wide = g.reshape(rows, -1).double()
-            # Zero times infinity is not a number, so that weights of zero choose instead.
+            # Zero times infinity is NaN, so rows of weight zero are selected instead of multiplied.
             total += torch.where(w[:, None] == 0, torch.zeros_like(wide), w[:, None] * wide)
     out.view(rows, -1).copy_(total)
 
@@ -101,7 +101,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Sets `shared` [N] where two views' rows share the place of a non-zero element."""
+    """Set `shared` [N] where two views' rows have a common non-zero element."""
     a, b = column[first], column[second]
     if a is not None and b is not None and a.numel():
         both = ((a != 0) & (b != 0)).reshape(rows, -1).any(dim=1)
@@ -113,7 +113,7 @@ def _any(column: Column) -> Tensor:
 
 
 def pieces(column: Column, scale: float) -> Iterator[Tensor]:
-    """[K, L] float64 pieces of the column's gradients, times `scale`."""
+    """Yield [K, L] float64 pieces of the column's gradients, times `scale`."""
     first = _any(column)
     step = PIECE.get(first.device.type, PIECE["cpu"])
     absent = first.new_zeros((), dtype=torch.float64)
@@ -129,7 +129,7 @@ def pieces(column: Column, scale: float) -> Iterator[Tensor]:
 
 
 def row_pieces(column: Column, rows: int) -> Iterator[tuple[slice, Tensor]]:
-    """Row ranges with [K, n, d] float64 gradients of their rows."""
+    """Yield row ranges with the [K, n, d] float64 gradients of their rows."""
     first = _any(column)
     width = max(first.numel() // rows, 1)
     step = max(PIECE.get(first.device.type, PIECE["cpu"]) // width, 1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from crossgrad_core.gradients.columns import Column
 
-#: Up to this many elements one core is faster than several.
+#: Up to this many elements, one core is faster than several.
 SMALL: Final = 1 << 17
 
 
@@ -35,7 +35,7 @@ def _size(gradient: Tensor | None) -> int:
 
 
 def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
-    """[T, K, K] Gramian of each column; NaN or infinite in rows of views that are not finite."""
+    """Return [T, K, K], a Gramian per column; NaN or infinite in rows of non-finite views."""
     from crossgrad_core.gradients.numba_kernels import dense
 
     sizes = _sizes(columns)
@@ -47,7 +47,7 @@ def gramians(columns: Sequence[Column]) -> NDArray[np.float64]:
 
 
 def spread_gramian(column: Column, rows: Tensor, count: int) -> NDArray[np.float64]:
-    """[K, K] Gramian of gradients in `rows` of `count` rows, with the bits of dense ones."""
+    """Return the [K, K] Gramian of gradients in `rows` of `count` rows, bit by bit as if dense."""
     from crossgrad_core.gradients.numba_kernels import dense
     from crossgrad_core.numerics.jobs import parallel
 
@@ -67,14 +67,14 @@ def combine(
     out: Sequence[Tensor],
     divisor: float = 1.0,
 ) -> None:
-    """Writes the weighted sum of each column in one pass over all of its gradients.
+    """Write the weighted sum of each column, in one pass over all of its gradients.
 
     Args:
-        columns: T columns; a None is left out.
+        columns: T columns; None is left out.
         weights: [T, K].
         plain: [T], columns to add without weights in the order of the views, in float32.
         out: T results; each may be one of its column's gradients.
-        divisor: What plain sums are divided by, in float32.
+        divisor: Divisor of plain sums, in float32.
     """
     from crossgrad_core.gradients.numba_kernels import dense
 
@@ -86,7 +86,7 @@ def combine(
 
 
 def overlap(column: Column, first: int, second: int) -> bool:
-    """Whether two views' gradients of a tensor share the place of a non-zero element."""
+    """Return True if two views' gradients of a tensor have a common non-zero element."""
     from crossgrad_core.gradients.numba_kernels import dense
 
     a, b = column[first], column[second]
@@ -96,7 +96,7 @@ def overlap(column: Column, first: int, second: int) -> bool:
 
 
 def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
-    """[N, K, K] Gramians of the rows of a block's tensors."""
+    """Return [N, K, K], the Gramians of the rows of a block's tensors."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
     from crossgrad_core.numerics.jobs import parallel
 
@@ -107,7 +107,7 @@ def row_gramians(columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
 
 
 def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-    """Writes the row-wise weighted sum of a column; `weights` is [N, K]."""
+    """Write the row-wise weighted sum of a column; `weights` is [N, K]."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
     from crossgrad_core.numerics.jobs import parallel
 
@@ -121,7 +121,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Sets `shared` [N] where two views' rows share the place of a non-zero element."""
+    """Set `shared` [N] where two views' rows have a common non-zero element."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
 
     a, b = column[first], column[second]

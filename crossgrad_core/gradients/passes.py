@@ -11,39 +11,38 @@ from torch import Tensor
 from crossgrad_core.gradients import generic, native
 from crossgrad_core.gradients.columns import Column, is_native
 
-#: Largest magnitudes of float64 gradients whose squares and products stay well inside float64.
+#: Range of magnitudes of float64 gradients whose squares and products stay inside float64.
 SAFE: Final = (1e-140, 1e140)
 
 
 class Passes(Protocol):
-    """The passes over single columns that both modules offer; see `generic`."""
+    """The passes over single columns that `native` and `generic` implement."""
 
     def overlap(self, column: Column, first: int, second: int) -> bool:
-        """Whether two views share a non-zero element's place."""
+        """Return True if two views have a common non-zero element."""
 
     def row_gramians(self, columns: Sequence[Column], rows: int) -> NDArray[np.float64]:
-        """[rows, K, K] Gramians of each row."""
+        """Return [rows, K, K], the Gramian of each row."""
 
     def row_overlap(
         self, column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
     ) -> None:
-        """Marks rows in which two views share a non-zero element's place."""
+        """Mark rows in which two views have a common non-zero element."""
 
     def row_combine(self, column: Column, weights: NDArray[np.float64], out: Tensor) -> None:
-        """Writes the weighted sums of each row, by weights [rows, K]."""
+        """Write the weighted sums of each row, with weights [rows, K]."""
 
 
 def passes_of(*columns: Column) -> Passes:
-    """The compiled passes where they take all of the columns, else those of torch."""
+    """Return the compiled passes if they support all columns, else the torch passes."""
     return native if all(map(is_native, columns)) else generic
 
 
 def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64]:
-    """[T, K, K] float64 Gramians; NaN or infinite in rows of views that are not finite.
+    """Return [T, K, K] float64 Gramians; NaN or infinite in rows of views that are not finite.
 
-    float32 products are exact in float64 and can neither overflow nor vanish there. Where float64
-    gradients have magnitudes outside `SAFE`, all Gramians are those of the gradients times one
-    power of two.
+    float32 products are exact in float64 and can neither overflow nor underflow there. If float64
+    gradients have magnitudes outside `SAFE`, all gradients are first multiplied by a power of two.
     """
     gramians = np.zeros((len(columns), views, views))
     touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]
@@ -63,18 +62,18 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
 def column_remainders(
     columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[B, K, K] what rounding took from the sums `gramians` of `column_gramians`.
+    """Return [B, K, K], the rounding residuals of `gramians`, sums of `column_gramians`.
 
     Args:
         columns: T columns.
-        group: [T] which of the sums each column is part of; -1 for none.
+        group: [T] index of the sum that contains each column; -1 for none.
         gramians: [B, K, K].
     """
     return rounding_residuals(columns, group, gramians, _scale(columns))
 
 
 def _scale(columns: Sequence[Column]) -> float:
-    """The power of two that keeps products of float64 gradients inside float64."""
+    """Return the power of two that keeps products of float64 gradients inside float64."""
     touched = [column for column in columns if any(g is not None for g in column)]
     wide = [column for column in touched if _dtype(column) == torch.float64]
     if not wide:
@@ -96,13 +95,15 @@ def rounding_residuals(
     gramians: NDArray[np.float64],
     scale: float,
 ) -> NDArray[np.float64]:
-    """[B, K, K] what is missing from Gramians, to about 106 bits; NaN where one is not finite.
+    """Return [B, K, K], the exact Gramians (to about 106 bits) minus the rounded `gramians`.
+
+    The result is NaN where a Gramian is not finite.
 
     Args:
         columns: T columns.
-        group: [T] Gramian that each column is part of; -1 leaves it out.
-        gramians: [B, K, K] as they were rounded.
-        scale: What the gradients were multiplied by for them.
+        group: [T] index of the Gramian that contains each column; -1 leaves it out.
+        gramians: [B, K, K], rounded.
+        scale: Factor that the gradients were multiplied by.
     """
     from crossgrad_core.gradients.numba_kernels.rounding_residuals import add_products, left_over
 
@@ -117,7 +118,7 @@ def rounding_residuals(
 def row_remainders(
     columns: Sequence[Column], rows: int, gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[N, K, K] the same for the Gramians of the rows of a block's tensors."""
+    """Return [N, K, K], the rounding residuals of the Gramians of the rows of a block's tensors."""
     from crossgrad_core.gradients.numba_kernels.rounding_residuals import (
         add_row_products,
         left_over,

@@ -1,4 +1,4 @@
-"""Gradients of K views kept apart, one tensor per view and parameter tensor."""
+"""Separate gradients of K views, one tensor per view and parameter tensor."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ KINDS: Final = ("geometry", "appearance", "neutral")
 
 @dataclass(frozen=True)
 class Groups:
-    """How tensors (or rows of blocks) make up the Gramians of one granularity.
+    """The assignment of tensors to the Gramians of one granularity.
 
     Attributes:
         names: [B] name of each Gramian's block or group.
-        of_tensor: [T] which of them a tensor belongs to.
+        of_tensor: [T] index of the Gramian that each tensor belongs to.
     """
 
     names: tuple[str, ...]
@@ -38,15 +38,16 @@ class Groups:
 class DenseGradients(SeparateGradients):
     """The gradients of K views, one tensor per view and parameter tensor.
 
-    Those by rows stay so for Gramians of blocks and for sums; all else is taken of dense ones.
-    Gramians are accumulated in float64 (see `column_gramians` for what is beyond its range).
+    Sparse gradients stay sparse for Gramians of blocks and for sums; all other operations convert
+    them to dense tensors. Gramians are accumulated in float64 (see `column_gramians` for values
+    beyond its range).
 
     Args:
-        views: For each view: tensor name -> gradient; None or no entry where the view does not
-            touch the tensor, which then counts as zero.
+        views: For each view: tensor name -> gradient; None or no entry means zero, because the view
+            does not touch the tensor.
         blocks: The blocks, in the order of every Gramian's first dimension.
-        overwrite: Allows `combine` and `total` to write their results over the gradients of one
-            view, which saves memory; the elements can be looked at only once then.
+        overwrite: Whether `combine` and `total` may overwrite the gradients of one view with their
+            results. This saves memory, but the gradients can then be used only once.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class DenseGradients(SeparateGradients):
     def rounding_residuals(self, granularity: Granularity) -> NDArray[np.float64]:
         if granularity not in self._lost:
             self._require_unspent()
-            # What is added to an infinity or a NaN makes no difference.
+            # Residuals of infinite or NaN Gramians have no effect.
             found = np.nan_to_num(self._remainders(granularity), posinf=0.0, neginf=0.0)
             self._lost[granularity] = found
         return self._lost[granularity]
@@ -119,7 +120,7 @@ class DenseGradients(SeparateGradients):
     @override
     def overlap(self, granularity: Granularity) -> NDArray[np.bool_]:
         gramians, present = self.gramians(granularity), self.present(granularity)
-        # Gradients with a product share an element; only pairs without one need a look.
+        # Gradients with a non-zero dot product share an element; only the other pairs need a check.
         shared: NDArray[np.bool_] = gramians != 0
         doubtful = ~shared & present[:, :, None] & present[:, None, :]
         for i, j in np.argwhere(np.triu(doubtful.any(axis=0), 1)).tolist():
@@ -157,7 +158,7 @@ class DenseGradients(SeparateGradients):
 
     @cached_property
     def _rows(self) -> tuple[int, ...]:
-        """How many Gramians each block has under granularity `gaussian`."""
+        """Number of Gramians of each block under granularity `gaussian`."""
         self._unpack()
         shapes = {
             name: next((g.shape for g in column if g is not None), None)
@@ -171,7 +172,7 @@ class DenseGradients(SeparateGradients):
 
     @cached_property
     def _squares(self) -> NDArray[np.float64]:
-        """[T, K, K] Gramians of the tensors; NaN or infinite where a view is not finite."""
+        """Gramians [T, K, K] of the tensors; NaN or infinite if a view is not finite."""
         self._require_unspent()
         columns = [[] if p.rows is not None else p.column for p in self._packed]
         squares = column_gramians(columns, self._views)
@@ -181,7 +182,7 @@ class DenseGradients(SeparateGradients):
         return squares
 
     def _unpack(self) -> None:
-        """Makes all gradients dense."""
+        """Convert all gradients to dense tensors."""
         if any(packed.rows is not None for packed in self._packed):
             self._packed = tuple(
                 PackedRows([dense(p.unpacked(g)) for g in p.column]) for p in self._packed
@@ -205,7 +206,7 @@ class DenseGradients(SeparateGradients):
         return Groups(kinds, np.repeat(places, counts))
 
     def _raw(self, granularity: Granularity) -> NDArray[np.float64]:
-        """[B, K, K] Gramians, computed once; NaN or infinite where a view is not finite."""
+        """Return [B, K, K] Gramians, computed once; NaN or infinite if a view is not finite."""
         if granularity not in self._known:
             self._known[granularity] = self._gathered(granularity)
         return self._known[granularity]
@@ -217,7 +218,7 @@ class DenseGradients(SeparateGradients):
         if len(groups.names) == len(self._tensors) and granularity == "block":
             return self._squares
         raw = np.zeros((len(groups.names), self._views, self._views))
-        # Infinities of both signs may meet; the sum is then rightly not a number.
+        # The sum of infinities of both signs is NaN, which is correct.
         with np.errstate(invalid="ignore"):
             np.add.at(raw, groups.of_tensor, self._squares)
         return raw
@@ -287,7 +288,7 @@ class DenseGradients(SeparateGradients):
     def _combine(
         self, weights: NDArray[np.float64], finite: NDArray[np.bool_], divisor: int = 1
     ) -> dict[str, Tensor | None]:
-        """Weighted sums of all tensors; `weights` and `finite` are [T, K]; plain sums divided."""
+        """Return weighted sums of all tensors; `weights` and `finite` are [T, K]."""
         results: dict[str, Tensor | None] = dict.fromkeys(self._tensors)
         used = weights != 0
         plain = ((weights == 1) | ~used).all(axis=1) & used.any(axis=1)
@@ -316,9 +317,9 @@ class DenseGradients(SeparateGradients):
         return {n: p.unpacked(results[n]) for n, p in zip(results, self._packed, strict=True)}
 
     def _order(self, weights: NDArray[np.float64], plain: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """[T, K] views with the longest summand first; those of plain sums stay in order."""
+        """Return [T, K] view indices, largest summand first; plain sums keep the order of views."""
         order = np.tile(np.arange(self._views), (len(self._tensors), 1))
-        # The order of two summands makes no difference.
+        # The order of two summands has no effect.
         if self._views > 2 and not plain.all():  # noqa: PLR2004
             squares = _diagonal(self._squares)
             norms = np.sqrt(np.where(np.isfinite(squares), squares, 0.0))
@@ -343,7 +344,7 @@ class DenseGradients(SeparateGradients):
         return results
 
     def _result(self, column: Column, finite: NDArray[np.bool_]) -> Tensor | None:
-        """Room for a tensor's result; None where no view that counts touches it."""
+        """Return a tensor for the result; None if no finite view touches the parameter tensor."""
         self._require_unspent()
         first = next((g for g in _selected(column, finite) if g is not None), None)
         if first is None:

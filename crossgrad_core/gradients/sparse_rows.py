@@ -1,7 +1,7 @@
-"""Gradients that are zero in most rows, as torch's sparse tensors: rows and their values.
+"""Gradients that are zero in most rows, stored as torch's sparse tensors: rows and values.
 
-Rows are sorted and each is there once (`coalesced`). Sums and products of such gradients are those
-of dense ones on the rows that any of them has.
+Rows are sorted and unique (`coalesced`). Sums and products of such gradients equal the results for
+dense gradients on the union of their rows.
 """
 
 from collections.abc import Sequence
@@ -13,42 +13,42 @@ from crossgrad_core.gradients.columns import Column, is_native
 
 
 def sparse_rows(rows: Tensor, values: Tensor, shape: Sequence[int]) -> Tensor:
-    """The sparse gradient of `shape` that has `values` [R, ...] in `rows` [R] int64."""
+    """Return the sparse gradient of `shape` with `values` [R, ...] in `rows` [R] int64."""
     return torch.sparse_coo_tensor(rows[None], values, tuple(shape), check_invariants=False)
 
 
 def rows_of(gradient: Tensor) -> Tensor:
-    """[R] int64 rows of a sparse gradient."""
+    """Return [R] int64 rows of a sparse gradient."""
     return gradient._indices()[0]  # noqa: SLF001 - the public name wants a flag that autograd drops
 
 
 def values_of(gradient: Tensor) -> Tensor:
-    """[R, ...] values of a sparse gradient."""
+    """Return [R, ...] values of a sparse gradient."""
     return gradient._values()  # noqa: SLF001 - as above
 
 
 def coalesced(gradient: Tensor | None) -> Tensor | None:
-    """The gradient, its rows sorted and each there once if it is sparse."""
+    """Return the gradient; a sparse gradient gets sorted and unique rows."""
     if gradient is None or not gradient.is_sparse:
         return gradient
     if gradient.sparse_dim() != 1:
         return gradient.to_dense()
     rows = rows_of(gradient)
     if not gradient.is_coalesced() and _rises(rows):
-        gradient._coalesced_(True)  # Torch's own mark, so that nobody looks again.
+        gradient._coalesced_(True)  # Torch's own flag, so that torch does not sort again.
     return gradient.coalesce()
 
 
 def _rises(rows: Tensor) -> bool:
-    """Whether each number is larger than the one before."""
-    if rows.is_cpu:  # NumPy begins sooner than torch.
+    """Return True if the numbers are strictly increasing."""
+    if rows.is_cpu:  # NumPy has less overhead than torch.
         numbers = rows.numpy()
         return bool((numbers[1:] > numbers[:-1]).all())
     return bool((rows[1:] > rows[:-1]).all())
 
 
 def dense(gradient: Tensor | None) -> Tensor | None:
-    """The gradient with a value for each element."""
+    """Return the gradient as a dense tensor."""
     if gradient is None or not gradient.is_sparse:
         return gradient
     full = values_of(gradient).new_zeros(gradient.shape)
@@ -57,12 +57,12 @@ def dense(gradient: Tensor | None) -> Tensor | None:
 
 
 class PackedRows:
-    """A column of gradients on the rows that any of them has.
+    """A column of gradients on the union of their rows.
 
     Attributes:
-        column: K gradients of these rows; the gradients themselves where one of them is dense.
-        rows: [R] int64; None where the gradients are dense.
-        shape: Of the whole tensor.
+        column: K gradients of these rows; dense gradients if one of them is dense.
+        rows: [R] int64; None if the gradients are dense.
+        shape: Shape of the whole tensor.
     """
 
     def __init__(self, column: Column) -> None:
@@ -80,15 +80,15 @@ class PackedRows:
         self.column = [None if g is None else _on(g, self.rows) for g in column]
 
     def unpacked(self, result: Tensor | None) -> Tensor | None:
-        """A result of the column as a gradient of the whole tensor."""
+        """Return a result of the column as a gradient of the whole tensor."""
         if result is None or self.rows is None:
             return result
-        # Torch's own mark, so that nobody looks again.
+        # Torch's own flag, so that torch does not sort again.
         return sparse_rows(self.rows, result, self.shape)._coalesced_(self._tidy)
 
 
 def _union(rows: Sequence[Tensor], count: int) -> Tensor:
-    """[R] the rows of `count` that are in any of the lists."""
+    """Return [R], the rows (below `count`) that are in any of the lists."""
     if len(rows) == 1:
         return rows[0]
     there = torch.zeros(count, dtype=torch.bool)
@@ -98,7 +98,7 @@ def _union(rows: Sequence[Tensor], count: int) -> Tensor:
 
 
 def _on(gradient: Tensor, rows: Tensor) -> Tensor:
-    """[R, ...] the values of a gradient in these rows, among which are all of its own."""
+    """Return [R, ...], the values of a gradient in `rows`, which contain all of its rows."""
     own, values = rows_of(gradient), values_of(gradient)
     if len(own) == len(rows):
         return values.contiguous()

@@ -1,4 +1,4 @@
-"""The running sum of the gradients of K views, for operators that do not need them apart."""
+"""The running sum of the gradients of K views, for operators without separate gradients."""
 
 from collections.abc import Mapping, Sequence
 from typing import Self
@@ -18,12 +18,13 @@ from crossgrad_core.gradients.sparse_rows import PackedRows
 
 
 def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
-    """Adds each column's gradients in order and in their own type, then divides.
+    """Add each column's gradients in order and in their own type, then divide.
 
     Args:
-        columns: T columns of contiguous gradients, dense or by rows; a None is left out.
-        divisor: What the sums are divided by.
-        keep: Leaves the gradients as they are; else the first of each column holds the result.
+        columns: T columns of contiguous gradients, dense or sparse by rows; None is left out.
+        divisor: Divisor of the sums.
+        keep: Whether to leave the gradients unchanged; otherwise the first gradient of each column
+            is overwritten with the result.
 
     Returns:
         T sums, None for columns without a gradient.
@@ -34,7 +35,7 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
 
 
 def _plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[Tensor | None]:
-    """The sums of dense columns."""
+    """Return the sums of dense columns."""
     sums: list[Tensor | None] = []
     compiled: list[Column] = []
     into: list[Tensor] = []
@@ -68,12 +69,12 @@ def _add_into(out: Tensor, column: Sequence[Tensor], divisor: int) -> None:
 class SummedGradients(Gradients):
     """The sum of K views' gradients in the order of the views; single views are not kept.
 
-    Either given as a whole (one backward pass of a joint loss) or built view by view from `empty`
-    with `add`, which leaves a view out of the blocks in which it is not finite. The last view waits
-    for `total`, which adds and divides in one pass.
+    The sum is given as a whole (one backward pass of a joint loss), or built view by view from
+    `empty` with `add`. `add` leaves a view out of the blocks in which it is not finite. `total`
+    adds the last view and divides in a single pass.
 
     Args:
-        total: Tensor name -> sum; None or no entry where no view touches the tensor.
+        total: Tensor name -> sum; None or no entry if no view touches the tensor.
         blocks: The blocks.
         views: K.
     """
@@ -86,7 +87,7 @@ class SummedGradients(Gradients):
         self._last: dict[str, Tensor] = {}
         self._divisor = 0
         self._views = self._expected = views
-        #: Gradients that were judged as they are, and their versions then.
+        #: Checked gradients and their versions at the time of the check.
         self._looked: dict[str, tuple[Tensor, int]] = {}
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []
@@ -98,16 +99,16 @@ class SummedGradients(Gradients):
 
     @classmethod
     def empty(cls, blocks: Sequence[Block], views: int) -> Self:
-        """No view yet, of `views` to come."""
+        """Return a sum without views that expects `views` views."""
         gradients = cls({}, blocks, 0)
         gradients._expected = views
         return gradients
 
     def add(self, view: Mapping[str, Tensor | None]) -> None:
-        """Adds the gradients of one more view, and takes them over: they are written to.
+        """Add the gradients of one more view; this object then owns and overwrites them.
 
         Raises:
-            RuntimeError: All views that were to come are there.
+            RuntimeError: All expected views were already added.
         """
         if self._views == self._expected:
             raise RuntimeError(f"one view more than the {self._expected} that were to come")
@@ -133,7 +134,7 @@ class SummedGradients(Gradients):
         """See `Gradients.total`.
 
         Raises:
-            RuntimeError: The sum was already divided by something else.
+            RuntimeError: The sum was already divided by another number.
         """
         if self._divisor in {0, divisor}:
             if not self._divisor:
@@ -162,7 +163,7 @@ class SummedGradients(Gradients):
         return gradient is own and gradient._version == version  # noqa: SLF001
 
     def _remember(self) -> None:
-        """Notes the sum where it was judged as it is; one of several views may overflow."""
+        """Record the checked sum; only for a single view, because a sum of views may overflow."""
         self._looked = {
             name: (gradient, gradient._version)  # noqa: SLF001
             for name, gradient in self._sum.items()
@@ -172,7 +173,7 @@ class SummedGradients(Gradients):
     def _judged(
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """[B] whether each block's gradient is finite, and [B] whether it is also not zero."""
+        """Return [B], True for finite block gradients, and [B], True for finite non-zero ones."""
         names = [name for block in self._blocks for name in block.tensors]
         known = all_finite_and_present([view.get(name) for name in names])
         each = dict(zip(names, known, strict=True))
@@ -182,7 +183,7 @@ class SummedGradients(Gradients):
         return finite, finite & present
 
     def _fold(self, divisor: int) -> None:
-        """Adds the view that waits, and divides."""
+        """Add the pending view and divide."""
         columns = [[gradient, self._last.get(name)] for name, gradient in self._sum.items()]
         sums = plain_sums(columns, divisor, keep=False)
         self._sum = dict(zip(self._sum, sums, strict=True))

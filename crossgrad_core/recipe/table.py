@@ -1,4 +1,4 @@
-"""The table of decided settings: made by a recipe, applied to a configuration, shown."""
+"""The table of decided settings: a recipe makes it, a run applies and shows it."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -15,7 +15,7 @@ from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.wording import listed, plural
 
-#: Settings that training and assembly read and that have no default: a recipe decides each.
+#: Settings without a default that training and assembly need: a recipe decides each of them.
 DECIDED: Final = (
     *(
         "views_per_step",
@@ -30,7 +30,7 @@ DECIDED: Final = (
 )
 #: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.
 RULES: Final = "rules"
-#: Lines of decisions that the terminal shows.
+#: Largest number of decision lines in the terminal.
 LINES: Final = 12
 
 
@@ -40,7 +40,7 @@ def recipe_of(config: RunConfig) -> Recipe:
 
 
 def is_given(config: RunConfig, setting: str) -> bool:
-    """Return True if a setting, or an option of a component, has a value already."""
+    """Return True if a setting, or an option of a component, already has a value."""
     name, _, option = setting.partition(".")
     value = getattr(config, name, None)
     if name == RULES:
@@ -62,12 +62,12 @@ def given_settings(config: RunConfig) -> dict[str, Any]:
 
 
 def is_complete(config: RunConfig) -> bool:
-    """Return True if no recipe is needed: the run repeats one that wrote all decisions down."""
+    """Return True if no recipe is needed, because the configuration contains all decisions."""
     return all(is_given(config, name) for name in (*DECIDED, RULES))
 
 
 def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
-    """Return the rows of the recipe for the settings that are open.
+    """Return the rows of the recipe for the settings without a value.
 
     Raises:
         UserError: The recipe does not decide a setting that a run needs.
@@ -127,20 +127,20 @@ def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
 
 
 def _long_form(name: str, value: object) -> object:
-    """Return the name of a component as a choice of it."""
+    """Return the value; a component's name becomes a mapping with this name."""
     component = plural(name) in GROUPS
     return {"name": value} if component and isinstance(value, str) else value
 
 
 def open_again(config: RunConfig) -> RunConfig:
-    """Return the configuration as the user set it: decided settings are open again."""
+    """Return the configuration as the user set it, without decided values."""
     update: dict[str, Any] = config.model_dump(exclude_unset=True)
     without_decided(update)
     return RunConfig.model_validate(update)
 
 
 def without_decided(settings: dict[str, Any]) -> None:
-    """Remove decided values, and what says that they were decided, from plain settings."""
+    """Remove decided values and the record `decided` from plain settings."""
     decided = settings.pop("decided", None) or {}
     for setting in decided:
         name, _, option = str(setting).partition(".")
@@ -151,7 +151,7 @@ def without_decided(settings: dict[str, Any]) -> None:
 
 
 def rows_of(config: RunConfig) -> tuple[Decision, ...]:
-    """Return the decisions that a configuration has written down; their evidence is not."""
+    """Return the decisions recorded in a configuration, without their evidence."""
     values = ((name, _value(config, name), why) for name, why in config.decided.items())
     # The bound on the views of a run within seconds has become a number of steps.
     return tuple(Decision(*row) for row in values if row[1] is not None)
@@ -199,7 +199,7 @@ def _value_text(row: Decision) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as a table shows it."""
+    """Return the text of a value in a table."""
     match value:
         case dict():
             return ", ".join(f"{name} {shown(each)}" for name, each in value.items()) or "on"

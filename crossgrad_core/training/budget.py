@@ -1,4 +1,4 @@
-"""How many steps fit into a budget of training seconds: a probe first, then the run's own clock."""
+"""The number of steps that fit into a time budget: planned by a probe, revised by the clock."""
 
 import logging
 from collections.abc import Callable
@@ -16,23 +16,23 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import ClockKind, TrainState
 
-#: What each edit of density control adds to the mean cost of a step, in units of a step at the
-#: start: chosen on runs with four edits. The clock corrects it as a run goes.
+#: Increase of the mean cost of a step per density control edit, in units of a step at the start.
+#: Chosen from runs with four edits; the clock corrects it during a run.
 COST_PER_EDIT = 0.2
-#: Growth slows down: more edits than these are not counted.
+#: Largest number of counted edits, because growth slows down.
 COUNTED_EDITS = 5
-#: So many pixels cost what a Gaussian costs. Source: steps of one view and of two with 7,000 to
-#: 50,000 Gaussians on four scenes at 400 px (`benchmarks/grids/two_views_tuning.yaml`).
+#: Number of pixels that cost as much time as one Gaussian. Source:
+#: `benchmarks/grids/two_views_tuning.yaml`.
 PIXELS_PER_PRIMITIVE = 8.0
 
 
 @dataclass(frozen=True)
 class PrimitiveCounts:
-    """The primitives of a run.
+    """The numbers of primitives of a run.
 
     Attributes:
-        start: How many it began with.
-        present: How many there are.
+        start: Number of primitives at the start.
+        present: Present number of primitives.
     """
 
     start: int
@@ -40,19 +40,19 @@ class PrimitiveCounts:
 
     @classmethod
     def of(cls, setup: Setup, state: TrainState) -> "PrimitiveCounts":
-        """Those of a run that has reached this state."""
+        """Return the numbers for a run that has reached this state."""
         return cls(started_with(setup, state), state.primitives(setup))
 
 
 def cost_of_run(setup: Setup, crowd: PrimitiveCounts, steps: int) -> float:
-    """Expected cost of a run of so many steps, in units of a view of full size at its start."""
+    """Return the expected cost of a run of `steps` steps, in full-size views at its start."""
     setup = setup.at_length(steps, crowd.start)
     schedule = schedule_for(setup, steps)
     return views_of(setup, schedule, 0, steps) * growth_ahead(setup, crowd, schedule, 0)
 
 
 def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> float:
-    """Expected cost of the `left` steps after `step`, in units of a view of full size now."""
+    """Return the expected cost of the `left` steps after `step`, in full-size views now."""
     setup = setup.at_length(step + left, crowd.start)
     schedule = setup.schedule.with_length(schedule_for(setup, step + left), step)
     views = views_of(setup, schedule, step, step + left)
@@ -60,12 +60,12 @@ def cost_ahead(setup: Setup, crowd: PrimitiveCounts, step: int, left: int) -> fl
 
 
 def schedule_for(setup: Setup, steps: int) -> Schedule:
-    """The schedule that the run would have, were it so long from its start."""
+    """Return the schedule that the run would have with this length from its start."""
     return schedule_of(setup.in_force, setup.densifier, steps, setup.schedule.counting)
 
 
 def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
-    """Expected cost of the steps after one and up to another one, in views of full size."""
+    """Return the expected cost of the steps `after + 1` to `until`, in full-size views."""
     resolution = setup.selection.resolution
     views = schedule.pace.views(until) - schedule.pace.views(after)
     pixels = resolution.pixels(schedule, until) - resolution.pixels(schedule, after)
@@ -73,21 +73,21 @@ def views_of(setup: Setup, schedule: Schedule, after: int, until: int) -> float:
 
 
 def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """Mean cost of a view in the steps after `step`, over its cost with the primitives of now."""
+    """Return the mean cost of a view after `step`, relative to its cost with present primitives."""
     if not setup.densifier.edits:
         return 1.0
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
-        # A budget that no run fills, as that of nearly the published length, bounds nothing.
+        # The limit is needed for budgets that no run reaches, as near the published length.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
 
 
 def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
-    """The same where growth follows the curve to its budget."""
+    """Return the same ratio if growth follows the curve to its budget."""
     cameras = [view.camera for view in setup.train_views]
-    # What a view without any primitive costs, in primitives.
+    # Cost of a view without primitives, in units of primitives.
     empty = fmean(camera.width * camera.height for camera in cameras) / PIXELS_PER_PRIMITIVE
     cost, at, count = 0.0, step, crowd.present
     for edit in schedule.edit_steps(step):
@@ -98,31 +98,31 @@ def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
 
 
 _LOG = logging.getLogger(__name__)
-#: Steps that the probe of a time budget takes at least, and that a look at the clock counts.
+#: Minimum number of steps of the probe, and between two readings of the clock.
 PROBE_STEPS = 12
-#: ... and the share of the budget that the probe takes beyond that.
+#: Minimum share of the time budget that the probe uses.
 PROBE_SHARE = 0.01
-#: How often it begins again behind a kernel that had to be compiled.
+#: How often the probe restarts after the compilation of a kernel.
 _TRIES = 8
-#: Share of the budget between two looks at the clock.
+#: Share of the budget between two readings of the clock.
 LOOK_SHARE = 0.02
-#: A length that is off by a smaller share of what is left stays.
+#: The length changes only if the difference exceeds this share of the remaining steps.
 TOLERANCE = 0.02
-#: A step that no run reaches, and one before it from which on photos have their full size.
+#: A step that no run reaches, and an earlier step from which on photos have their full size.
 _NEVER = 10**9
 _FULL_SIZE = _NEVER - _NEVER // 100
-#: Share of the newest stretch in the smoothed cost of a step. Views differ, and other programs
-#: come and go.
+#: Weight of the newest measurement in the smoothed cost of a step. Smoothing is needed because
+#: views differ and other programs use the machine.
 SMOOTHING = 0.25
 
 
 def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
-    """How many steps fit into `seconds` of training by the run's clock, and on what evidence.
+    """Measure how many steps fit into `seconds` of training by the run's clock.
 
-    Kernels must be compiled already. The probe trains a throw-away state and keeps nothing.
+    Kernels must be compiled already. The probe trains a temporary state and keeps nothing.
 
     Returns:
-        The steps, a note, and the run's `pixel_share`.
+        The number of steps, a note with the evidence, and the run's `pixel_share`.
     """
     _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
@@ -136,12 +136,12 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         measured = replace(setup, pixel_share=share)
         return _fitting(lambda steps: cost_of_run(measured, crowd, steps), seconds / each)
 
-    # How many pixels the first steps draw may depend on the length.
+    # The number of pixels in the first steps may depend on the length.
     fits = fitting(share)
     first = _without_edits(schedule_for(setup, fits), max(fits, 2 * PROBE_STEPS))
     pixels = setup.selection.resolution.pixels(first, PROBE_STEPS) / first.pace.views(PROBE_STEPS)
     if pixels < 1.0:
-        del state  # Its views remember the scale that they have reached.
+        del state  # Its resolution state stores the scale that the views have reached.
         state = first_state(unwatched(setup))
         steps, small = _probed(replace(probed, schedule=first), state, seconds)
         note += f" at full size, {steps} at first {small * first.pace.at(1) * 1000:.1f} ms"
@@ -156,18 +156,18 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
 
 
 def most_steps(setup: Setup) -> int:
-    """The steps that a run within a budget of seconds may take, however fast they are."""
+    """Return the largest number of steps of a run with a time budget, however fast they are."""
     views = setup.config.max_views
     return _NEVER if views is None else setup.selection.views.steps_of(views)
 
 
 def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float]:
-    """How many steps were taken from a state on, and the training seconds of a view in them.
+    """Return the number of measured steps and the training seconds per view.
 
-    They are its next `PROBE_STEPS`, again and again: later ones may draw more pixels.
+    The probe repeats the next `PROBE_STEPS` steps, because later steps may render more pixels.
 
-    Where a kernel had to be compiled, what was measured before and with it is left out, a few times
-    at most: some plugin may compile in every step.
+    If a kernel is compiled, the measurement restarts. The number of restarts is limited, because a
+    plugin may compile in every step.
     """
     kind, step, compiled, tries = setup.config.clock, state.step, False, _TRIES
     timed_step(setup, state)
@@ -192,43 +192,43 @@ def _probed(setup: Setup, state: TrainState, seconds: float) -> tuple[int, float
 
 
 class Length(Protocol):
-    """Who decides about the length of a run while it trains."""
+    """A rule that decides the length of a run during training."""
 
     def due(self, state: TrainState) -> bool:
-        """Whether a decision is due after this step."""
+        """Return True if a decision is due after this step."""
         ...
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """The setup with the length that holds from here on."""
+        """Return the setup with the length that is valid from this step on."""
         ...
 
 
 class Planned:
-    """The length that is written down: fixed, or revised where an earlier run revised it.
+    """A recorded length: fixed, or revised at the same steps as in an earlier run.
 
     Args:
-        revisions: After which step the run has how many steps in all.
+        revisions: Pairs of a step and the total number of steps that is valid after it.
     """
 
     def __init__(self, revisions: tuple[tuple[int, int], ...] = ()) -> None:
         self._revisions = dict(revisions)
 
     def due(self, state: TrainState) -> bool:
-        """At the steps that are written down."""
+        """Return True at the recorded steps."""
         return state.step in self._revisions
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """The setup with the length that is written down."""
+        """Return the setup with the recorded length."""
         return _told(setup, with_length(setup, state.step, self._revisions[state.step]))
 
 
 class Timed:
-    """The length that fits into a budget of training seconds, by the run's own clock.
+    """A length that fits into a budget of training seconds, by the run's own clock.
 
     Args:
         seconds: The budget.
-        kind: The clock that it counts on.
-        most: The steps that the run may take, however fast they are.
+        kind: The clock of the budget.
+        most: Largest number of steps of the run, however fast they are.
     """
 
     def __init__(self, seconds: float, kind: ClockKind = "wall", *, most: int = _NEVER) -> None:
@@ -241,9 +241,9 @@ class Timed:
         self._rewinds = self._seen = self._next = 0
 
     def due(self, state: TrainState) -> bool:
-        """After some steps and a share of the budget."""
+        """Return True after a number of steps and a share of the budget."""
         if state.rewinds > self._rewinds:
-            # A length is written down with its step: it has to be one that is done only once.
+            # A length is recorded with its step, so this step must occur only once.
             self._rewinds, self._next = state.rewinds, self._seen + 1
             self._look(state)
         self._seen = state.step
@@ -252,8 +252,8 @@ class Timed:
         return steps >= PROBE_STEPS and seconds >= LOOK_SHARE * self._seconds
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """The setup with the length that now fits; its configuration says so."""
-        # Of a view, as a step may have another number of them later.
+        """Return the setup with the length that now fits, recorded in its configuration."""
+        # Measured per view, because the number of views per step may change.
         seconds = state.clock.trained(self._kind) - self._clock
         newest = seconds / views_of(setup, setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
@@ -276,12 +276,12 @@ class Timed:
 
 
 def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
-    """Training seconds that the steps still to be taken are going to take, growth included.
+    """Return the expected training seconds of the remaining steps, including growth.
 
     Args:
         setup: The run.
-        state: What it has reached.
-        each: Seconds that a step takes now.
+        state: The present state of the run.
+        each: Present seconds per step.
     """
     schedule, step = setup.schedule, state.step
     now = views_of(setup, schedule, max(0, step - 1), max(1, step))
@@ -290,7 +290,7 @@ def seconds_ahead(setup: Setup, state: TrainState, each: float) -> float:
 
 
 def with_length(setup: Setup, step: int, total: int) -> Setup:
-    """The setup of a run that has reached `step` and is to have `total` steps in all."""
+    """Return the setup of a run at step `step` with a new total of `total` steps."""
     changed = zip(setup.config.revisions, setup.config.revised, strict=False)
     settings = {done: settings for (done, _), settings in changed}.get(step, {})
     setup = replace(setup, revised={**setup.revised, **settings})
@@ -301,7 +301,7 @@ def with_length(setup: Setup, step: int, total: int) -> Setup:
 
 
 def replay_length(setup: Setup, step: int) -> Setup:
-    """The setup as it was when the run had done `step` steps."""
+    """Return the setup as it was after `step` steps of the run."""
     for done, total in setup.config.revisions:
         if done <= step:
             setup = with_length(setup, done, total)
@@ -309,7 +309,7 @@ def replay_length(setup: Setup, step: int) -> Setup:
 
 
 def _with_notes(setup: Setup, instead_of: Setup) -> Setup:
-    """The setup with the notes on its length in place of those that were true before."""
+    """Return the setup with new notes on its length in place of the outdated notes."""
     gone = {*notes_on_length(instead_of), *_length_note(instead_of)}
     kept = (note for note in setup.notes if note not in gone)
     return replace(setup, notes=(*kept, *notes_on_length(setup), *_length_note(setup)))
@@ -323,7 +323,7 @@ def _length_note(setup: Setup) -> tuple[str, ...]:
 
 
 def _told(before: Setup, after: Setup) -> Setup:
-    """The later setup; says where its length brings density control about or leaves it out."""
+    """Return the later setup; log a message if its length adds or removes density control."""
     was, now = growth_note(before), growth_note(after)
     if was and not now:
         schedule = after.schedule
@@ -336,7 +336,7 @@ def _told(before: Setup, after: Setup) -> Setup:
 
 
 def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
-    """A schedule whose steps cost what most do: statistics, all SH bands and levels, no edits."""
+    """Return a schedule of typical steps: statistics, all SH bands and levels, no edits."""
     return replace(
         schedule,
         total=total,
@@ -350,11 +350,11 @@ def _without_edits(schedule: Schedule, total: int = _NEVER) -> Schedule:
 
 
 def _fitting(cost: Callable[[int], float], affordable: float) -> int:
-    """The most steps that cost no more than `affordable`, at least 1.
+    """Return the largest number of steps that costs at most `affordable`, at least 1.
 
     Args:
-        cost: Expected cost of so many steps, in views of full size; it grows with them.
-        affordable: Such views.
+        cost: Number of steps -> expected cost in full-size views; increasing.
+        affordable: Largest cost, in full-size views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
     while cost(too_many) <= affordable and too_many < _NEVER:  # Views of less than full size.

@@ -1,4 +1,4 @@
-"""How many primitives density control may add: a budget, a curve that leads to it, the memory."""
+"""Limits for density control: a budget of primitives, a growth curve, and the memory."""
 
 import sys
 from typing import cast
@@ -11,12 +11,12 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.views import Rendered
 
-#: Under this name a run with a curve, or with a budget by itself, keeps the number at its start.
+#: Name of the state that stores the number of primitives at the start of a budgeted run.
 STATE = "budget"
 
 
 def max_new_gaussians(setup: Setup, state: TrainState, rendered: Rendered) -> int:
-    """How many primitives this step's edit may add; 0 where none is due."""
+    """Return how many primitives the edit of this step may add; 0 if no edit is due."""
     if not setup.schedule.densifies(state.step):
         return 0
     most, present = _most(setup, state), state.primitives(setup)
@@ -25,7 +25,7 @@ def max_new_gaussians(setup: Setup, state: TrainState, rendered: Rendered) -> in
 
 
 def _most(setup: Setup, state: TrainState) -> int:
-    """The most primitives that there may be after this step's edit."""
+    """Return the largest allowed number of primitives after the edit of this step."""
     numbers = setup.numbers
     decided = numbers.max_gaussians == AUTO or "max_gaussians" in setup.config.decided
     if numbers.growth == "unbounded" and not (decided and numbers.max_gaussians):
@@ -36,18 +36,18 @@ def _most(setup: Setup, state: TrainState) -> int:
 
 
 def started_with(setup: Setup, state: TrainState) -> int:
-    """The number of primitives at the start of a run, where growth depends on it."""
+    """Return the number of primitives at the start of the run."""
     kept = state.states.get(STATE)
-    # Nothing is added before the first edit: what is there until then is the start.
+    # Before the first edit nothing is added, so the present number is the number at the start.
     return state.primitives(setup) if kept is None else cast("int", kept.values["start"])
 
 
 def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
-    """The most primitives that there may be after an edit in a run that began with `start`.
+    """Return the largest allowed number of primitives after an edit.
 
     Args:
         setup: The run.
-        schedule: Its schedule.
+        schedule: The schedule of the run.
         step: The step of the edit.
         start: Primitives at the start.
     """
@@ -63,7 +63,7 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
 
 
 def curve(event: int, events: int, start: int, budget: int) -> int:
-    """How many primitives there may be after an edit; `budget` after the last one.
+    """Return the allowed number of primitives after an edit; `budget` after the last edit.
 
     Source: Taming 3DGS (arXiv 2406.15643), A(x) = (B - S - 2 N) (x / N)^2 + 2 x + S.
     """
@@ -71,7 +71,7 @@ def curve(event: int, events: int, start: int, budget: int) -> int:
 
 
 def _demand(setup: Setup, state: TrainState, rendered: Rendered) -> Demand:
-    """What a step keeps for each primitive."""
+    """Return the memory demand of a step for each primitive."""
     per_primitive = sum(
         state.tensors[name][:1].numel() * state.tensors[name].element_size()
         for block in setup.blocks

@@ -1,4 +1,4 @@
-"""The loop around the step: evaluation, checkpoints, interruption, rewinding."""
+"""The training loop: steps, evaluation, checkpoints, interruption, rollback."""
 
 import signal
 from collections import deque
@@ -30,7 +30,7 @@ from crossgrad_core.training.state import (
 from crossgrad_core.training.step import model_of, sample_context, take_step
 from crossgrad_core.training.views import photo_camera
 
-#: What the user is told at the first and at the second signal; the third one ends the process.
+#: Messages at the first and at the second signal; the third signal ends the process.
 _WORDS = (
     "stopping: what there is gets saved and evaluated first (once more: only saved)",
     "stopping: what there is gets saved first (once more: ends at once)",
@@ -39,12 +39,12 @@ _WORDS = (
 
 @dataclass
 class Stopper:
-    """Whether and why a run is to stop.
+    """A request to stop a run, with its reason.
 
     Attributes:
-        signal: Number of the first signal; None where there was none.
-        at_once: Whether a second one came: what only takes time is left out.
-        error: What was found beside training and ends it; None where nothing was.
+        signal: Number of the first signal; None if there was no signal.
+        at_once: Whether there was a second signal; optional work is then skipped.
+        error: Error from outside the training step that ends the run; None without an error.
     """
 
     signal: int | None = None
@@ -56,18 +56,18 @@ class Stopper:
 
     @property
     def requested(self) -> bool:
-        """Whether training is to stop after the step under way."""
+        """Whether training must stop after the present step."""
         return self.signal is not None or self.error is not None
 
     def fail(self, error: Exception) -> None:
-        """Asks the run to end after its step because of an error found beside it, in any thread."""
+        """Request the end of the run after its step because of an error in any thread."""
         self.error = error
 
     @contextmanager
     def installed(self) -> Iterator["Stopper"]:
-        """Handles signals inside the block; does nothing outside the main thread.
+        """Handle signals inside the block; does nothing outside the main thread.
 
-        A signal that the process was told to ignore (`nohup`, a job in the background) stays so.
+        Signals that the process ignores already (`nohup`, background jobs) stay ignored.
         """
         before = self._before
         try:
@@ -84,7 +84,7 @@ class Stopper:
 
     @contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Inside the block a second signal raises KeyboardInterrupt; elsewhere it is only noted."""
+        """Let a second signal raise KeyboardInterrupt in the block; elsewhere it is only noted."""
         self._interruptible = not self.at_once
         try:
             yield
@@ -105,21 +105,21 @@ class Stopper:
             raise KeyboardInterrupt
 
     def _end(self, number: int, frame: FrameType | None) -> None:
-        """Leaves the end to the previous handler of signals; in Python itself an exception."""
+        """Call the previous signal handler to end the process, then raise KeyboardInterrupt."""
         before = self._before.get(number)
         (before if callable(before) else end_at_once)(number, frame)
         raise KeyboardInterrupt
 
 
-#: Views, or where they are more those of two steps, that are foreseen.
+#: Prefetch at least this many views and at least this many steps.
 _VIEWS, _STEPS = 8, 2
 
 
 class Prefetcher:
-    """Lets the sampler draw ahead on copies of its random stream and its state.
+    """A prefetcher of photos: draws future views with copies of the sampler's stream and state.
 
-    A guess, which only decides what is decoded first: a sampler that looks at the losses of the
-    step before may draw other views then. Nothing that the run itself uses is touched.
+    The prediction only decides which photos are decoded first. It may be wrong for a sampler that
+    uses the losses of the last step. The state of the run is not changed.
 
     Args:
         setup: The run.
@@ -134,7 +134,7 @@ class Prefetcher:
         self._blind = False
 
     def update(self, state: TrainState) -> None:
-        """Names the photos of the steps after `state.step` to those who decode them."""
+        """Pass the photos of the steps after `state.step` to the decoding threads."""
         setup = self._setup
         if self._blind or not setup.photos_ahead.useful:
             return
@@ -151,7 +151,7 @@ class Prefetcher:
         setup.photos_ahead.expect(wanted)
 
     def _follow(self, state: TrainState) -> None:
-        """Forgets the step that was taken, and all others where it drew something else."""
+        """Drop the prediction of the last step, and all predictions if this one was wrong."""
         if self._draws and self._step - len(self._draws) == state.step - 1:
             drawn = self._draws.popleft()
             if state.last is not None and state.last.views == drawn:
@@ -179,28 +179,28 @@ class Prefetcher:
         return len(self._draws) >= _STEPS and sum(map(len, self._draws)) >= _VIEWS
 
 
-#: Why the loop came back.
+#: Why the loop returned.
 Ending = Literal["finished", "stopped", "paused"]
-#: Steps between looks at all parameters. Losses and gradients are looked at in every step; a bad
-#: parameter that touches neither (a Gaussian that is not drawn any more) can wait so long.
+#: Steps between checks of all parameters. Losses and gradients are checked in every step. A bad
+#: parameter that affects neither (of a Gaussian that is not drawn any more) is found later.
 CHECK_EVERY = 10
 #: Steps between copies of the last good state; a multiple of `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 
 class RunWriter(Protocol):
-    """Where a run's results go."""
+    """A writer of a run's results."""
 
     def evaluate(self, setup: Setup, state: TrainState) -> None:
-        """Evaluates and records a row."""
+        """Evaluate and record a row."""
         ...
 
     def save(self, setup: Setup, state: TrainState) -> None:
-        """Writes a checkpoint."""
+        """Write a checkpoint."""
         ...
 
     def rewind(self, setup: Setup, step: int) -> None:
-        """Forgets what was recorded after `step`."""
+        """Delete the records after `step`."""
         ...
 
 
@@ -212,15 +212,16 @@ def train(
     pauses: Callable[[TrainState], bool] | None = None,
     keeper: RollbackGuard | None = None,
 ) -> Ending:
-    """Runs the remaining steps of the schedule, or those until `pauses` says so after a step.
+    """Run the remaining steps of the schedule, or until `pauses` returns True after a step.
 
-    A `keeper` that outlives a pause goes back behind it; by default none does.
+    A `keeper` that is reused after a pause can restore states from before the pause. By default,
+    each call creates a new keeper.
 
     Raises:
-        TrainingFailedError: Something was not finite twice, or at the start; names step, views and
-            block.
-        BaseException: Whatever a plugin, a photo, the memory or the disk raised, with the step as a
-            note. After any exception `state` is the last good one.
+        TrainingFailedError: A value was not finite for the second time, or at the start; names
+            step, views and block.
+        BaseException: An error of a plugin, a photo, the memory or the disk, with the step as a
+            note. After any exception, `state` is the last good state.
     """
     check_start(state)
     use_large_pages()
@@ -272,16 +273,16 @@ def _steps(
         pausing = pauses is not None and state.step < last and pauses(state)
         if pausing and _is_good(setup, state, sink, keeper):
             return "paused"
-    # A signal may have come after the last look.
+    # A signal may have arrived after the last check.
     _is_good(setup, state, sink, keeper)
     return "finished" if state.step >= total else "stopped"
 
 
 def timed_step(setup: Setup, state: TrainState) -> StepRecord:
-    """One step on the training clock; decoding photos is counted as loading.
+    """Take one step on the training clock; decoding photos is counted as loading.
 
-    A GPU, or the other threads, may still be at the optimizer when the step is over; the next one
-    waits for them.
+    A GPU or other threads may still run the optimizer at the end of the step. The next step waits
+    for them.
     """
     state.laps = PhaseTimer()
     setup.photos_ahead.taken_cpu()
@@ -296,7 +297,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard) -> bool:
-    """Checks a state that is about to be kept; where it is bad, training goes back."""
+    """Check a state before it is kept; if it is bad, rewind training. Return True if it is good."""
     try:
         keeper.check(state)
     except NonFiniteError as error:
@@ -328,25 +329,25 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
 
 
 def looks_after(setup: Setup, step: int) -> bool:
-    """Whether all parameters are looked at after this step: what is kept or shown is good."""
+    """Return True if all parameters are checked after this step, such as before a checkpoint."""
     return step % CHECK_EVERY == 0 or saves_after(setup, step) or evaluates_after(setup, step)
 
 
 def copies_after(setup: Setup, step: int) -> bool:
-    """Whether the state after this step is one to go back to."""
+    """Return True if the state after this step is copied for a rollback."""
     return step % SNAPSHOT_EVERY == 0 or saves_after(setup, step)
 
 
 def saves_after(setup: Setup, step: int) -> bool:
-    """Whether a checkpoint is written after this step of a run that goes on."""
+    """Return True if a checkpoint is written after this step, which is not the last one."""
     return step % setup.numbers.save_every == 0 and step < setup.schedule.total
 
 
 def evaluates_after(setup: Setup, step: int) -> bool:
-    """Whether the held-out views are evaluated after this step of a run that goes on."""
+    """Return True if held-out views are evaluated after this step, which is not the last one."""
     every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
-    # Opacities are reset every tenth of the steps, too: right after that there is hardly a picture.
+    # Opacities are also reset every tenth of the steps, and renders are poor right after a reset.
     chosen = "eval_every" not in setup.config.decided
     between = not chosen and setup.schedule.reset_every is not None
     shift = every // 2 if between else 0

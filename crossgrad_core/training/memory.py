@@ -1,4 +1,4 @@
-"""Memory: how much was used, and how many more primitives the machine can take."""
+"""Memory: the peak use, and the number of further primitives that fit."""
 
 import sys
 from collections.abc import Iterable
@@ -10,21 +10,21 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import ViewRecord
 
-#: Copies of the parameters that are always alive: themselves, two moments, the last good state.
+#: Copies of the parameters that always exist: parameters and two moments, now and in the snapshot.
 STANDING = 6
-#: ... and while an edit is under way, when no graph is left: the new parameters and moments.
+#: Further copies during an edit, when no graph exists: the new parameters and moments.
 EDIT = 3
-#: What the graph of one view takes until its backward pass is over, in units of the parameters or,
-#: where that is more, of what was decoded for the view. Measured with the numba rasterizer: 2.7.
+#: Memory of the graph of one view until its backward pass ends, in units of the parameters or of
+#: the decoded tensors of the view, whichever is larger. Measured with the numba rasterizer: 2.7.
 GRAPH = 3
 #: Share of the available memory that growth may claim.
 GROWTH_SHARE = 0.5
 
 
 def peak_mebibytes(device: torch.device) -> float | None:
-    """Peak memory of this process (resident set), or of the device where it is a GPU, MiB.
+    """Return the peak memory of this process (resident set), or of the GPU, in MiB.
 
-    None where the system does not say.
+    None if the system does not report it.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
@@ -37,9 +37,9 @@ def peak_mebibytes(device: torch.device) -> float | None:
 
 
 def available_bytes(device: torch.device) -> int | None:
-    """Memory that can still be allocated; None where the system does not say."""
+    """Return the bytes that can still be allocated; None if the system does not report them."""
     if device.type == "cuda":
-        # What torch holds on to for its next tensors is there for them, and not free.
+        # Memory that torch has reserved is not free, but new tensors can use it.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
     figures = [
@@ -68,16 +68,16 @@ def _cgroup_available() -> int | None:
 
 @dataclass(frozen=True)
 class Demand:
-    """Memory that a step keeps for each primitive, at the worst moment.
+    """Peak memory of a step for each primitive.
 
     Attributes:
         parameters: Bytes of its parameters.
-        kept: Bytes that the records of all views hold besides: what was decoded, the statistics.
+        kept: Further bytes in the records of all views: decoded tensors and statistics.
         views: K.
-        separate: Whether the views' gradients are kept apart.
-        watched: Whether their combination may not overwrite one of them.
-        joint: Whether the graphs of all views are alive at once.
-        copies: Copies of the parameters that the states of rules hold.
+        separate: Whether the gradients of the views are stored separately.
+        watched: Whether the combined gradient must not overwrite the gradient of a view.
+        joint: Whether the graphs of all views exist at once.
+        copies: Copies of the parameters in the states of rules.
     """
 
     parameters: int
@@ -90,7 +90,7 @@ class Demand:
 
     @property
     def gradients(self) -> int:
-        """Gradients alive at once: all views', or the sum so far and that of the newest view."""
+        """Number of simultaneous gradients: one per view, or the sum and the newest gradient."""
         return self.views + self.watched if self.separate else min(self.views, 2)
 
     @property
@@ -104,7 +104,7 @@ class Demand:
 
 
 def kept_bytes(records: Iterable[ViewRecord], parameters: Iterable[Tensor]) -> int:
-    """Bytes of what the records of a step hold besides the parameters themselves."""
+    """Return the bytes of the tensors in the records of a step, without the parameters."""
     own = {tensor.untyped_storage().data_ptr() for tensor in parameters}
     held: dict[int, int] = {}
     for record in records:
@@ -119,7 +119,7 @@ def _tensors(values: Iterable[object]) -> Iterable[Tensor]:
 
 
 def room_for_primitives(device: torch.device, demand: Demand) -> int | None:
-    """How many more primitives fit into the growth share of the available memory."""
+    """Return how many more primitives fit into the growth share of the available memory."""
     available = available_bytes(device)
     if available is None:
         return None

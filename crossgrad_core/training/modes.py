@@ -1,4 +1,4 @@
-"""Says where a grouping splits what has one mode only."""
+"""The note on a grouping that splits a distribution with a single mode."""
 
 import numpy as np
 
@@ -9,9 +9,10 @@ from crossgrad_core.scene.bimodality import ONE_MODE, bimodality
 
 
 def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
-    """One note where the training views have one mode in what the grouping splits, else none.
+    """Return a note if the quantity that the grouping splits has a single mode, else no note.
 
-    The finite-sample form of the coefficient decides, for small samples that of plain moments.
+    The finite-sample form of the bimodality coefficient decides; for small samples, the form with
+    plain moments decides.
 
     Args:
         name: Name of the grouping.
@@ -23,7 +24,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
         return ()
     found = bimodality(quantity.values[np.isfinite(quantity.values)])
     figure = found.deciding
-    # Not a number where all values are equal or there are too few: nothing can be said.
+    # The figure is NaN if all values are equal or there are too few values.
     if not figure < ONE_MODE:
         return ()
     return (

@@ -1,4 +1,4 @@
-"""The decided settings as training reads them: plain values, none of them open."""
+"""The decided settings as training reads them: plain values, all of them set."""
 
 from dataclasses import dataclass, fields
 from typing import Literal
@@ -33,7 +33,7 @@ class Numbers:
         """Return the numbers of a configuration.
 
         Raises:
-            UserError: A number is open: no recipe decided it.
+            UserError: A number has no value, because no recipe decided it.
         """
         values = {each.name: getattr(config, each.name) for each in fields(cls)}
         if missing := [name for name, value in values.items() if value is None]:

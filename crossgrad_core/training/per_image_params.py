@@ -1,6 +1,6 @@
-"""Parameters per photo: kept as a state beside those of plugins, stepped by an Adam of their own.
+"""Parameters per photo: stored like a plugin state and optimized by a separate Adam.
 
-The state is a value like that of a plugin, so that snapshots, rewinding and checkpoints carry it.
+The state is a value like a plugin state, so that snapshots, rollback and checkpoints include it.
 """
 
 import json
@@ -26,7 +26,7 @@ from crossgrad_core.wording import listed
 
 #: The file in a run's folder.
 PHOTO_VALUES: Final = "exposure.json"
-#: Version of the layout; raised whenever an older reader could misread a newer file.
+#: Version of the format; increased when an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
 _TODO = "name the exposure.json of a run, or leave --exposure-from out"
 
@@ -34,11 +34,11 @@ _TODO = "name the exposure.json of a run, or leave --exposure-from out"
 def write_values(
     path: Path, exposure: str, photos: Sequence[str], values: Mapping[str, Tensor]
 ) -> None:
-    """Writes the values of photos.
+    """Write the values of photos.
 
     Args:
         path: The file.
-        exposure: Name of the exposure whose values they are.
+        exposure: Name of the exposure that the values belong to.
         photos: Names of the photos.
         values: Name of a parameter -> [P, ...].
 
@@ -54,14 +54,14 @@ def write_values(
 
 
 def read_values(path: Path, like: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Name of a photo -> name of a parameter -> its value.
+    """Return name of a photo -> name of a parameter -> its value.
 
     Args:
         path: The file.
-        like: Name -> [P, ...] values as the run has them: names and shapes that the file must have.
+        like: Name -> [P, ...] values of the run; the file must contain the same names and shapes.
 
     Raises:
-        UserError: It cannot be read, or holds the values of another exposure.
+        UserError: The file cannot be read, or contains the values of another exposure.
     """
     content = _content(path)
     exposure = content.get("exposure", "another one")
@@ -127,10 +127,10 @@ Leaves = dict[str, Tensor]
 
 
 def started(setup: Setup) -> PluginState | None:
-    """The state before the first step; None where nothing has a value per photo.
+    """Return the state before the first step; None without parameters per photo.
 
     Raises:
-        UserError: A start is not one finite float32 row for each training photo.
+        UserError: Initial values are not one finite float32 row for each training photo.
     """
     parameters = setup.per_photo
     if not parameters:
@@ -149,12 +149,12 @@ def started(setup: Setup) -> PluginState | None:
 
 
 def known_starts(setup: Setup) -> Mapping[str, Tensor]:
-    """The starts with the values of photos that the user has a file of; empty without one.
+    """Return the initial values with the values of the user's file; empty without a file.
 
-    Photos that are not in it keep what they differ by from those that are, on average.
+    Photos that are not in the file keep their difference from the mean of the photos in the file.
 
     Raises:
-        UserError: Its values are of no training photo, or do not fit.
+        UserError: The file contains no training photo, or its values do not fit.
     """
     path = setup.config.exposure_from
     if path is None:
@@ -181,10 +181,10 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
 
 
 def check_photos_are(setup: Setup, state: TrainState) -> None:
-    """Refuses values of other photos than those that are trained on.
+    """Check that the state contains the values of exactly the training photos.
 
     Raises:
-        UserError: They are.
+        UserError: It contains values of other photos.
     """
     held = state.states.get(STATE, EMPTY_STATE).values.get("photos", [])
     names = [view.name for view in setup.train_views] if setup.per_photo else []
@@ -197,7 +197,7 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
 
 
 def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
-    """Writes the values of all training photos, where there are any; says whether it did."""
+    """Write the values of all training photos, if there are any; return True if written."""
     values = _values(setup, state)
     if values:
         photos = [view.name for view in setup.train_views]
@@ -206,13 +206,13 @@ def write_photos(setup: Setup, state: TrainState, path: Path) -> bool:
 
 
 def leaves_of(setup: Setup, state: TrainState, index: int) -> Leaves:
-    """Copies of a training photo's values that gather gradients."""
+    """Return copies of a training photo's values that collect gradients."""
     values = _values(setup, state)
     return {name: each[index].detach().clone().requires_grad_() for name, each in values.items()}
 
 
 def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
-    """What the exposure makes of a render of any view, with the values as they are now."""
+    """Apply the exposure with its present values to a render of any view."""
     values = _values(setup, state)
     row = setup.row_of.get(view.name)
     if row is not None:
@@ -225,25 +225,25 @@ def apply(setup: Setup, state: TrainState, view: View, image: Tensor) -> Tensor:
 def take_photo_step(
     setup: Setup, state: TrainState, taken: Iterable[tuple[int, Leaves]], progress: float
 ) -> None:
-    """One step of Adam for each photo of the step, then the projection of all.
+    """Take one Adam step for each photo of the step, then project the values of all photos.
 
     A photo that was drawn twice takes one step with the sum of its gradients.
 
     Args:
         setup: The run.
-        state: Its state; gets new tensors.
+        state: The state of the run; gets new tensors.
         taken: Position of each drawn view and its leaves after the backward passes.
-        progress: Share of the schedule that is over, for the learning rates.
+        progress: Completed share of the schedule, for the learning rates.
 
     Raises:
         NonFiniteError: A gradient is NaN or infinite.
-        UserError: The projection does not give all values back.
+        UserError: The projection does not return valid values for all photos.
     """
     if not setup.per_photo:
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # A checkpoint has brought it to the GPU, which would be waited for in each step.
+    # A checkpoint may have put it on the GPU, where each step would wait for it.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():
@@ -266,7 +266,7 @@ def _values(setup: Setup, state: TrainState) -> dict[str, Tensor]:
 
 
 def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]:
-    """Position of a photo -> gradients of its values, those of several draws added up."""
+    """Return position of a photo -> gradients of its values, summed over repeated draws."""
     found: dict[int, dict[str, Tensor]] = {}
     for row, leaves in taken:
         gradients = found.setdefault(row, {})
@@ -279,7 +279,7 @@ def _summed(taken: Iterable[tuple[int, Leaves]]) -> dict[int, dict[str, Tensor]]
 def _row(
     tensors: Mapping[str, Tensor], row: int, names: Iterable[str], kind: str
 ) -> dict[str, Tensor]:
-    """One photo's rows of the tensors of a kind, to be changed in place."""
+    """Return one photo's rows of the tensors of a kind, as views for in-place changes."""
     return {name: tensors[f"{kind}.{name}"][row] for name in names}
 
 
@@ -293,7 +293,7 @@ def _check_gradients(
 
 
 def _is_finite(tensor: Tensor) -> bool:
-    """Whether it is; on a GPU it is not waited for: the loss of the photo's next draw tells."""
+    """Return True if finite or on a GPU, where the loss of the photo's next draw shows an error."""
     return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 
 

@@ -1,4 +1,4 @@
-"""Looking at a model without training it."""
+"""Gradients of a model for inspection, without training."""
 
 from collections.abc import Sequence
 
@@ -11,11 +11,11 @@ from crossgrad_core.training.scaled_photos import on_device
 
 
 def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str, Tensor]:
-    """Gradients of one view's photometric loss at the model's parameters, which stay as they are.
+    """Return the gradients of one view's photometric loss; the model does not change.
 
     Args:
         model: The model.
-        view: The view, of any part of the scene.
+        view: Any view of the scene.
         tensors: Names of tensors of `model.parameters`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The learning rates of a step and how Adam averages in it."""
+"""The learning rates and Adam's averaging rule of a step."""
 
 from math import sqrt
 from typing import Final
@@ -12,20 +12,20 @@ from crossgrad_core.wording import listed
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
 
-#: Tensors that learn in one of n steps have n to this power times their rate then.
+#: The learning rate of a tensor that learns in one of n steps is multiplied by n to this power.
 RESTED: Final = 0.5
 
 
 def axes_of(setup: Setup) -> tuple[str, str, str] | None:
-    """Tensors of positions, scales and rotations, where positions step along axes; else None."""
+    """Return the tensors of positions, scales and rotations if positions step along axes."""
     return setup.backbone.gaussian_tensors if setup.numbers.position_lr == "per-axis" else None
 
 
 def check_axes(setup: Setup, parameters: Parameters) -> None:
-    """Refuses tensors of other shapes than those that `Backbone.axes` promises.
+    """Check that tensors have the shapes that `Backbone.axes` promises.
 
     Raises:
-        UserError: It names the backbone.
+        UserError: A shape is wrong. The message names the backbone.
     """
     if (names := setup.backbone.gaussian_tensors) is None:
         return
@@ -42,7 +42,7 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
 
 
 def rates_at(setup: Setup, step: int) -> dict[str, float]:
-    """Name of each trained tensor -> its learning rate in a step."""
+    """Return name of each trained tensor -> its learning rate in a step."""
     intervals = setup.update_intervals
     return {
         name: rate_at(setup, block.lr, step) * float(intervals.get(name, 1) ** RESTED)
@@ -52,13 +52,13 @@ def rates_at(setup: Setup, step: int) -> dict[str, float]:
 
 
 def means_rate_at(setup: Setup, step: int) -> float:
-    """The learning rate of the primitives' positions in a step; 0 where they do not move."""
+    """Return the learning rate of the primitives' positions in a step; 0 if they do not move."""
     rates = {block.name: block.lr for block in setup.blocks}
     return rate_at(setup, rates.get("means", LearningRate(0.0)), step)
 
 
 def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
-    """A learning rate of the backbone in a step: of the schedule, times what the run asks for."""
+    """Return a learning rate of the backbone in a step: the scheduled rate times all factors."""
     numbers, schedule = setup.numbers, setup.schedule
     factor = numbers.rate_factor * (rate.few_passes if numbers.few_pass_rates else 1.0)
     factor *= rate_factor(setup, rate, step)
@@ -68,7 +68,7 @@ def rate_at(setup: Setup, rate: LearningRate, step: int) -> float:
 
 
 def rule_at(setup: Setup, step: int) -> AdamRule:
-    """How Adam averages in a step."""
+    """Return the averaging rule of Adam in a step."""
     betas = setup.numbers.beta1, setup.numbers.beta2
     if setup.config.batch_rule == "none":
         return AdamRule(betas)

@@ -15,28 +15,28 @@ STREAMS = (
 def make_streams(
     seed: int, rewinds: int = 0, names: Iterable[str] = STREAMS
 ) -> dict[str, np.random.Generator]:
-    """Fresh generators of a run; `rewinds` gives other ones after a rewind.
+    """Return new generators of a run; `rewinds` changes them after a rewind.
 
     Args:
         seed: Seed of the run.
-        rewinds: How often training went back.
-        names: The streams: those of every run, and one for each rule.
+        rewinds: How often training was rewound.
+        names: Names of the streams: the streams of every run, and one for each rule.
     """
     return {name: np.random.default_rng([seed, crc32(name.encode()), rewinds]) for name in names}
 
 
 def stream_states(streams: Mapping[str, np.random.Generator]) -> dict[str, dict[str, Any]]:
-    """The states of all generators as plain data."""
+    """Return the states of all generators as plain data."""
     return {name: dict(rng.bit_generator.state) for name, rng in streams.items()}
 
 
 def restored_streams(states: Mapping[str, Mapping[str, Any]]) -> dict[str, np.random.Generator]:
-    """Generators that continue from `states`.
+    """Return generators that continue from `states`.
 
     Raises:
         KeyError: A stream is missing.
-        TypeError: A state is none of NumPy's.
-        ValueError: Likewise.
+        TypeError: A state is not a NumPy generator state.
+        ValueError: A state is not a NumPy generator state.
     """
     absent = [name for name in STREAMS if name not in states]
     if absent:

@@ -1,4 +1,4 @@
-"""Ask rules about the Gaussians of a view, learning rates, and the parameters to be shown."""
+"""Calls of rules: Gaussians of a view, learning rates, and parameters for evaluation."""
 
 from dataclasses import replace
 from math import inf, prod
@@ -31,7 +31,7 @@ def view_gaussians(setup: Setup, state: TrainState, context: GaussiansContext) -
 
 
 def rate_factor(setup: Setup, rate: LearningRate, step: int) -> float:
-    """Return what rules multiply a learning rate of the backbone by in a step.
+    """Return the product of the rules' factors for a learning rate of the backbone in a step.
 
     Raises:
         UserError: A factor is negative or not a finite number.
@@ -47,7 +47,7 @@ def rate_factor(setup: Setup, rate: LearningRate, step: int) -> float:
 
 
 def eval_parameters(setup: Setup, state: TrainState) -> Parameters:
-    """Return the parameters that evaluations and exports show.
+    """Return the parameters that evaluations and exports use.
 
     Raises:
         UserError: A rule gives tensors that do not fit the parameters.

@@ -1,4 +1,4 @@
-"""Photos in a smaller size, by an area filter, in a bounded amount of memory."""
+"""Photos reduced by an area filter, cached in a bounded amount of memory."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,20 +10,20 @@ from torch import Tensor
 
 from crossgrad_core.contract.scene import Camera, Scene, View
 
-#: Photo [H, W, 3] uint8 and mask [H, W] bool, None where every pixel counts.
+#: Photo [H, W, 3] uint8 and mask [H, W] bool (None if every pixel counts).
 Pair = tuple[Tensor, Tensor | None]
 #: Width and height, pixels.
 _Size = tuple[int, int]
 
 
 class ScaledPhotos:
-    """Reduced photos: of each view the size that was asked for last, and what it was made from.
+    """A cache of reduced photos: for each view, the last requested size and its source.
 
-    That is the photo, halved as often as it stays larger than what was asked for: where the size
-    changes step by step, most of the work is done once.
+    The source is the photo, halved as often as it stays larger than the requested size. If the size
+    changes from step to step, most of the work is done once.
 
     Args:
-        mib: Memory in MiB; what does not fit is made again.
+        mib: Memory in MiB; photos that do not fit are computed again.
     """
 
     def __init__(self, mib: int) -> None:
@@ -31,17 +31,17 @@ class ScaledPhotos:
         self._kept: dict[str, dict[_Size, Pair]] = {}
 
     def holds(self, view: View, camera: Camera) -> bool:
-        """Whether a photo in the size of a camera can be had without the view's own."""
+        """Return True if a photo in the size of a camera is available without the full photo."""
         kept = self._kept.get(view.name, {})
         return any(size in kept for size in _sizes(view.camera, camera))
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """The photo and mask of a view in the size of a camera; shared, so never to be written to.
+        """Return the photo and mask of a view in the size of a camera; shared, so read only.
 
         Args:
             view: The view.
-            camera: At most as large as the view's own.
-            full: Gives the photo and the mask as trained.
+            camera: A camera at most as large as the view's camera.
+            full: Returns the photo and the mask as trained.
         """
         sizes, before = _sizes(view.camera, camera), self._kept.pop(view.name, {})
         self._room += _bytes(before)
@@ -57,12 +57,12 @@ class ScaledPhotos:
 
 
 class DevicePhotos:
-    """Photos on a GPU, as uint8: of each view the size that was asked for last.
+    """A cache of photos on a GPU, as uint8: for each view, the last requested size.
 
     Args:
-        scaled: Makes the photos, in the machine's memory.
+        scaled: Makes the photos in host memory.
         device: The GPU.
-        mib: Its memory for them in MiB; what does not fit is copied there again for each step.
+        mib: GPU memory for photos in MiB; photos that do not fit are copied again for each step.
     """
 
     def __init__(self, scaled: ScaledPhotos, device: torch.device, mib: int) -> None:
@@ -77,7 +77,7 @@ class DevicePhotos:
         return here or self._scaled.holds(view, camera)
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """See `ScaledPhotos.get`; `full` gives the photo in the machine's memory."""
+        """See `ScaledPhotos.get`; `full` returns the photo in host memory."""
         size = camera.width, camera.height
         held = self._kept.get(view.name)
         if held is not None and held[0] == size:
@@ -93,18 +93,18 @@ class DevicePhotos:
 
 
 def on_device(pair: Pair, device: torch.device) -> Pair:
-    """A photo and its mask on a device."""
+    """Return a photo and its mask on a device."""
     image, mask = pair
     moved = None if mask is None else mask.to(device, non_blocking=True)
     return image.to(device, non_blocking=True), moved
 
 
 def _sizes(full: Camera, wanted: Camera) -> list[_Size]:
-    """The sizes from the full one, left out, down to the wanted one.
+    """Return the sizes to compute, from the full size (not included) down to the wanted size.
 
-    At most one lies between them: the smallest of the halved sizes that is not below what is
-    wanted. A halved size that is itself wanted is made from the photo too, so that it is the same
-    whatever it was made for.
+    There is at most one size in between: the smallest halved size that is not below the wanted
+    size. If the wanted size is itself a halved size, it is made from the photo, so that it does not
+    depend on earlier requests.
     """
     halved, size = (full.width, full.height), (full.width, full.height)
     wanted_size = (wanted.width, wanted.height)
@@ -119,10 +119,10 @@ def _bytes(made: dict[_Size, Pair]) -> int:
 
 
 def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair:
-    """Image and mask averaged by area: each new pixel is the mean of what it covers.
+    """Return image and mask reduced by area: each new pixel is the mean of the area that it covers.
 
-    Pixels that do not count are left out of the means; a new pixel counts where at least half of
-    what it covers does. One thread does it in a fixed order, so that no bit depends on threads.
+    Pixels that do not count are left out of the means. A new pixel counts if at least half of its
+    area counts. A single thread works in a fixed order, so that the bits do not depend on threads.
 
     Args:
         image: [H, W, 3] uint8.
@@ -142,10 +142,10 @@ def reduced(image: Tensor, mask: Tensor | None, width: int, height: int) -> Pair
 
 @contextmanager
 def decoded_meanwhile(scene: Scene) -> Iterator[None]:
-    """Decodes the scene's photos in a thread as long as the block runs, the held-out ones first.
+    """Decode the scene's photos in a thread while the block runs, held-out photos first.
 
-    They stay where decoded photos are kept, as far as there is room. A photo that cannot be decoded
-    is left alone; the next access to it raises the error.
+    The decoded photos stay in the photo cache if they fit. A photo that cannot be decoded is
+    skipped; the next access to it raises the error.
     """
     over = Event()
     thread = Thread(target=_decode, args=(scene, over), name="crossgrad-photos", daemon=True)

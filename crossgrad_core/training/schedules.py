@@ -1,4 +1,4 @@
-"""The schedule of a run, and what is said where it leaves density control out."""
+"""The schedule of a run, and the note for a run without density control."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,10 +20,12 @@ _EDITS = ("densify_from", "densify_until", "densify_every")
 def schedule_of(
     config: RunConfig, densifier: Densifier, steps: int, counting: Counting
 ) -> Schedule:
-    """The schedule of a run of `steps` steps: the densifier's times, then what is set.
+    """Return the schedule of a run of `steps` steps.
+
+    The densifier chooses the times of edits, and explicit settings override them.
 
     Args:
-        config: The configuration; of its settings, those of edits and of SH bands count.
+        config: The configuration; its settings of schedule, edits and SH bands are used.
         densifier: The densifier.
         steps: Length of the run.
         counting: Views of the steps, and photos.
@@ -34,7 +36,7 @@ def schedule_of(
     )
     schedule = densifier.window(Schedule.for_run(steps, config.schedule, counting))
     edits = _given(config, _EDITS)
-    # Another schedule than the run's own may be longer than the run.
+    # A schedule that is not stretched to the run may be longer than the run.
     length = min(schedule.length, schedule.counted(schedule.total))
     schedule = replace(
         schedule,
@@ -43,7 +45,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # What the user sets stays, whatever the length.
+    # Settings of the user do not change with the length.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 
@@ -52,14 +54,14 @@ def _given(config: RunConfig, names: tuple[str, ...]) -> Mapping[str, Any]:
 
 
 def notes_on_length(setup: Setup) -> tuple[str, ...]:
-    """What is noted about a run of this length."""
+    """Return the notes about a run of this length."""
     resolution = setup.selection.resolution
     messages = resolution.messages(setup.schedule)
     return (*growth_note(setup), *messages)
 
 
 def growth_note(setup: Setup) -> tuple[str, ...]:
-    """Says that density control is left out, where the run is too short for it."""
+    """Return a note if the run is too short for density control, else nothing."""
     schedule = setup.schedule
     if not setup.densifier.edits or schedule.grows:
         return ()

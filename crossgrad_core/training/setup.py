@@ -1,4 +1,4 @@
-"""The parts of a run once its configuration is resolved; training changes nothing here."""
+"""The parts of a run after its configuration is resolved; training does not change them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -38,8 +38,8 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 def learns_in(step: int, every: int) -> bool:
     """Return True if a tensor that learns in one of `every` steps learns in this one.
 
-    The step is drawn by lot from each `every` steps: where samplers go through photos or regimes
-    by turns, none of them is left out.
+    One step of each `every` steps is chosen by a hash. So no photo or regime is left out if a
+    sampler cycles through photos or regimes.
     """
     turn, place = divmod(step - 1, every)
     return place == hash32(turn) * every >> 32
@@ -47,13 +47,14 @@ def learns_in(step: int, every: int) -> bool:
 
 @dataclass(frozen=True)
 class Scale:
-    """The scale of an operator's answer at one K, by tensor name.
+    """The scale of an operator's result at one K, by tensor name.
 
     Attributes:
-        per_step: c(K), what it makes of K equal gradients: K for their sum, 1 for their mean.
+        per_step: c(K), the factor for K equal gradients: K for their sum, 1 for their mean.
         per_view: c(K) / K.
-        to_sum: K / |c(K)|, what brings the answer to the scale of the views' sum. Adam sees that
-            one, as its eps and the limits of its arithmetic are absolute.
+        to_sum: K / |c(K)|, the factor that brings the result to the scale of the views' sum. Adam
+            receives the scaled result, because its eps and the limits of its arithmetic are
+            absolute.
     """
 
     per_step: Mapping[str, float]
@@ -62,20 +63,19 @@ class Scale:
 
     @classmethod
     def of(cls, sums: Mapping[str, float], views: int) -> "Scale":
-        """The scale of an operator with these c(K) at K = `views`."""
+        """Return the scale of an operator with these c(K) at K = `views`."""
         shares = {name: value / views for name, value in sums.items()}
-        # An operator that answers equal gradients with zero has no scale to follow.
+        # An operator that returns zero for equal gradients has no scale.
         to_sum = {name: 1.0 / (abs(share) or 1.0) for name, share in shares.items()}
         return cls(sums, shares, to_sum)
 
 
 class OperatorScale:
-    """c(K), the sum of an operator's weights for K equal gradients in a neutral context.
+    """The factors c(K), the sums of an operator's weights for K equal gradients.
 
-    The operator is asked once for each K and its labels, with K equal gradients of one element per
-    tensor, without memory and with nothing that tells the views apart but their labels. So every
-    operator has a scale: chains, one operator per block, those that work on elements, and a third
-    party's.
+    The operator is called once for each combination of K and labels, with K equal gradients of one
+    element per tensor, without state. The views differ in their labels only. This defines a scale
+    for every operator: chains, one operator per block, element-wise operators and plugins.
 
     Args:
         operator: The operator.
@@ -86,10 +86,10 @@ class OperatorScale:
         self._known: dict[tuple[int, tuple[str, ...] | None], Scale] = {}
 
     def of(self, context: AggregateContext) -> Scale:
-        """The scale for the K and the labels of this step.
+        """Return the scale for the K and the labels of this step.
 
         Raises:
-            UserError: The operator's answer to equal gradients is not finite.
+            UserError: The operator's result for equal gradients is not finite.
         """
         key = (len(context.losses), context.labels)
         if key not in self._known:
@@ -117,7 +117,7 @@ class OperatorScale:
 
 
 def neutral(context: AggregateContext) -> AggregateContext:
-    """The first step of K views, all at full size and alike in gradients, losses and distances."""
+    """Return a context of step 1 with K views of equal size, gradients, losses and distances."""
     views = len(context.losses)
     names = [name for block in context.blocks for name in block.tensors]
     unit = {name: torch.ones(1, dtype=torch.float64) for name in names}
@@ -138,21 +138,22 @@ class Setup:
     """The resolved run.
 
     Attributes:
-        config: The configuration with every decision filled in.
+        config: The configuration, with all decisions included.
         scene: The scene.
         selection: The chosen components.
         manager: This run's plugin manager.
         plugins: Every registered plugin by name.
         groups: Label of each training view, or None.
         schedule: The schedule.
-        device: Where tensors live.
-        notes: What was chosen or left out, and why.
-        scaled_photos: Where photos of smaller sizes, and those on a GPU, are kept.
-        photos_ahead: The threads that decode photos beside the steps.
+        device: Device of the tensors.
+        notes: Messages about choices and omissions, with reasons.
+        scaled_photos: Cache of reduced photos and of photos on a GPU.
+        photos_ahead: The threads that decode photos in parallel with the steps.
         decisions: The table of decided settings.
-        decide: Makes the table for another length; a run that repeats another one decides nothing.
-        revised: The settings that the clock has changed with the length of the run.
-        pixel_share: Share of the time of a full-size step that goes with its pixels, as probed.
+        decide: Makes the table for another length; a run that repeats another run decides nothing.
+        revised: Settings that changed because the clock changed the length of the run.
+        pixel_share: Share of the time of a full-size step that is proportional to its pixels, as
+            measured.
     """
 
     config: RunConfig
@@ -173,7 +174,7 @@ class Setup:
 
     @cached_property
     def in_force(self) -> RunConfig:
-        """The configuration with the settings that the clock has changed."""
+        """The configuration, including the settings that the clock changed."""
         return self.config.model_copy(update=dict(self.revised))
 
     @cached_property
@@ -182,7 +183,7 @@ class Setup:
         return Numbers.of(self.in_force)
 
     def following(self, steps: int, start: int | None) -> dict[str, Any]:
-        """The settings that follow the length of the run, if it has so many steps in all.
+        """Return the values that length-dependent settings have for a total of `steps` steps.
 
         Args:
             steps: Steps of the run.
@@ -192,11 +193,11 @@ class Setup:
         return {row.setting: row.value for row in rows if row.setting in FOLLOWING}
 
     def at_length(self, steps: int, start: int | None) -> "Setup":
-        """The run with the settings that it has in another length."""
+        """Return the run with the settings for another length."""
         return replace(self, revised={**self.revised, **self.following(steps, start)})
 
     def with_rules(self, rules: Mapping[str, Rule]) -> "Setup":
-        """The run with these rules in place of its own."""
+        """Return the run with these rules in place of its own rules."""
         if rules == self.selection.rules:
             return self
         others = {n: each for n, each in self.plugins.items() if not isinstance(each, Rule)}
@@ -236,12 +237,12 @@ class Setup:
 
     @property
     def exposure(self) -> Exposure:
-        """What cameras do to light."""
+        """The exposure, which models how a camera changes light."""
         return self.selection.exposure
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
-        """What is measured of held-out views."""
+        """The metrics of held-out views."""
         return tuple(self.selection.metrics.values())
 
     @cached_property
@@ -271,7 +272,7 @@ class Setup:
 
     @cached_property
     def per_photo(self) -> Mapping[str, PerPhoto]:
-        """The parameters that every training photo has a value of."""
+        """The parameters with one value per training photo."""
         return self.exposure.per_photo(self.scene)
 
     @cached_property
@@ -281,18 +282,18 @@ class Setup:
 
     @cached_property
     def watchers(self) -> tuple[str, ...]:
-        """Names of the plugins that look at the gradients of single views."""
+        """Names of the plugins that read the gradients of single views."""
         wants = "needs_separate_gradients"
         return tuple(name for name, plugin in self.plugins.items() if getattr(plugin, wants, False))
 
     @cached_property
     def separate(self) -> bool:
-        """Whether the views' gradients are kept apart."""
+        """Whether the gradients of the views are stored separately."""
         return self.operator.separate or bool(self.watchers)
 
     @cached_property
     def operator_scale(self) -> OperatorScale:
-        """What the operator makes of equal gradients."""
+        """The scale of the operator's result for equal gradients."""
         return OperatorScale(self.operator)
 
     @cached_property
@@ -302,10 +303,10 @@ class Setup:
 
     @cached_property
     def sparse_rows(self) -> Mapping[str, str]:
-        """Field of the Gaussians -> tensor whose steps wait until a row is drawn."""
+        """Field of the Gaussians -> tensor whose Adam steps are deferred until a row is drawn."""
         trained = {name for block in self.trained_blocks for name in block.tensors}
-        # Who looks at the model after each step reads every row, and a wrapper of the aggregation
-        # computes with dense gradients.
+        # A plugin that reads the model after each step needs every row, and a wrapper of the
+        # aggregation needs dense gradients.
         whole = self.joint or self.shows_model or self.device.type != "cpu"
         wrapped = len(self.hook.crossgrad_aggregate_gradients.get_hookimpls()) > 1
         if whole or wrapped or not (self.rasterizer.sparse_rows and self.operator.sparse_rows):
@@ -315,10 +316,10 @@ class Setup:
 
     @cached_property
     def update_intervals(self) -> Mapping[str, int]:
-        """Trained tensor -> N, of those that learn in one of N steps.
+        """Trained tensor -> N, for tensors that learn in one of N steps.
 
         Raises:
-            UserError: A plugin names another tensor, or no number from 1 on.
+            UserError: A plugin names another tensor, or N is not a whole number of at least 1.
         """
         hook = self.hook.crossgrad_update_intervals
         trained = {name for block in self.trained_blocks for name in block.tensors}
@@ -329,7 +330,7 @@ class Setup:
         return found
 
     def resting(self, step: int) -> frozenset[str]:
-        """The tensors that do not learn in a step."""
+        """Return the names of the tensors that do not learn in a step."""
         intervals = self.update_intervals.items()
         return frozenset(name for name, every in intervals if not learns_in(step, every))
 
@@ -340,7 +341,7 @@ class Setup:
 
     @cached_property
     def shows_model(self) -> bool:
-        """Whether any plugin looks at the model after a step."""
+        """Whether any plugin reads the model after a step."""
         return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
@@ -350,7 +351,7 @@ class Setup:
 
     @cached_property
     def follows_steps(self) -> bool:
-        """Whether any plugin follows the parameters from step to step."""
+        """Whether any plugin updates a state after each complete step."""
         return bool(self.hook.crossgrad_step_done.get_hookimpls())
 
     @cached_property
@@ -360,14 +361,14 @@ class Setup:
 
     @cached_property
     def gaussians_hooks(self) -> tuple[pluggy.HookCaller, ...]:
-        """The plugins that change the Gaussians of training views, each by itself."""
+        """The hooks of plugins that change the Gaussians of training views, one per plugin."""
         return one_by_one(self.manager, "crossgrad_view_gaussians")
 
     @cached_property
     def optimizer_hooks(self) -> tuple[pluggy.HookCaller, ...]:
-        """The plugins that act after the optimizer, each by itself."""
+        """The hooks of plugins that act after the optimizer, one per plugin."""
         return one_by_one(self.manager, "crossgrad_after_optimizer")
 
     def phase(self, step: int, *, training: bool) -> Phase:
-        """The phase that a backbone decodes in."""
+        """Return the phase in which a backbone decodes."""
         return Phase(step, training, self.schedule)

@@ -1,4 +1,4 @@
-"""The first state of a run, and compiling what it needs."""
+"""The first state of a run, and the compilation of its kernels."""
 
 import json
 import logging
@@ -48,17 +48,17 @@ from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import ordered
 from crossgrad_core.wording import in_one_line, listed
 
-#: Seconds that the other process is waited for once this one has nothing left to compile.
+#: Seconds to wait for the other process after this process has compiled everything.
 _PATIENCE: Final = 60.0
 
 
 @contextmanager
 def compiling_beside(setup: Setup) -> Iterator[None]:
-    """Starts the other process with the first kernel that is missing, and waits for it at last.
+    """Compile kernels in a second process, which starts at the first missing kernel.
 
-    Not where this one has one core, or one thread, to itself, and not for a GPU. At last, with or
-    without that process, all kernels of steps by rows are in memory here: whether a view draws few
-    rows or many, which have kernels of their own, is found out on the clock.
+    The second process is not used with a single core or thread, or for a GPU. At the end of the
+    block, this process waits for it. Then all kernels for sparse rows are loaded here, because few
+    and many rows use different kernels, and a view of either kind may first occur during training.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -74,7 +74,7 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
         with notes_on_missing(start):
             yield
         for process in processes:
-            # One that hangs, in a plugin's import perhaps, keeps no run from training.
+            # A hanging process, for example in a plugin's import, must not block the run.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_PATIENCE)
         if setup.sparse_rows:
@@ -86,7 +86,7 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
 
 
 def compile_all(loss: ComponentChoice) -> None:
-    """Compiles what a loss and the optimizer need, on numbers that mean nothing."""
+    """Compile the kernels of a loss and the optimizer with dummy data."""
     photo = torch.zeros((64, 64, 3), dtype=torch.uint8)
     render = torch.full((64, 64, 3), 0.5, requires_grad=True)
     measured = build(Loss, loss.name, loss.options).loss(render, photo, None, None)
@@ -98,9 +98,9 @@ def compile_all(loss: ComponentChoice) -> None:
 
 
 def compile_rows() -> None:
-    """Compiles what steps by rows need, likewise."""
+    """Compile the kernels for optimizer steps of sparse rows with dummy data."""
     values, state, late = torch.zeros((8, 3)), AdamState(), Late()
-    # One row of many, another one, which is late by then, and so many that all are taken.
+    # One row, then another row with deferred steps, then enough rows for the kernel for all rows.
     for rows in ([1], [4], [1, 4, 6]):
         grad = sparse_rows(torch.tensor(rows), torch.ones((len(rows), 3)), values.shape)
         late.step(
@@ -114,24 +114,24 @@ if __name__ == "__main__":
 
 
 _LOG = logging.getLogger(__name__)
-#: Random initial points where a scene has none (`--init random`).
+#: Number of random initial points (`--init random`).
 RANDOM_POINTS = 20_000
-#: The share of a bound on primitives that a run begins with where its points would make more
-#: (docs/schedules.md), and under which name such a run keeps how many they would have been.
+#: Share of the bound on primitives at the start of a run whose points would make more
+#: (docs/schedules.md), and the name of the state that stores the original number.
 BEGINNING, THINNED = 2 / 3, "thinned"
-#: The share of points that are left, at most, for another try.
+#: Largest share of points that another attempt keeps.
 _LESS = 0.8
 
 
 def first_state(setup: Setup) -> TrainState:
-    """The state before the first step."""
+    """Return the state before the first step."""
     rngs = make_streams(setup.config.seed, names=(*STREAMS, *setup.selection.rules))
     created, crowd = initial_parameters(setup, rngs["create"])
     parameters = setup.densifier.started(created)
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # In one order of rows, as it comes out of a checkpoint: other orders round otherwise.
+        # Contiguous, as from a checkpoint, because another memory layout changes the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -148,16 +148,16 @@ def first_state(setup: Setup) -> TrainState:
 
 
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Parameters, int | None]:
-    """Parameters from the SfM points, from random points, or from a PLY of Gaussians.
+    """Return parameters made from SfM points, from random points, or from a PLY of Gaussians.
 
-    Where points would make more primitives than the user's bound, so many of them are drawn that
-    `BEGINNING` of the bound is there at first: what is left is for density control, which places
-    primitives where the photos ask for them. Without density control it is all of the bound. A PLY
-    is taken as it is.
+    If the points would make more primitives than the user's bound, points are drawn at random so
+    that the run starts with the share `BEGINNING` of the bound. The rest is left for density
+    control, which places primitives where the photos need them. Without density control, the run
+    starts with the full bound. A PLY is used unchanged.
 
     Returns:
-        The parameters, and the number of primitives that all points would have made where fewer
-        were taken.
+        The parameters, and the number of primitives that all points would have made; None if all
+        points were used.
     """
     data, scene = setup.config.data, setup.scene
     if data.init_file is not None:
@@ -175,23 +175,23 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     while made > bound and share * len(begun.points) >= 1.0:
         parameters = _made(setup, setup.backbone.create(thinned(begun, share, rng), rng), "create")
         made = primitives_of(setup.blocks, parameters)
-        # Where several points make one primitive, or one makes several, it takes more than one try.
+        # If the number of primitives per point is not 1, this takes more than one attempt.
         share *= min(_LESS, wanted / made)
     return parameters, present
 
 
 def _begun(setup: Setup) -> Scene:
-    """The scene with the points that the start adds.
+    """Return the scene with the points that the initializer adds.
 
     Raises:
-        UserError: They are none that primitives can be made of.
+        UserError: The points are not valid.
     """
     scene, initializer = setup.scene, setup.selection.initializer
     try:
         begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        initializer.more_points(scene)  # What the initializer itself raises comes through.
+        initializer.more_points(scene)  # An error of the initializer itself is raised here.
         wrong = in_one_line(error)
     if not wrong:
         return begun
@@ -206,7 +206,7 @@ def _begun(setup: Setup) -> Scene:
 
 
 def _misfit(begun: Scene, known: int) -> str:
-    """What is wrong with the points behind the known ones, in words; empty where nothing is."""
+    """Return what is wrong with the points after the first `known` ones; empty if all are valid."""
     points, sizes, opacities = begun.points[known:], begun.point_sizes, begun.point_opacities
     if sizes is None or opacities is None:
         return ""
@@ -225,10 +225,11 @@ def _misfit(begun: Scene, known: int) -> str:
 
 
 def _made(setup: Setup, answer: object, method: str) -> Parameters:
-    """The parameters that a method of the backbone answered with.
+    """Return the checked parameters from a method of the backbone.
 
     Raises:
-        UserError: They are none, or not those that its blocks name once it has prepared them.
+        UserError: The result is not a dictionary, or lacks tensors that the blocks name (after
+            `prepare`: any of them; before: the first per-primitive tensor).
     """
     parameters = answered(answer, dict, setup.backbone, method)
     per_primitive = [block.tensors for block in setup.blocks if block.per_primitive]
@@ -247,10 +248,10 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
 
 
 def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
-    """The scene with this share of its points, at least one, drawn at random.
+    """Return the scene with this share of its points, at least one, drawn at random.
 
-    Points that a start added, which have sizes of their own, are kept where they fit: each of them
-    stands for much that has no other point.
+    Points that an initializer added, which have sizes, are all kept if they fit, because each of
+    them covers a region without other points.
     """
     count = len(scene.points)
     wanted = max(1, round(share * count))
@@ -264,7 +265,7 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
 
 
 def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
-    """What to say of a start with fewer primitives than there were, or with more than asked for."""
+    """Return notes on a start with fewer primitives than possible, or with more than the bound."""
     kept, most = state.states.get(THINNED), setup.config.max_gaussians
     if kept is None:
         present = state.primitives(setup)
@@ -282,7 +283,7 @@ def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
 
 
 def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
-    """The scene with grey points uniform in a cube of three extents around the cameras."""
+    """Return the scene with random grey points, uniform in a cube of side 3 (local units)."""
     points = rng.uniform(-1.5, 1.5, (RANDOM_POINTS, 3))
     colors = np.full((RANDOM_POINTS, 3), 127, dtype=np.uint8)
     views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in scene.views)
@@ -290,38 +291,39 @@ def with_random_points(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 def unwatched(setup: Setup) -> Setup:
-    """The same run without observers and wrappers, which must not see steps that do not count."""
+    """Return the run without observers and wrappers, which must not see uncounted steps."""
     plugins = setup.selection.plugins
     return replace(setup, manager=make_manager(plugins), plugins=plugins)
 
 
 def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
-    """Compiles every kernel that the run will need, on throw-away states.
+    """Compile every kernel that the run needs, with temporary states.
 
-    Photos are decoded meanwhile: compilers run one at a time and leave the interpreter to others.
+    Photos are decoded at the same time, because compilers run one at a time and release the
+    interpreter.
 
     Args:
         setup: The run.
-        reached: The state of a resumed run, which stays as it is.
+        reached: The state of a resumed run, which is not changed.
 
     Returns:
-        The seconds that it took.
+        The time in seconds.
 
     Raises:
-        UserError: The rasterizer does not draw rightly on this machine.
+        UserError: The rasterizer renders incorrectly on this machine.
     """
     _LOG.info("loading kernels")
     start = perf_counter()
     setup.rasterizer.self_test(str(setup.device))
     setup, schedule = unwatched(setup), setup.schedule
-    # A run of one step has no second one to be tried out with.
+    # A run of one step has no second step for a test.
     degrees = {max(schedule.sh_interval * degree, schedule.sh_wait) for degree in (1, 2, 3)}
     steps = [min(1, schedule.total - 1), *map(schedule.step_of, sorted(degrees))]
     if setup.densifier.needs:
-        # Once density control is over, its statistics are left out: other kernels.
+        # After the end of density control there are no statistics, which uses other kernels.
         steps.append(schedule.step_of(schedule.densify_until))
     if schedule.grows:
-        # An edit may draw, too.
+        # An edit may render, too.
         steps.append(schedule.first_edit - 1)
     with decoded_meanwhile(setup.scene), compiling_beside(setup):
         for step in steps:
@@ -330,7 +332,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
                 state.step = step
                 timed_step(setup, state)
                 if setup.sparse_rows and step == steps[0] and step + 1 < schedule.total:
-                    # Rows are behind from the second step on.
+                    # Rows have deferred steps from the second step on.
                     timed_step(setup, state)
     seconds = perf_counter() - start
     _LOG.debug("loaded kernels in %.1f s", seconds)
@@ -338,6 +340,6 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
 
 
 def initial_bytes(setup: Setup) -> int:
-    """Bytes of the initial parameters with their gradients and moments."""
+    """Return the bytes of the initial parameters with their gradients and moments."""
     parameters, _ = initial_parameters(setup, make_streams(setup.config.seed)["create"])
     return 4 * sum(tensor.numel() * tensor.element_size() for tensor in parameters.values())

@@ -1,4 +1,4 @@
-"""The running state of the loop: all that changes, and all that a checkpoint holds."""
+"""The state of the training loop: everything that changes and that a checkpoint contains."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams, restored_streams, stream_
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: What a budget counts: seconds of the clock on the wall, or of CPU time of the process.
+#: Unit of a time budget: wall-clock seconds, or CPU seconds of the process.
 ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
@@ -41,14 +41,14 @@ Phase = Literal[
     "density_control",
     "other",
 ]
-#: What a step spends time on: `photos` is choosing views and scales and having the photos at hand
-#: (decoding files is loading), `loss` has exposure, pixel weights and regularisation in it.
+#: Phases of a step. `photos` is the choice of views and scales and the access to photos (decoding
+#: files is loading). `loss` includes exposure, pixel weights and regularisation.
 PHASES: Final[tuple[Phase, ...]] = get_args(Phase)
 
 
 @dataclass
 class Clock:
-    """Seconds by what they were spent on; only `train` counts as training.
+    """Seconds by activity; only `train` counts as training.
 
     Attributes:
         train: Training.
@@ -56,10 +56,10 @@ class Clock:
         load: Reading the scene and decoding photos.
         evaluate: Evaluating held-out views.
         report: Writing results.
-        phases: Training seconds by phase of the step; together they are `train`. Work of a GPU, or
-            of the other threads alone, is counted in the phase that waits for it.
-        cpu: Seconds of CPU time that the process took while it trained, all threads together, but
-            for what others do between two steps where this clock is no budget.
+        phases: Training seconds by phase of the step; their sum is `train`. Work on a GPU or on
+            other threads is counted in the phase that waits for it.
+        cpu: CPU seconds of the process during training, for all threads. Work of other threads
+            between two steps is not included if this clock is not the budget.
     """
 
     train: float = 0.0
@@ -71,15 +71,15 @@ class Clock:
     cpu: float = 0.0
 
     def trained(self, kind: ClockKind) -> float:
-        """Training seconds of that kind."""
+        """Return the training seconds on this clock."""
         return self.cpu if kind == "cpu" else self.train
 
     def copy(self) -> "Clock":
-        """A copy that stays as it is."""
+        """Return an independent copy."""
         return replace(self, phases=dict(self.phases))
 
     def count(self, laps: "PhaseTimer") -> None:
-        """Adds a complete step."""
+        """Add the times of a complete step."""
         self.train += laps.total
         self.cpu += laps.cpu
         for phase in PHASES:
@@ -88,14 +88,15 @@ class Clock:
 
 @dataclass
 class PhaseTimer:
-    """The phases of the step under way; a step that is cut short counts for none.
+    """The phases of the present step; an interrupted step is not counted.
 
     Attributes:
-        border: When the present phase began.
-        total: Seconds from the start of the step to the last border, without what was left out.
+        phase_began: Time at which the present phase began.
+        total: Seconds from the start of the step to the end of the last phase, without excluded
+            seconds.
         spent: Phase -> seconds.
-        cpu: CPU seconds of the process from the start of the step to the last border, likewise.
-        cpu_border: CPU time of the process at the last border.
+        cpu: CPU seconds of the process in the same time, without excluded seconds.
+        cpu_border: CPU time of the process at the end of the last phase.
     """
 
     phase_began: float = field(default_factory=perf_counter)
@@ -105,7 +106,7 @@ class PhaseTimer:
     cpu_border: float = field(default_factory=process_time)
 
     def lap(self, phase: Phase) -> None:
-        """Ends a phase here: the seconds since the last border were spent on it."""
+        """End a phase: add the time since the end of the last phase to it."""
         now = perf_counter()
         seconds = now - self.phase_began
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
@@ -116,11 +117,11 @@ class PhaseTimer:
         self.cpu_border = cpu
 
     def leave_out(self, seconds: float, cpu: float) -> None:
-        """Does not count seconds of the present phase: they belong to another clock.
+        """Exclude seconds from the present phase, because they belong to another clock.
 
         Args:
-            seconds: Seconds on the wall.
-            cpu: Seconds of CPU time in them.
+            seconds: Wall-clock seconds.
+            cpu: CPU seconds in this time.
         """
         self.phase_began += seconds
         self.cpu_border += cpu
@@ -134,7 +135,7 @@ class Counters:
         views: Rendered training views.
         backward_passes: Backward passes.
         dropped: Blocks of views that were dropped because their gradient was not finite.
-        peak_primitives: The most primitives that there were after a step.
+        peak_primitives: Largest number of primitives after any step.
     """
 
     views: int = 0
@@ -148,19 +149,19 @@ class TrainState:
     """Everything that a step reads and writes.
 
     Attributes:
-        tensors: The parameters as they lie in memory: rows may be late with steps of Adam, and a
-            step may be under way on other threads.
-        moments: The optimizer's moments, likewise.
+        tensors: The parameters as stored in memory. Some rows may have deferred Adam steps, and a
+            step may still run on other threads.
+        moments: The optimizer's moments, under the same conditions.
         rngs: Stream name -> its generator.
         states: Plugin name -> its state.
-        step: Steps done, the one under way included.
+        step: Number of steps, including the present one.
         last: Record of the last complete step.
-        counters: What was done so far.
+        counters: Counts of the work so far.
         clock: Seconds so far.
-        laps: What the step under way has spent its time on.
-        rewinds: How often training went back to the last good state.
-        touched: Whether a step that is not complete has begun to change parameters or moments.
-        late: The steps that rows are late with, and those under way.
+        laps: Phases of the present step.
+        rewinds: How often training was rewound to the last good state.
+        touched: Whether an incomplete step has begun to change parameters or moments.
+        late: The deferred steps of rows, and the steps that still run on other threads.
     """
 
     tensors: Parameters
@@ -178,7 +179,7 @@ class TrainState:
 
     @property
     def parameters(self) -> Parameters:
-        """Tensor name -> parameter, with all steps taken."""
+        """Tensor name -> parameter, after all deferred steps."""
         self.settle()
         return self.tensors
 
@@ -189,7 +190,7 @@ class TrainState:
 
     @property
     def adam(self) -> AdamState:
-        """The optimizer's moments, with all steps taken."""
+        """The optimizer's moments, after all deferred steps."""
         self.settle()
         return self.moments
 
@@ -200,31 +201,31 @@ class TrainState:
 
     @property
     def current(self) -> Mapping[str, Tensor]:
-        """The parameters, each with all steps taken once it is read."""
+        """The parameters; deferred steps of a tensor are applied when it is read."""
         return _Current(self)
 
     def settle(self, names: Iterable[str] | None = None) -> None:
-        """Takes the steps that rows of these tensors, by default of all, are late with."""
+        """Apply the deferred steps of these tensors, by default of all tensors."""
         for name in self.late.names.intersection(self.late.names if names is None else names):
             self.late.catch_up(name, self.tensors[name], self.moments)
 
     def primitives(self, setup: Setup) -> int:
-        """Number of primitives."""
+        """Return the number of primitives."""
         return primitives_of(setup.blocks, self.tensors)
 
     def commit(self, states: Mapping[str, PluginState]) -> None:
-        """Takes over states of the core."""
+        """Store states of the core."""
         self.states.update(states)
 
     def accept(self, states: Mapping[str, PluginState], hook: HookCaller) -> None:
-        """Takes over the states that plugins answered a hook with.
+        """Check and store the states that plugins returned from a hook.
 
         Args:
             states: Name -> state.
-            hook: The hook; a slot's name is its component's where that has the hook.
+            hook: The hook; a component that implements it may use the name of its slot.
 
         Raises:
-            UserError: A name belongs to a slot or to the core, or a state is none.
+            UserError: A name belongs to a slot or to the core, or a state is not valid.
         """
         if not isinstance(states, Mapping):
             raise _no_states(hook, "its states", "a mapping of names to PluginState", states)
@@ -253,9 +254,9 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """What of a state a checkpoint cannot hold, in words; empty where it can hold all.
+    """Return what in a state a checkpoint cannot store; empty if it can store everything.
 
-    To be cheap in each step it looks at those names only that the state `known` does not have.
+    To be fast in each step, it checks only names that are not in the state `known`.
     """
     for kind in ("values", "tensors", "per_primitive"):
         have = getattr(known, kind)
@@ -269,7 +270,7 @@ def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -
 
 
 def no_json(value: object) -> str:
-    """Which part of a value JSON would change on the way; empty where it changes none."""
+    """Return the part of a value that JSON cannot store unchanged; empty if there is none."""
     if isinstance(value, dict):
         odd = (f"the key {key!r}" for key in value if not isinstance(key, str))
         return next(odd, "") or no_json(list(value.values()))
@@ -280,7 +281,7 @@ def no_json(value: object) -> str:
 
 
 def _odd(value: object, device: str) -> str:
-    """What something is that should be a tensor that a file can hold; empty where it is."""
+    """Return how a value differs from a tensor that a file can store; empty if it is storable."""
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
     plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
@@ -289,7 +290,7 @@ def _odd(value: object, device: str) -> str:
 
 
 def _answering(hook: HookCaller) -> list[str]:
-    """Names of the plugins that have a hook."""
+    """Return the names of the plugins that implement a hook."""
     return [each.plugin_name for each in hook.get_hookimpls()]
 
 
@@ -304,7 +305,7 @@ def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> Use
 
 
 class _Current(Mapping[str, Tensor]):
-    """Tensor name -> parameter; what is read has taken all steps of Adam. A copy is a dict."""
+    """Tensor name -> parameter; reading applies deferred Adam steps. A copy is a plain dict."""
 
     def __init__(self, state: TrainState) -> None:
         self._state = state
@@ -329,9 +330,9 @@ class _Current(Mapping[str, Tensor]):
 
 @dataclass(frozen=True, eq=False)
 class StepSnapshot:
-    """All that a step changes besides parameters and moments, as it was at one moment.
+    """Everything that a step changes except parameters and moments, at one moment.
 
-    Plugin states and records are values and need no copy.
+    Plugin states and records are immutable values and need no copy.
     """
 
     step: int
@@ -344,7 +345,7 @@ class StepSnapshot:
 
     @classmethod
     def of(cls, state: TrainState) -> "StepSnapshot":
-        """The mark of this moment."""
+        """Return a snapshot of the present moment."""
         return cls(
             step=state.step,
             last=state.last,
@@ -356,7 +357,7 @@ class StepSnapshot:
         )
 
     def restore(self, state: TrainState) -> None:
-        """Puts all that back, the random streams to where they were included."""
+        """Restore everything, including the positions of the random streams."""
         state.step = self.step
         state.last = self.last
         state.states = dict(self.states)
@@ -376,7 +377,7 @@ class Snapshot:
 
     @classmethod
     def of(cls, state: TrainState) -> "Snapshot":
-        """A deep copy of what training changes."""
+        """Return a deep copy of everything that training changes."""
         return cls(
             parameters={name: t.detach().clone() for name, t in state.parameters.items()},
             adam=copied_moments(state.adam),
@@ -384,7 +385,7 @@ class Snapshot:
         )
 
     def restore(self, state: TrainState, seed: int) -> None:
-        """Puts `state` back, with fresh random streams so that the same draw does not recur."""
+        """Restore `state` with new random streams, so that the same draws do not occur again."""
         state.late.forget()
         state.tensors = self._tensors(state, {n: t.clone() for n, t in self.parameters.items()})
         state.moments = copied_moments(self.adam)
@@ -395,10 +396,10 @@ class Snapshot:
         state.rngs = make_streams(seed, state.rewinds, state.rngs)
 
     def hand_over(self, state: TrainState) -> None:
-        """Puts `state` back as it was, so that it goes on as if nothing had happened since.
+        """Restore `state` exactly, including the random streams.
 
-        The copy itself becomes its tensors, as memory may be what has run out: nothing is left to
-        go back to.
+        `state` gets the tensors of the copy itself, because memory may be short. The copy cannot be
+        used again.
         """
         state.late.forget()
         state.tensors = self._tensors(state, self.parameters)
@@ -407,13 +408,13 @@ class Snapshot:
 
     @staticmethod
     def _tensors(state: TrainState, copies: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Copies as the state has them: those that learn ask for gradients."""
+        """Return the copies with the same `requires_grad` as the tensors of the state."""
         learns = {name: tensor.requires_grad for name, tensor in state.tensors.items()}
         return {name: each.requires_grad_(learns[name]) for name, each in copies.items()}
 
 
 def copied_moments(adam: AdamState) -> AdamState:
-    """A deep copy."""
+    """Return a deep copy."""
     return AdamState(
         exp_avg={name: tensor.clone() for name, tensor in adam.exp_avg.items()},
         exp_avg_sq={name: tensor.clone() for name, tensor in adam.exp_avg_sq.items()},
@@ -426,8 +427,8 @@ class NonFiniteError(Exception):
 
     Args:
         step: Step in which it was found.
-        views: Names of the views of that step (the one view, where it can be told).
-        block: What is not finite.
+        views: Names of the views of that step, or of the single view if it is known.
+        block: Description of the value that is not finite.
     """
 
     def __init__(self, step: int, views: tuple[str, ...], block: str) -> None:
@@ -441,17 +442,17 @@ class NonFiniteError(Exception):
 
 
 class TrainingFailedError(Exception):
-    """Training cannot go on; the results so far and the last checkpoint are kept."""
+    """Training cannot continue; the results so far and the last checkpoint are kept."""
 
 
 def are_parameters_finite(state: TrainState) -> bool:
-    """Whether no parameter is NaN or infinite."""
+    """Return True if no parameter is NaN or infinite."""
     state.late.finish()
     return all(is_finite(tensor) for tensor in state.tensors.values())
 
 
 def check_parameters(state: TrainState) -> None:
-    """Raises NonFiniteError where a parameter is NaN or infinite after a step."""
+    """Raise NonFiniteError if a parameter is NaN or infinite after a step."""
     state.late.finish()
     for name, tensor in state.tensors.items():
         if not is_finite(tensor):
@@ -460,7 +461,7 @@ def check_parameters(state: TrainState) -> None:
 
 
 def check_start(state: TrainState) -> None:
-    """Refuses to train from a state that is bad already: nothing could be gone back to.
+    """Check the state at the start of training, before which there is no state to restore.
 
     Raises:
         TrainingFailedError: A parameter or moment is NaN or infinite; names it.
@@ -486,7 +487,7 @@ def _way_out(step: int) -> str:
 
 
 def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
-    """Stops a run that had to drop too many non-finite gradients."""
+    """Raise TrainingFailedError if too many non-finite gradients were dropped."""
     if state.counters.dropped >= setup.config.max_nonfinite_blocks:
         raise TrainingFailedError(
             f"{state.counters.dropped} blocks of single views were dropped because their gradient "
@@ -495,14 +496,14 @@ def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
 
 
 class RollbackGuard:
-    """Holds the state before the step under way, and a copy of an earlier good one.
+    """The state before the present step, and a copy of an earlier good state.
 
-    Most of what can go wrong in a step (sampling, a photo, rendering, an operator, the memory)
-    does so before parameters change: then only the step under way is lost. Where an optimizer step
-    or an edit was cut short, the copy takes their place. Only a state that was looked at is copied.
+    Most errors of a step (sampling, a photo, rendering, an operator, the memory) occur before
+    parameters change. Then only the present step is lost. If an optimizer step or an edit was
+    interrupted, the copy is restored. Only checked states are copied.
 
     Args:
-        state: The state that training starts from, which was looked at.
+        state: The state at the start of training, already checked.
     """
 
     def __init__(self, state: TrainState) -> None:
@@ -512,10 +513,10 @@ class RollbackGuard:
         state.touched = False
 
     def commit(self, state: TrainState, *, look: bool = False) -> None:
-        """Notes that a step is complete.
+        """Record that a step is complete.
 
         Raises:
-            NonFiniteError: `look` was asked for, and a parameter is NaN or infinite.
+            NonFiniteError: `look` is True, and a parameter is NaN or infinite.
         """
         if look:
             self.check(state)
@@ -523,17 +524,17 @@ class RollbackGuard:
         state.touched = False
 
     def check(self, state: TrainState) -> None:
-        """Looks at the parameters, unless that was done after this very step.
+        """Check the parameters, unless they were already checked after this step.
 
         Raises:
-            NonFiniteError: One of them is NaN or infinite.
+            NonFiniteError: A parameter is NaN or infinite.
         """
         if self._looked != state.step:
             check_parameters(state)
             self._looked = state.step
 
     def copy(self, state: TrainState) -> None:
-        """Takes this state as the one to go back to.
+        """Copy this state as the state to restore after an error.
 
         Raises:
             NonFiniteError: A parameter is NaN or infinite.
@@ -542,15 +543,15 @@ class RollbackGuard:
         self._snapshot = Snapshot.of(state)
 
     def rewind(self, state: TrainState, seed: int) -> None:
-        """Puts `state` back to the copy, with fresh random streams."""
+        """Restore `state` from the copy, with new random streams."""
         self._snapshot.restore(state, seed)
         self._looked = state.step
         self.commit(state)
 
     def restore(self, state: TrainState) -> None:
-        """Puts `state` back to the last complete step, or further back to the copy.
+        """Restore `state` to the last complete step or, if this is impossible, to the copy.
 
-        It is for the end of training: there may be no copy afterwards.
+        This is for the end of training, because the copy may be used up.
         """
         for tensor in state.tensors.values():
             tensor.grad = None
@@ -562,8 +563,8 @@ class RollbackGuard:
 
 
 def is_whole(state: TrainState) -> bool:
-    """Whether all parameters are finite, as far as the machine lets it be seen."""
+    """Return True if all parameters are finite; False if they are not or cannot be checked."""
     try:
         return are_parameters_finite(state)
-    except Exception:  # Its last step has failed, there is no memory for it, or the GPU failed.
+    except Exception:  # The last step failed, there is no memory for the check, or the GPU failed.
         return False

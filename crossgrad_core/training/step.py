@@ -70,7 +70,7 @@ from crossgrad_core.wording import listed
 
 
 def model_of(setup: Setup, state: TrainState) -> Model:
-    """The model as it is after the last step, shared, not copied."""
+    """Return the model after the last step; it shares its tensors with `state`."""
     return Model(
         phase=setup.phase(state.step, training=True),
         scene=setup.scene,
@@ -87,15 +87,15 @@ def model_of(setup: Setup, state: TrainState) -> Model:
     )
 
 
-#: Name of the state that holds the labels, and of their stream of random numbers.
+#: Name of the state that contains the labels, and of their stream of random numbers.
 GROUPING = "grouping"
 _LABELS = "labels"
 
 
 def regroup_if_due(setup: Setup, state: TrainState) -> None:
-    """Groups the training views anew where the step that was done last is the one for it.
+    """Group the training views again if the last completed step is `refit_after`.
 
-    The sampler starts afresh: what it remembers (decks of views, turns) is about the old groups.
+    The state of the sampler is reset, because it refers to the old groups.
     """
     grouping = setup.selection.grouping
     if not isinstance(grouping, Regrouping) or state.step != grouping.refit_after:
@@ -108,7 +108,7 @@ def regroup_if_due(setup: Setup, state: TrainState) -> None:
 
 
 def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
-    """The labels of the training views by the rule of the grouping of that name, one for each."""
+    """Return one label for each training view, by the rule of the grouping `name`."""
     labels, views = tuple(rule.labels(scene.train_views)), scene.train_views
     if len(labels) == len(views):
         return labels
@@ -120,30 +120,30 @@ def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
 
 
 def groups_of(setup: Setup, state: TrainState) -> tuple[str, ...] | None:
-    """The label of each training view now; None where there is no grouping."""
+    """Return the present label of each training view; None without a grouping."""
     known = state.states.get(GROUPING, EMPTY_STATE).values.get(_LABELS)
     return tuple(map(str, known)) if isinstance(known, list) else setup.groups
 
 
-#: Name of the stream that all random numbers of further views come from.
+#: Name of the stream for all random numbers of extra views.
 STREAM = "density"
 
 
 def observed_views(
     setup: Setup, state: TrainState, records: Sequence[ViewRecord]
 ) -> tuple[ViewRecord, ...]:
-    """Of the views of a step those that density control gets, and a further one where it is due.
+    """Return the views that density control receives, with an extra view if it is due.
 
     Raises:
-        NonFiniteError: The loss of the further view is not finite.
+        NonFiniteError: The loss of the extra view is not finite.
     """
     if setup.config.densify_views == "one":
-        # Each place of a draw in turn, as samplers may always put the same group first.
+        # Use each position in turn, because a sampler may always put the same group first.
         return (records[state.step % len(records)],)
     wanted = setup.schedule.grows and setup.schedule.collects(state.step)
     if setup.config.densify_views != "extra" or not wanted:
         return tuple(records)
-    # Whatever is drawn for the further view, its background and what plugins draw included.
+    # All random numbers of the extra view, its background and plugins come from this stream.
     streams, states = dict.fromkeys(state.rngs, state.rngs[STREAM]), dict(state.states)
     state = replace(state, rngs=streams, states=states)
     index = int(state.rngs[STREAM].integers(len(setup.train_views)))
@@ -152,13 +152,13 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Primitives from which on they are put in order: of 59 parameters each and their moments, 12 MB.
+#: Fewest primitives that are sorted; with 59 parameters each, parameters and moments take 12 MB.
 FEWEST_SORTED = 2**14
-#: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame (of which the
-#: cameras span about one): farther away than 128 units all is one cell.
+#: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame. The cameras
+#: span about one unit; positions farther away than 128 units are clamped to the border cells.
 _BITS = 21
 _CELLS = 2**13
-#: Shifts and masks that put two zeros between the bits of a number, from Morton's interleaving.
+#: Shifts and masks that insert two zeros between the bits of a number (Morton interleaving).
 _SPREAD = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -169,7 +169,7 @@ _SPREAD = (
 
 
 def along_curve(positions: Tensor) -> Tensor:
-    """[N] int64: rows of `positions` [N, 3] (local frame) along Morton's curve; stable."""
+    """Return [N] int64, the rows of `positions` [N, 3] (local frame) in Morton order; stable."""
     highest = 2**_BITS - 1
     cells = torch.nan_to_num(positions.detach().double() * _CELLS + 2 ** (_BITS - 1), nan=0.0)
     codes = cells.clamp(0, highest).long()
@@ -179,12 +179,12 @@ def along_curve(positions: Tensor) -> Tensor:
 
 
 def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Tensor | None:
-    """[N] int64, the rows of the primitives along the curve; None where they stay as they are.
+    """Return [N] int64, the rows of the primitives in Morton order; None to keep the order.
 
     Args:
-        parameters: In any order.
-        blocks: Of the backbone.
-        name: The tensor that has the positions; without it the order stays as it is.
+        parameters: The parameters, in any order.
+        blocks: The blocks of the backbone.
+        name: The tensor of the positions; without it, the order does not change.
     """
     if not any(block.per_primitive and name in block.tensors for block in blocks):
         return None
@@ -192,7 +192,7 @@ def in_order(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Te
 
 
 def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Parameters:
-    """The parameters with their primitives in that order."""
+    """Return the parameters with their primitives in Morton order (see `in_order`)."""
     rows = in_order(parameters, blocks, name)
     return (
         parameters if rows is None else apply_to_parameters(Edit(source=rows), blocks, parameters)
@@ -200,10 +200,10 @@ def ordered(parameters: Parameters, blocks: tuple[Block, ...], name: str) -> Par
 
 
 def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
-    """Edits parameters, moments and plugin states together.
+    """Apply an edit to parameters, moments and plugin states together.
 
     Returns:
-        Whether the set of primitives changed.
+        True if the set of primitives changed.
 
     Raises:
         UserError: The edit does not fit the parameters.
@@ -231,9 +231,9 @@ def _check_edit(setup: Setup, state: TrainState, edit: Edit) -> None:
 
 
 def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
-    """Yield the edits of a finished run, each when it is applied; derived values are not renewed.
+    """Apply and yield the final edits of a finished run; derived values are not updated.
 
-    What ends an edit halfway leaves the state as it was.
+    If an error interrupts an edit, the state is as before this edit.
 
     Raises:
         UserError: An edit does not fit the parameters.
@@ -261,7 +261,7 @@ def final_edits(setup: Setup, state: TrainState) -> Iterator[FinalEdit]:
 
 
 def put_in_order(setup: Setup, state: TrainState) -> None:
-    """Sort the primitives along the curve after an edit, so that neighbours are near in memory."""
+    """Sort the primitives in Morton order after an edit, so that neighbours are near in memory."""
     rows = in_order(state.tensors, setup.blocks, setup.backbone.positions)
     if rows is not None:
         _apply(setup, state, Edit(source=rows))
@@ -299,10 +299,10 @@ def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: 
 
 
 def take_step(setup: Setup, state: TrainState) -> StepRecord:
-    """Advances `state` by one step.
+    """Advance `state` by one step.
 
     Raises:
-        NonFiniteError: A loss or gradient is not finite; `state` is then not usable any more.
+        NonFiniteError: A loss or gradient is not finite; `state` must not be used any more.
     """
     regroup_if_due(setup, state)
     state.step += 1
@@ -318,11 +318,12 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
     scale = setup.operator_scale.of(context)
     gradients = joined(aggregated.gradients, rendered.regular, of_step, scale)
     if setup.device.type == "cpu":
-        # On a GPU each look would be waited for: what is not finite is found with the parameters.
+        # On a GPU each check would wait for the device; the check of the parameters is enough
+        # there.
         _check_finite(state, rendered, gradients, of_views)
     state.laps.lap("aggregation")
     counted = aggregated.counts
-    # An edit needs the memory that gradients hold.
+    # Free the memory of the gradients, because an edit needs it.
     del of_views, context, aggregated, of_step
     counts = _finish(setup, state, rendered, gradients, scale)
     primitives = state.primitives(setup)
@@ -334,7 +335,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
         labels=draw.labels,
         losses=tuple(record.loss for record in rendered.records),
         primitives=primitives,
-        # NumPy's integers do not go into a checkpoint.
+        # A checkpoint cannot contain NumPy integers.
         counts={name: int(count) for name, count in {**counted, **counts}.items()},
         train_seconds=state.clock.train,
         scales=scales,
@@ -342,7 +343,7 @@ def take_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
-    """What the sampler is told in a step, if it were the next one."""
+    """Return the context that the sampler would get if `step` were the next step."""
     return SampleContext(
         **{**context_fields(setup, state, "sampler"), "step": step},
         views_per_step=setup.schedule.pace.at(step),
@@ -353,10 +354,10 @@ def sample_context(setup: Setup, state: TrainState, step: int) -> SampleContext:
 
 
 def check_largest_draw(setup: Setup) -> None:
-    """Draws the most views that a step has, which one that is tried out need not draw.
+    """Check that the sampler can draw the largest K of the run, which test steps may not use.
 
     Raises:
-        UserError: The sampler cannot draw so many.
+        UserError: The sampler cannot draw this many views.
     """
     blank = TrainState({}, AdamState(), make_streams(setup.config.seed))
     context = sample_context(setup, blank, 1)
@@ -373,7 +374,7 @@ def _sample(setup: Setup, state: TrainState) -> ViewSample:
     views = answer.draw.views
     known = all(isinstance(each, int | np.integer) and 0 <= each < photos for each in views)
     if known and len(views) in counts:
-        # NumPy's integers do not go into a checkpoint.
+        # A checkpoint cannot contain NumPy integers.
         views = tuple(map(int, views))
         return replace(answer.draw, views=views, labels=_labels(setup, state, answer.draw))
     raise UserError(
@@ -386,7 +387,7 @@ def _sample(setup: Setup, state: TrainState) -> ViewSample:
 
 
 def _labels(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[str, ...] | None:
-    """The labels of a draw; a plugin may list them otherwise than in a tuple."""
+    """Return the labels of a draw as a tuple; a plugin may give a list or an array."""
     labels: object = draw.labels
     if labels is None:
         return None
@@ -435,7 +436,7 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 
 def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
-    """What of an answer is no gradient of the tensors that learn; empty where all fits."""
+    """Return what in a result does not fit the trained tensors; empty if all fits."""
     for part in (answer.gradients, answer.counts):
         if not isinstance(part, Mapping):
             return f"{type(part).__name__}, not a mapping of names"
@@ -453,21 +454,21 @@ def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
 def _finish(
     setup: Setup, state: TrainState, rendered: Rendered, gradients: TensorGradients, scale: Scale
 ) -> Mapping[str, int]:
-    """Optimizer, density control and `after_step` in the order of the run.
+    """Run optimizer, density control and `after_step` in the order that the run uses.
 
-    `gradients` is emptied once they are spent.
+    `gradients` is cleared after use.
     """
     state.touched = True
     if setup.numbers.step_order == "optimize-first":
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # What is under way holds gradients, whose memory an edit needs.
+            # Background steps hold gradients, and an edit needs their memory.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:
         edit, edited = _densify(setup, state, rendered)
-        # In the published order an edit replaces tensors, whose gradients are then gone.
+        # In the published order, an edit replaces tensors, so their gradients are not used.
         gone = set(gradients) if edited else set(edit.values)
         if state.step < setup.schedule.total:
             left = {name: g for name, g in gradients.items() if name not in gone}
@@ -487,7 +488,7 @@ def _optimize(
     progress = setup.schedule.progress(state.step)
     take_photo_step(setup, state, rendered.photos, progress)
     rates, rule = rates_at(setup, state.step), rule_at(setup, state.step)
-    # Terms of regularisation may pull at what rests, too.
+    # Regularisation terms may give gradients to tensors that do not learn in this step.
     resting = setup.resting(state.step)
     found = {name: coalesced(g) for name, g in gradients.items() if name not in resting}
     waiting = set(setup.sparse_rows.values())
@@ -511,7 +512,7 @@ def _take_adam_step(
     rule: AdamRule,
     scale: Scale,
 ) -> None:
-    """Adam's step of whole tensors; that of positions by the axes of their Gaussians, where due."""
+    """Take Adam's step of whole tensors; positions may step along the axes of their Gaussians."""
     tensors, found = state.tensors, axes_of(setup)
     if found is None or gradients.get(found[0]) is None:
         adam_step(tensors, gradients, state.moments, rates, rule, scale.to_sum)
@@ -553,7 +554,7 @@ def _after_optimizer(setup: Setup, state: TrainState) -> None:
 
 
 def _after_step(setup: Setup, state: TrainState, *, edited: bool) -> bool:
-    """Whether the set of primitives changed."""
+    """Run the hooks after the step; return True if the set of primitives changed."""
     changed = False
     context = _after_context(setup, state, edited=edited)
     for answer in call_all(setup.hook.crossgrad_after_step, context, DensifyResult):

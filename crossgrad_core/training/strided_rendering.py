@@ -1,4 +1,4 @@
-"""Views drawn at one pixel of each n x n: in each step another one, and none of them reduced."""
+"""Strided rendering: one pixel of each n x n is rendered, at a position that varies by step."""
 
 from dataclasses import replace
 from math import isclose
@@ -13,27 +13,27 @@ from crossgrad_core.contract.slots.rasterizer import Rasterizer
 from crossgrad_core.numerics.hashing import hash32
 from crossgrad_core.training.scaled_photos import Pair
 
-#: Column and row of the first pixel that is drawn.
+#: Column and row of the first rendered pixel.
 Corner = tuple[int, int]
 
 
 def stride_of(scale: float, camera: Camera) -> int:
-    """The n of a scale 1 / n; 1 where it is none, or a side is shorter: its photo is reduced."""
+    """Return n for a scale 1 / n; 1 if the scale has another form or a side is shorter than n."""
     whole = round(1.0 / scale)
     fits = isclose(whole * scale, 1.0) and whole <= min(camera.width, camera.height)
     return whole if fits else 1
 
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
-    """The pixel of each n x n that a step draws of its view at `slot`, as if drawn by lot."""
+    """Return the pseudo-random pixel of each n x n that a step renders of its view at `slot`."""
     place = hash32(hash32(step) + slot) * stride * stride >> 32
     return place % stride, place // stride
 
 
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
-    """The camera whose pixels are each n-th one of `camera`, from `corner` on.
+    """Return the camera whose pixels are every n-th pixel of `camera`, from `corner` on.
 
-    The centre of its pixel (i, j) is that of pixel (corner + n (i, j)) there.
+    The centre of its pixel (i, j) is the centre of pixel (corner + n (i, j)) of `camera`.
     """
     column, row = corner
     return replace(
@@ -48,7 +48,7 @@ def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
 
 
 def pixels_of(pair: Pair, stride: int, corner: Corner) -> Pair:
-    """Each n-th pixel of a photo [H, W, 3] and its mask [H, W] from `corner` on, as copies."""
+    """Return every n-th pixel of a photo [H, W, 3] and its mask [H, W] from `corner`, copied."""
     image, mask = pair
     column, row = corner
     taken = (slice(row, None, stride), slice(column, None, stride))
@@ -56,11 +56,11 @@ def pixels_of(pair: Pair, stride: int, corner: Corner) -> Pair:
 
 
 def _copied(pixels: Tensor) -> Tensor:
-    """The pixels side by side in memory."""
+    """Return a contiguous copy of the pixels."""
     if not pixels.is_cpu:
         return pixels.contiguous()
-    # Torch would share this with a second thread and wait for it where cores are busy. By channels,
-    # as NumPy is slow with runs of three.
+    # Torch would use a second thread and wait for it if cores are busy. Copied by channel, because
+    # NumPy is slow with an inner dimension of three.
     copy = torch.empty(pixels.shape, dtype=pixels.dtype)
     for channel in range(pixels.shape[2]):
         np.copyto(copy.numpy()[:, :, channel], pixels.numpy()[:, :, channel])
@@ -68,10 +68,10 @@ def _copied(pixels: Tensor) -> Tensor:
 
 
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
-    """The Gaussians with the dilation of the full photo, in pixels n times as wide.
+    """Return the Gaussians with the dilation of the full photo, in units of n times wider pixels.
 
-    With it the render of `camera_of` has the values that the full one has at its pixels, but for
-    Gaussians so far beyond the border that their positions are clamped there.
+    With it, a render with `camera_of` has the same values as the full render at these pixels,
+    except for Gaussians so far outside the image that their positions are clamped.
     """
     if stride == 1:
         return gaussians

@@ -1,4 +1,4 @@
-"""Rendering the K views of a step and running their backward passes."""
+"""Renders and backward passes of the K views of a step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -53,14 +53,14 @@ from crossgrad_core.wording import listed
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The camera of a render of a view, and the photo it is compared with.
+    """The camera of a render of a view, and the photo that the render is compared with.
 
     Attributes:
         camera: The camera to render with.
-        scale: Its sides over those of the view's own.
+        scale: Side length of the render divided by the side length of the photo as trained.
         photo: [H, W, 3] uint8.
-        mask: [H, W] bool; None where every pixel counts.
-        stride: n where it is one pixel of each n x n of the photo.
+        mask: [H, W] bool; None if every pixel counts.
+        stride: n if the render contains one pixel of each n x n pixels of the photo.
     """
 
     camera: Camera
@@ -71,15 +71,15 @@ class Target:
 
 
 def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: int = 0) -> Target:
-    """Camera and photo of a training view at a scale in (0, 1].
+    """Return camera and photo of a training view at a scale in (0, 1].
 
     Args:
         setup: The run.
-        state: Its state.
+        state: The state of the run.
         index: The training view.
         scale: The scale.
-        slot: The place of the view in the draw, which has a part in the lot that decides on the
-            pixels of a strided view.
+        slot: Position of the view in the step; with the step number, it determines the pixels of a
+            strided view.
     """
     view = setup.train_views[index]
     stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)
@@ -91,7 +91,7 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: i
 
 
 def photo_camera(setup: Setup, view: View, scale: float) -> Camera:
-    """The camera of the photo that a view of that scale takes its pixels from."""
+    """Return the camera of the photo that gives the pixels of a view at this scale."""
     return view.camera if _stride_at(setup, view, scale) > 1 else camera_at(view.camera, scale)
 
 
@@ -100,7 +100,7 @@ def _stride_at(setup: Setup, view: View, scale: float) -> int:
 
 
 def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> Tensor | None:
-    """[H, W], how much each pixel counts; None where all count alike."""
+    """Return [H, W], the weight of each pixel; None if all weights are equal."""
     if not setup.weighs:
         return None
     context = PixelContext(
@@ -119,7 +119,7 @@ def weights_of(setup: Setup, state: TrainState, index: int, target: Target) -> T
 
 
 def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor:
-    """Pixel weights, if a loss can use them; of a GPU, which would be waited for, their shape."""
+    """Return checked pixel weights; on a GPU only shape and type are checked, to avoid waiting."""
     shape = context.target.shape[:2]
     found, least = type(weights).__name__, ""
     if isinstance(weights, Tensor):
@@ -139,7 +139,7 @@ def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor
 
 
 def camera_at(camera: Camera, scale: float) -> Camera:
-    """The camera in `scale` times its size, rounded to whole pixels; itself at scale 1."""
+    """Return the camera resized by `scale`, rounded to whole pixels; unchanged at scale 1."""
     width = max(1, round(camera.width * scale))
     height = max(1, round(camera.height * scale))
     if (width, height) == (camera.width, camera.height):
@@ -148,7 +148,7 @@ def camera_at(camera: Camera, scale: float) -> Camera:
 
 
 def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
-    """The fields that the contexts of all hooks of a step share."""
+    """Return the fields that the contexts of all hooks of a step share."""
     return {
         "step": state.step,
         "schedule": setup.schedule,
@@ -160,12 +160,12 @@ def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, An
 
 
 def photo_of(setup: Setup, state: TrainState, view: View) -> Pair:
-    """The decoded photo and mask of a view on the run's device; decoding counts as loading."""
+    """Return the photo and mask of a view on the run's device; decoding counts as loading."""
     return on_device(_decoded(state, view), setup.device)
 
 
 def _decoded(state: TrainState, view: View) -> Pair:
-    """The decoded photo and mask of a view in the machine's memory, where they are decoded."""
+    """Return the decoded photo and mask of a view in host memory."""
     start, cpu = perf_counter(), thread_time()
     image, mask = view.photo.image(), view.photo.mask()
     seconds = perf_counter() - start
@@ -175,7 +175,7 @@ def _decoded(state: TrainState, view: View) -> Pair:
 
 
 def background_of(setup: Setup, state: TrainState) -> Tensor:
-    """[3] RGB that the next training view is drawn over."""
+    """Return the background [3] RGB of the next training view."""
     if setup.config.background == "random":
         rgb = state.rngs["background"].random(3).astype(np.float32)
         return torch.from_numpy(rgb).to(setup.device, non_blocking=True)
@@ -183,7 +183,7 @@ def background_of(setup: Setup, state: TrainState) -> Tensor:
 
 
 def eval_background(setup: Setup) -> Tensor:
-    """[3] RGB that evaluated views are drawn over: the run's own, black where that is random."""
+    """Return the background [3] RGB of evaluated views: black if the run's background is random."""
     name = setup.config.background
     named = {"black": (0.0, 0.0, 0.0), "random": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     rgb = named[name] if name in named else tuple(float(part) for part in name.split(","))
@@ -201,7 +201,7 @@ def add_regularization(
     gaussians: Gaussians | None = None,
     view: View | None = None,
 ) -> None:
-    """Adds the gradients of all regularisation terms, of one view or (None) of the step."""
+    """Add the gradients of all regularisation terms of one view or, if None, of the step."""
     context = RegularizeContext(
         **context_fields(setup, state, "regularize"),
         parameters=state.current,
@@ -235,16 +235,17 @@ def joined(
     of_step: TensorGradients,
     scale: Scale,
 ) -> TensorGradients:
-    """The aggregated gradients with those of the regularisation terms added.
+    """Return the aggregated gradients plus the gradients of the regularisation terms.
 
-    They follow the operator's scale c(K), so that the terms weigh as much against the photometric
-    loss whatever the operator: a term of the step joins c(K) times, each view's c(K) / K times.
+    The terms are multiplied by the operator's scale c(K), so that their weight against the
+    photometric loss does not depend on the operator. The factor is c(K) for terms of the step and
+    c(K) / K for terms of a view.
 
     Args:
         gradients: The aggregated gradients.
         of_views: The sum of the gradients of the views' terms.
         of_step: The sum of the gradients of the step's terms.
-        scale: What the operator makes of K equal gradients.
+        scale: The scale of the operator's result for K equal gradients.
     """
     regular = _times(of_views, scale.per_view)
     _add(regular, _times(of_step, scale.per_step))
@@ -254,7 +255,7 @@ def joined(
 
 
 def _times(gradients: TensorGradients, factors: Mapping[str, float]) -> TensorGradients:
-    """The gradients by their tensors' factors; none where the factor is 0."""
+    """Return the gradients times the factors of their tensors, without gradients of factor 0."""
     return {
         name: gradient if factors[name] == 1.0 else gradient * factors[name]
         for name, gradient in gradients.items()
@@ -268,9 +269,9 @@ class Rendered:
 
     Attributes:
         records: One record per view.
-        regular: Sum of the gradients of the views' regularisation terms, apart from the above.
+        regular: Sum of the gradients of the views' regularisation terms.
         photos: Position of each view and the values of its photo, with their gradients.
-        observed: The records that density control gets.
+        observed: The records that density control receives.
     """
 
     records: tuple[ViewRecord, ...]
@@ -281,7 +282,7 @@ class Rendered:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A view that is about to be drawn."""
+    """A view that is ready for the render."""
 
     slot: int
     target: Target
@@ -291,7 +292,7 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A view with its graph still alive. Its record does not know the loss yet."""
+    """A rendered view with its graph. Its record does not contain the loss yet."""
 
     record: ViewRecord
     gaussians: Gaussians
@@ -300,7 +301,7 @@ class _Drawn:
 
 
 def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float, ...]:
-    """The scales at which the views of `draw` are rendered."""
+    """Return the scales at which the views of `draw` are rendered."""
     context = ScaleContext(**context_fields(setup, state, "resolution"), draw=draw, last=state.last)
     answer = call_first_result(setup.hook.crossgrad_choose_scales, context, ScaleResult)
     state.accept(answer.states, setup.hook.crossgrad_choose_scales)
@@ -308,7 +309,7 @@ def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float,
     if len(scales) == len(draw.views) and all(
         isinstance(each, Real) and 0.0 < each <= 1.0 for each in scales
     ):
-        return tuple(map(float, scales))  # NumPy's do not go into a checkpoint.
+        return tuple(map(float, scales))  # A checkpoint cannot contain NumPy numbers.
     raise UserError(
         "the resolution does not give each view a scale",
         where=f"resolution {setup.selection.names['resolution']}, step {state.step}",
@@ -321,7 +322,7 @@ def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float,
 def render_views(
     setup: Setup, state: TrainState, draw: ViewSample, scales: Sequence[float]
 ) -> tuple[Rendered, Gradients]:
-    """The views of `draw` at their scales, and their gradients: apart or summed up.
+    """Render the views of `draw` and return them with their gradients, separate or summed.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -345,13 +346,13 @@ def render_views(
     state.counters.backward_passes += len(records)
     if not setup.separate:
         return Rendered(known, regular, tuple(photos)), total
-    # Single views are not needed after they are combined, unless a plugin says so.
+    # The separate gradients may be overwritten after their use, unless a plugin reads them.
     apart = DenseGradients(per_view, setup.trained_blocks, overwrite=not setup.watchers)
     return Rendered(known, regular, tuple(photos)), apart
 
 
 def _sums(setup: Setup, views: int) -> SummedGradients | DeferredSums:
-    """No gradient yet, of `views` to come."""
+    """Return an empty sum for the gradients of `views` views."""
     if setup.device.type == "cpu":
         return SummedGradients.empty(setup.trained_blocks, views)
     return DeferredSums(setup.trained_blocks, views)
@@ -364,7 +365,7 @@ def _one_by_one(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
-    """Each view with its gradients, drawn and taken back before the next one."""
+    """Yield each view with its gradients; render and backward pass run view by view."""
     _clear(state.tensors)
     for slot in range(len(draw.views)):
         drawn = _draw_view(setup, state, draw, slot, scales[slot])
@@ -381,10 +382,10 @@ def _together(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> Iterator[tuple[_Drawn, TensorGradients]]:
-    """Each view with its gradients, all drawn in one call and taken back in one backward pass.
+    """Yield each view with its gradients; all views share one render call and one backward pass.
 
-    That pass ends at copies of what was decoded, which are each view's own; from there every view
-    goes back to the parameters by itself.
+    This backward pass ends at copies of the decoded Gaussians of each view. A second backward pass
+    per view leads from there to the parameters.
     """
     _clear(state.tensors)
     slots = range(len(draw.views))
@@ -412,8 +413,8 @@ def _leaf(tensor: Tensor) -> Tensor:
 
 
 def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
-    """Takes the gradients of the copy of what was decoded back to the parameters."""
-    # Of a tensor that needs no gradient the copy has none.
+    """Propagate the gradients of the copied Gaussians back to the parameters."""
+    # The copy of a tensor that needs no gradient has no gradient.
     pairs = [(t, c.grad) for t, c in zip(decoded.floats(), copy.floats(), strict=True)]
     given = [(tensor, gradient) for tensor, gradient in pairs if gradient is not None]
     torch.autograd.backward([t for t, _ in given], [g for _, g in given])
@@ -422,7 +423,7 @@ def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
 def _with_losses(
     state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
 ) -> tuple[ViewRecord, ...]:
-    """The records with their losses, which are read together: a GPU is waited for once.
+    """Return the records with their losses, which are read together to wait for a GPU only once.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -441,7 +442,7 @@ def _render_jointly(
     scales: Sequence[float],
     regular: TensorGradients,
 ) -> tuple[Rendered, Gradients]:
-    """One backward pass through the sum of the losses (kept for comparison; all graphs alive)."""
+    """Run one backward pass through the sum of the losses (for comparison; all graphs alive)."""
     _clear(state.tensors)
     drawn = [_draw_view(setup, state, draw, slot, scale) for slot, scale in enumerate(scales)]
     losses = [view.loss.detach() for view in drawn]
@@ -460,7 +461,7 @@ def _render_jointly(
 def _prepare(
     setup: Setup, state: TrainState, draw: ViewSample, slot: int, scale: float
 ) -> _Prepared:
-    """The photo of a view of the draw, and what is decoded for it."""
+    """Return the photo and the decoded Gaussians of a view of the draw."""
     target = target_at(setup, state, draw.views[slot], scale, slot)
     background = background_of(setup, state)
     state.laps.lap("photos")
@@ -478,7 +479,7 @@ def _prepare(
 
 
 def _outputs(setup: Setup, state: TrainState) -> frozenset[str]:
-    """The optional statistics, not needed once density control is over; some cost much."""
+    """Return the optional statistics to compute; none after the end of density control."""
     return setup.densifier.needs if setup.schedule.collects(state.step) else frozenset()
 
 
@@ -495,7 +496,7 @@ def _draw_view(
 def _compare(
     setup: Setup, state: TrainState, draw: ViewSample, view: _Prepared, render: Render
 ) -> _Drawn:
-    """The render of a view beside its photo."""
+    """Compare the render of a view with its photo: compute loss and record."""
     index, target = draw.views[view.slot], view.target
     leaves = leaves_of(setup, state, index)
     image = setup.exposure.apply(render.image, leaves)
@@ -520,14 +521,14 @@ def _compare(
 
 
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
-    """What a view sees; rows of some tensors are brought up to date when they are drawn."""
+    """Return the decoded Gaussians of a view; some tensors are updated when they are drawn."""
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)
     gaussians = answered(answer, Gaussians, setup.backbone, "decode")
     names = {f: n for f, n in setup.sparse_rows.items() if getattr(gaussians, f) is tensors[n]}
     if names.keys() != {f for f in setup.sparse_rows if getattr(gaussians, f) is not None}:
-        # It is not handed over as it is after all, and was read too early.
+        # `decode` did not pass a tensor through unchanged, so it may have read outdated rows.
         state.settle()
         return setup.backbone.decode(tensors, camera, phase)
     if not names or not is_native([state.tensors[name] for name in names.values()]):
@@ -541,7 +542,7 @@ def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
 
 
 def _learning(setup: Setup, state: TrainState) -> Parameters:
-    """The parameters as they lie in memory; those that rest in this step need no gradient."""
+    """Return the parameters in memory; tensors that do not learn in this step are detached."""
     resting = setup.resting(state.step)
     if not resting:
         return state.tensors
@@ -549,10 +550,10 @@ def _learning(setup: Setup, state: TrainState) -> Parameters:
 
 
 def observe_view(setup: Setup, state: TrainState, draw: ViewSample, scale: float) -> ViewRecord:
-    """Renders the one view of `draw` for its statistics: nobody takes its gradients.
+    """Render the single view of `draw` for its statistics; its gradients are discarded.
 
     Raises:
-        NonFiniteError: Its loss is not finite.
+        NonFiniteError: The loss of the view is not finite.
     """
     drawn = _draw_view(setup, state, draw, 0, scale)
     state.laps.lap("loss")
@@ -570,7 +571,7 @@ def _regularize_view(setup: Setup, state: TrainState, drawn: _Drawn, into: Tenso
 
 
 def _backward(loss: Tensor) -> None:
-    # A view that draws nothing has a constant image: its gradients are absent, not an error.
+    # A view without visible Gaussians has a constant image and no gradients; this is not an error.
     if loss.requires_grad:
         loss.backward()  # type: ignore[no-untyped-call]
 
@@ -588,12 +589,12 @@ def _take(parameters: Mapping[str, Tensor]) -> TensorGradients:
 
 @dataclass(frozen=True, eq=False)
 class RenderCallback:
-    """Renders training views with the parameters as they are; a `RenderOnRequest`.
+    """A `RenderOnRequest` that renders training views with the present parameters.
 
     Attributes:
         setup: The run.
-        state: Its state.
-        counted: Whether the renders are counted among the rendered views.
+        state: The state of the run.
+        counted: Whether the renders count as rendered views.
     """
 
     setup: Setup

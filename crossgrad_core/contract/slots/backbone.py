@@ -22,24 +22,26 @@ class Backbone(Component):
     """A trained representation: parameters in named blocks, decoded to Gaussians for a camera.
 
     Attributes:
-        default_densifier: Name of the densifier that is used unless the user names another; in
-            short runs of many photos another one stands in for that of the published Gaussians.
+        default_densifier: Name of the densifier that is used unless the user names another. In
+            short runs of many photos, another densifier replaces the densifier of the published
+            Gaussians.
         response: How its Gaussians fill a pixel.
         plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
             PLY loses nothing.
-        sets_dilation: Whether its Gaussians' dilation is its own, whatever the rasterizer's is.
-        passthrough: Field of the Gaussians -> tensor that `decode` hands over as this field (or not
-            at all) and does not read: only the rows that are drawn need to be up to date. It
-            holds for the very class that says so, not for those that inherit from it.
-        positions: Tensor [N, 3] of the primitives' positions in the local frame, by which they are
-            put in order in memory, before the first step and after steps that edit: all rows of all
-            per-primitive tensors together, and without a call of `prepare`. At the end of a run
-            rows are removed likewise, after `decode` was asked what some of them alone give
-            (floaters). Where it is empty, only edits move or remove rows.
-        axes: Tensors [N, 3] of the logarithms of standard deviations and [N, 4] of rotations (wxyz,
-            of any length) of Gaussians that primitives are, each about its position, which may then
-            step along these axes, and whose deviations may be bounded. Empty where primitives are
-            none. Of the very class, too.
+        sets_dilation: Whether its Gaussians set their own dilation, whatever the rasterizer's
+            dilation is.
+        passthrough: Field of the Gaussians -> tensor that `decode` returns unchanged as this field
+            (or not at all) and does not read. Only the rows that are drawn need to be up to date.
+            Subclasses do not inherit this value.
+        positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
+            the first step and after steps with edits, the primitives are sorted in memory by
+            position: all rows of all per-primitive tensors together, without a call of `prepare`.
+            At the end of a run, rows may be removed in the same way, after calls of `decode` with
+            some rows only (floaters). If it is empty, only edits move or remove rows.
+        axes: Names of two tensors, if each primitive is one Gaussian about its position: [N, 3]
+            logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
+            may then step along these axes, and the deviations may be bounded. Empty if primitives
+            are not Gaussians. Subclasses do not inherit this value.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -54,34 +56,34 @@ class Backbone(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # A class that inherits it may read in `decode` what its parent only hands over.
+        # The `decode` of a subclass may read a tensor that its parent only passes through.
         if "passthrough" not in vars(cls):
             cls.passthrough = {}
-        # ... and hold its sizes and rotations in another way.
+        # A subclass may store sizes and rotations in another way.
         if "axes" not in vars(cls):
             cls.axes = ()
 
     @abstractmethod
     def blocks(self) -> tuple[Block, ...]:
-        """The blocks; fixed for the life of the component."""
+        """Return the blocks, which never change during the life of the component."""
 
     @abstractmethod
     def create(self, scene: Scene, rng: np.random.Generator) -> Parameters:
-        """Initial parameters from the SfM points, float32 on the CPU."""
+        """Return initial parameters made from the SfM points, float32 on the CPU."""
 
     @abstractmethod
     def decode(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Gaussians:
-        """The Gaussians that `camera` sees, differentiable in the parameters."""
+        """Return the Gaussians for a render with `camera`, differentiable in the parameters."""
 
     def trained_blocks(self) -> tuple[Block, ...]:
-        """The blocks that get gradients."""
+        """Return the blocks that get gradients."""
         return tuple(block for block in self.blocks() if not block.frozen)
 
     @property
     def gaussian_tensors(self) -> tuple[str, str, str] | None:
-        """The tensors of positions, scales and rotations of Gaussians that steps update whole.
+        """Names of the tensors of positions, scales and rotations, if steps update them as a whole.
 
-        None if primitives are no such Gaussians, or if rows may be updated late.
+        None if primitives are not Gaussians with axes, or if rows may be updated later.
         """
         names = self.positions, *self.axes
         late = not set(self.passthrough.values()).isdisjoint(names)
@@ -89,20 +91,20 @@ class Backbone(Component):
 
     @property
     def learns_scales(self) -> bool:
-        """Whether Gaussians with axes learn their scales, so that these can be bounded."""
+        """Whether Gaussians with axes learn their scales, so that the scales can be bounded."""
         names = self.gaussian_tensors
         learning = (block for block in self.trained_blocks() if block.lr.initial > 0.0)
         return names is not None and any(names[1] in block.tensors for block in learning)
 
     def fitted_to(self, scene: Scene) -> tuple["Backbone", tuple[str, ...]]:
-        """This backbone with options that the scene does not need left out, and what was left out.
+        """Return this backbone without options that the scene does not need, and notes about them.
 
         Options that the user set are never changed.
         """
         return self, ()
 
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
-        """Initial parameters from existing Gaussians (`--init FILE.ply`), float32 on the CPU.
+        """Return initial parameters made from existing Gaussians (`--init FILE.ply`), float32, CPU.
 
         Raises:
             UserError: This backbone cannot start from Gaussians.
@@ -116,14 +118,15 @@ class Backbone(Component):
         )
 
     def prepare(self, parameters: Parameters, scene: Scene, phase: Phase) -> Parameters:
-        """Called before the first step and after every topology edit; returns the parameters.
+        """Return the parameters with derived tensors updated.
 
-        A backbone that keeps derived tensors without gradient (filters, levels) renews them here.
+        This is called before the first step and after every topology edit. A backbone that stores
+        derived tensors without gradient (filters, levels) computes them again here.
         """
         return parameters
 
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """The tensor `opacities` [N] (logits) with no Gaussian drawn more opaque than `cap`."""
+        """Return the tensor `opacities` [N] (logits), limited so that no opacity exceeds `cap`."""
         limit = torch.logit(torch.tensor(cap, dtype=torch.float64)).item()
         return parameters["opacities"].detach().clamp(max=limit)
 
@@ -131,8 +134,8 @@ class Backbone(Component):
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        """Plain SH Gaussians without a graph, for a standard PLY.
+        """Return plain SH Gaussians without a graph, for a standard PLY.
 
-        What depends on the view is baked as `cameras` (one or more) see it: on average, or as a
-        rule of the backbone's says.
+        View-dependent values are baked for `cameras` (one or more): as an average, or by a rule of
+        the backbone.
         """

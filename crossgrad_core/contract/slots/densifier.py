@@ -12,19 +12,19 @@ STATE = "densifier"
 
 
 class Densifier(Component):
-    """Gathers per-view statistics in every step and edits the set of primitives.
+    """A method that collects per-view statistics in every step and edits the set of primitives.
 
     Attributes:
-        needs: Screen statistics beyond the radii and the mean gradient that it needs
+        needs: Screen statistics that it needs in addition to the radii and the mean gradient
             (`pixels`, `abs_gradient`, `directions`, `count`), while `schedule.collects(step)`.
-        tensors: Names of the parameter tensors that it needs a backbone to have.
+        tensors: Names of the parameter tensors that the backbone must provide.
         edits: Whether it ever edits the set of primitives.
-        resets: Whether it resets opacities when the schedule says so.
-        reset_options: Its options that count only in runs with resets; methods that inherit them
-            and read them in other runs, too, name others.
-        observes: Whether it gathers statistics of the views that the steps render.
-        budgeted: Whether a run that names no bound leads its growth along the curve to the budget
-            of its length, which is one of Gaussians.
+        resets: Whether it resets opacities when the schedule requires it.
+        reset_options: Its options that have an effect only in runs with resets. A subclass that
+            reads an inherited option in other runs, too, must change this set.
+        observes: Whether it collects statistics of the views that the steps render.
+        budgeted: Whether growth follows the budget of Gaussians for the length of the run if the
+            user sets no bound.
     """
 
     slot: ClassVar[str] = "densifiers"
@@ -37,7 +37,7 @@ class Densifier(Component):
     budgeted: ClassVar[bool] = False
 
     def window(self, schedule: Schedule) -> Schedule:
-        """The schedule with the times at which this method edits; what the user set wins over it.
+        """Return the schedule with the edit times of this method; the user's settings override it.
 
         Args:
             schedule: The schedule of the run, with the times of 3DGS.
@@ -45,22 +45,22 @@ class Densifier(Component):
         return schedule
 
     def started(self, parameters: Parameters) -> Parameters:
-        """The initial parameters as this method wants them; by default untouched."""
+        """Return the initial parameters with the changes of this method; by default unchanged."""
         return parameters
 
     @abstractmethod
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
-        """The edit of this step and the new state.
+        """Return the edit of this step and the new state.
 
-        An edit of a model that trains well keeps at least a tenth of its primitives: a model that
-        loses nearly all of them at once cannot be trained back.
+        An edit must keep at least a tenth of the primitives of a model that trains well, because a
+        model does not recover from the loss of nearly all primitives.
 
         The core gathers `state.per_primitive` of *the returned state* along with the edit.
         """
 
     @hookimpl
     def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
-        """Answers the hook with this densifier's edit."""
+        """Implement the hook with this densifier's edit."""
         answer = self.densify(context, context.state(STATE))
         edit, state = with_state(answer, Edit, self, "densify")
         return DensifyResult(edit, states={STATE: state})

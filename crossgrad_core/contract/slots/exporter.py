@@ -17,12 +17,12 @@ from crossgrad_core.errors import UserError
 
 @dataclass(frozen=True, eq=False)
 class Rounding:
-    """How a file keeps positions.
+    """The offset and the rounding error of positions in a file.
 
     Attributes:
-        offset: [3] float64, what is to be added to the numbers of the file.
-        largest: How far rounding moves a Gaussian at most, in the file's units; None where the
-            exporter does not tell.
+        offset: [3] float64, added to the numbers of the file to get positions.
+        largest: Largest distance by which rounding moves a Gaussian, in the file's units; None if
+            the exporter does not report it.
     """
 
     offset: NDArray[np.float64]
@@ -30,7 +30,7 @@ class Rounding:
 
 
 class Exporter(Component):
-    """Writes Gaussians to a file of one format.
+    """A writer of Gaussians to files of one format.
 
     Attributes:
         suffix: Suffix of its files, without the dot.
@@ -43,35 +43,35 @@ class Exporter(Component):
     def write(
         self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
     ) -> tuple[str, ...]:
-        """Writes the file; it appears complete or not at all.
+        """Write the file; it appears complete or not at all.
 
         Args:
-            gaussians: Gaussians of the local frame that do not depend on a view, without a graph.
+            gaussians: View-independent Gaussians in the local frame, without a graph.
             similarity: Maps the local frame back to the input frame, in which files are written.
             path: The file.
             comments: Lines of plain text about the file, for formats that can hold them.
 
         Returns:
-            What the user should know about the file, one sentence each; usually nothing.
+            Messages for the user about the file, one sentence each; usually none.
 
         Raises:
             UserError: The disk is full or the folder may not be written to.
         """
 
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
-        """How positions are kept in the file that `write` makes of the same."""
+        """Return offset and rounding of positions in the file that `write` creates for these."""
         return Rounding(np.zeros(3))
 
     def stored(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians as a reader of the file gets them, local frame; by default unchanged."""
+        """Return the Gaussians as read back from the file, local frame; by default unchanged."""
         return gaussians
 
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
-        """The Gaussians in a file of this format, to start from; by default refused.
+        """Return the Gaussians in a file of this format, to start from; by default an error.
 
         Args:
             path: The file.
-            similarity: Maps the local frame, that of the answer, back to the frame of the file.
+            similarity: Maps the local frame, the frame of the result, to the frame of the file.
 
         Returns:
             float32 Gaussians on the CPU with spherical harmonics.
@@ -82,7 +82,7 @@ class Exporter(Component):
         raise _not_read(path)
 
     def sh_degree_of(self, path: Path) -> int:
-        """The SH degree of the Gaussians in a file, from its header alone; by default refused.
+        """Return the SH degree of the Gaussians in a file from its header; by default an error.
 
         Raises:
             UserError: The file cannot be read.

@@ -1,4 +1,4 @@
-"""The exposure slot: what a camera does to light between the render and its photo."""
+"""The exposure slot: a model of the camera's exposure between the render and its photo."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -14,11 +14,11 @@ from crossgrad_core.contract.scene import Scene, View
 
 @dataclass(frozen=True, eq=False)
 class PerPhoto:
-    """A parameter that every training photo has a value of.
+    """A parameter with one value per training photo.
 
     Attributes:
-        start: [P, ...] float32, the values at the start, in the order of `scene.train_views`; or
-            what works them out, where that takes long: a run that goes on does not ask.
+        start: [P, ...] float32, the initial values in the order of `scene.train_views`; or a
+            function that computes them, if this takes long. A resumed run does not call it.
         lr: Its learning rate.
     """
 
@@ -26,18 +26,18 @@ class PerPhoto:
     lr: LearningRate
 
     def first(self) -> Tensor:
-        """The values at the start."""
+        """Return the initial values."""
         return self.start if isinstance(self.start, Tensor) else self.start()
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """The exposure that a scene calls for, and why.
+    """The exposure that suits a scene, with the reasons.
 
     Attributes:
-        exposure: The exposure that the run takes.
-        name: The name under which that one is installed; None where it is the one that was asked.
-        notes: What was decided, and on what evidence.
+        exposure: The exposure that the run uses.
+        name: Name under which this exposure is installed; None if the choice did not change.
+        notes: The decision and its evidence.
     """
 
     exposure: "Exposure"
@@ -46,36 +46,38 @@ class Fitted:
 
 
 class Exposure(Component):
-    """Makes of a render the image that the camera of one photo would have taken.
+    """A model that turns a render into the image that the camera of one photo would have taken.
 
-    Its parameters belong to photos, not to the scene: no operator sees their gradients. After each
-    step the photos of that step take a step of Adam of their own, with their own count, for any
-    number of views and every backbone; then all values are projected. They are part of checkpoints.
+    Its parameters belong to photos, not to the scene, so operators do not receive their gradients.
+    After each step, each photo of the step takes an Adam step of its own with its own step count,
+    for any number of views and every backbone. Then all values are projected. Checkpoints contain
+    the values.
     """
 
     slot: ClassVar[str] = "exposures"
 
     def fitted_to(self, scene: Scene) -> Fitted:
-        """The exposure that the scene calls for; by default this one.
+        """Return the exposure that suits the scene; by default this exposure.
 
-        What a run takes is written to its config.yaml, so a run that goes on asks that one.
+        The result is written to config.yaml, and a resumed run uses the written one.
         """
         return Fitted(self)
 
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """What the user should know about this exposure and the scene; asked of new runs only.
+        """Return messages about this exposure and the scene; called for new runs only.
 
-        `known` are the values [P, ...] at the start by name, if the user has a file; else empty.
+        `known` contains the initial values [P, ...] by name if the user gives a file; else it is
+        empty.
         """
         return ()
 
     def per_photo(self, scene: Scene) -> Mapping[str, PerPhoto]:
-        """The parameters by name; by default there are none."""
+        """Return the parameters by name; by default there are none."""
         return {}
 
     @abstractmethod
     def apply(self, image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        """The image as taken, differentiable in the render and in the values.
+        """Return the exposed image, differentiable in the render and in the values.
 
         Args:
             image: [H, W, 3] the render, of any size and not clamped.
@@ -83,26 +85,28 @@ class Exposure(Component):
         """
 
     def project(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """All values [P, ...] after a step, brought back to where they must be.
+        """Return all values [P, ...] after a step, projected to their valid range.
 
-        By default as they are. Gains that are brought back to a mean of zero, say, leave the
-        scene its own brightness.
+        By default unchanged. For example, gains projected to a mean of zero do not change the
+        brightness of the scene.
         """
         return values
 
     def shift(self, name: str, values: Tensor, start: Tensor, end: Tensor) -> Tensor:
-        """The values [P, ...] of a parameter, all moved by what makes `end` of `start`.
+        """Return the values [P, ...] of a parameter, all changed as from `start` to `end`.
 
-        By default by a sum. What photos differ by stays, at whatever level a file has them.
+        By default `end - start` is added. Differences between photos are kept at the level of the
+        values in a file.
         """
         return values + (end - start)
 
     def predict_unseen(
         self, view: View, scene: Scene, values: Mapping[str, Tensor]
     ) -> Mapping[str, Tensor]:
-        """The values of a view that is not trained on, without a look at its pixels.
+        """Return the values of a view that is not used for training, without reading its pixels.
 
-        By default the mean over the training photos of its regime, over all where it has none.
+        By default this is the mean over the training photos of its regime, or over all training
+        photos if its regime contains none.
 
         Args:
             view: The view.

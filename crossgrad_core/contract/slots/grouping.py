@@ -19,25 +19,25 @@ class GroupingRule:
 
     Attributes:
         labels: One label per view, for any views of the scene, in their order.
-        notes: What the user should know about the rule as fitted (its threshold, a fall-back ...).
+        notes: Messages for the user about the fitted rule (its threshold, a fall-back ...).
     """
 
     labels: Callable[[Sequence[View]], tuple[str, ...]]
     notes: tuple[str, ...] = ()
 
     def label(self, view: View) -> str:
-        """The label of one view."""
+        """Return the label of one view."""
         return self.labels((view,))[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """The one number per view that a grouping splits.
+    """The single number per view by which a grouping splits the views.
 
     Attributes:
-        name: What it is, as in "the log distance from the mean camera".
-        values: [V] float64 in the order in which the views were given; not finite where a view has
-            none.
+        name: Its description, such as "the log distance from the mean camera".
+        values: [V] float64 in the order of the given views; not finite if it is undefined for a
+            view.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Quantity:
 
 
 class GradientProbe(Protocol):
-    """Gradients of a model with frozen parameters, seen through their dot products only."""
+    """Dot products of the gradients of a model with frozen parameters."""
 
     @property
     def blocks(self) -> tuple[str, ...]:
@@ -53,16 +53,17 @@ class GradientProbe(Protocol):
         ...
 
     def gramians(self, views: Sequence[int]) -> NDArray[np.float64]:
-        """[B, V, V] float64 Gramians of the gradients of V training views, given by position."""
+        """Return [B, V, V] float64 Gramians of the gradients of V training views, by position."""
         ...
 
 
 class Grouping(Component):
-    """Labels views; the rule is fitted on the training cameras and then applied to all.
+    """A method that labels views: a rule fitted to the training cameras and applied to all views.
 
     Attributes:
-        labels: Every label the rule can give, near first; empty where the user's input names them.
-        needs_probe: Whether the rule looks at gradients; it then refuses to label without a probe.
+        labels: Every label that the rule can give, near first; empty if the user's input defines
+            the labels.
+        needs_probe: Whether the rule reads gradients and cannot label views without a probe.
     """
 
     slot: ClassVar[str] = "groupings"
@@ -73,7 +74,7 @@ class Grouping(Component):
     def fit(
         self, scene: Scene, rng: np.random.Generator, probe: GradientProbe | None = None
     ) -> GroupingRule:
-        """The rule, fitted on `scene.train_views`.
+        """Return the rule, fitted to `scene.train_views`.
 
         Args:
             scene: The scene.
@@ -81,11 +82,11 @@ class Grouping(Component):
             probe: Gradients of the training views, for rules that need them.
 
         Raises:
-            UserError: The rule leaves a group without training views, with what to do.
+            UserError: The rule leaves a group without training views; the message says what to do.
         """
 
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
-        """What the rule splits, so that a run can say where that has one mode only.
+        """Return the quantity that the rule splits, so that a run can report a single mode.
 
         Args:
             scene: The scene.
@@ -98,16 +99,16 @@ class Grouping(Component):
 
 
 class Regrouping(Grouping):
-    """A grouping that is fitted anew once the model has learnt something."""
+    """A grouping that is fitted again after some training."""
 
     @property
     @abstractmethod
     def refit_after(self) -> int:
-        """The step after which the training views are grouped anew."""
+        """The step after which the training views are grouped again."""
 
     @abstractmethod
     def refit(self, model: Model, rng: np.random.Generator) -> GroupingRule:
-        """The rule for the rest of the run.
+        """Return the rule for the rest of the run.
 
         Args:
             model: The model after step `refit_after`; nothing in it may be changed.

@@ -1,4 +1,4 @@
-"""The start slot: the points that the first primitives are made of."""
+"""The initializer slot: the points from which the first primitives are made."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -13,15 +13,15 @@ from crossgrad_core.contract.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class MorePoints:
-    """Points beside those of the scene.
+    """Points in addition to the points of the scene.
 
     Attributes:
         positions: [N, 3] float64, local frame.
         colors: [N, 3] uint8 RGB.
-        sizes: [N] float64, local units: standard deviation of the Gaussian that a point becomes,
-            where a backbone makes Gaussians of points. NaN takes it from the distance to the
+        sizes: [N] float64, local units: standard deviation of the Gaussian of a point, if the
+            backbone makes Gaussians from points. NaN computes it from the distance to the
             neighbours, as for the points of the scene.
-        opacities: [N] float64 in (0, 1): its opacity, likewise. NaN takes the backbone's own.
+        opacities: [N] float64 in (0, 1): opacity of this Gaussian. NaN uses the backbone's value.
     """
 
     positions: NDArray[np.float64]
@@ -31,12 +31,13 @@ class MorePoints:
 
 
 class Initializer(Component):
-    """Adds points where a scene has too few to begin with; asked once and again, it answers alike.
+    """A method that adds points to scenes with too few points; repeated calls agree.
 
-    Only runs that start from the scene's own points (`--init points`) ask it.
+    It is used only in runs that start from the scene's own points (`--init points`).
 
     Attributes:
-        alone: Whether it has points for a scene without any; it then raises where it finds none.
+        alone: Whether it can make points for a scene without points. If it then finds none, it
+            raises an error.
     """
 
     slot: ClassVar[str] = "initializers"
@@ -44,14 +45,14 @@ class Initializer(Component):
 
     @abstractmethod
     def more_points(self, scene: Scene) -> MorePoints | None:
-        """The points to add; None for none."""
+        """Return the points to add; None to add no points."""
 
     def messages(self, scene: Scene) -> tuple[str, ...]:
-        """What the user should know about them; asked of new runs only."""
+        """Return messages for the user about the added points; called for new runs only."""
         return ()
 
     def begun(self, scene: Scene) -> Scene:
-        """The scene with the added points behind its own, whose indices stay what they are."""
+        """Return the scene with the new points appended; indices of its own points stay."""
         answer = self.more_points(scene)
         if answer is None:
             return scene

@@ -1,4 +1,4 @@
-"""The loss slot: how far a render is from its photo."""
+"""The loss slot: the difference between a render and its photo."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -9,7 +9,7 @@ from crossgrad_core.contract.component import Component
 
 
 class Loss(Component):
-    """The photometric loss of one view, which training brings down."""
+    """The photometric loss of one view, which training minimises."""
 
     slot: ClassVar[str] = "losses"
 
@@ -17,16 +17,16 @@ class Loss(Component):
     def loss(
         self, render: Tensor, photo: Tensor, mask: Tensor | None, weights: Tensor | None
     ) -> Tensor:
-        """How far the render is from the photo: a scalar, differentiable in the render.
+        """Return the loss between render and photo, a scalar that is differentiable in the render.
 
-        A mean over the pixels that count, so that images of different sizes compare. Without a
-        pixel that counts it is 0.
+        It is a mean over the pixels that count, so that losses of images of different sizes are
+        comparable. If no pixel counts, it is 0.
 
         Args:
             render: [H, W, 3] floating point; values may lie outside [0, 1].
             photo: [H, W, 3] uint8 (255 means 1) or floating point, on the render's device.
-            mask: [H, W] bool, True where the pixel counts; None where every pixel counts. A pixel
-                that does not count adds nothing, and the render gets no gradient there.
-            weights: [H, W] float32, not negative: how much each pixel counts beside the others.
-                Only their ratios matter; None weighs all pixels alike.
+            mask: [H, W] bool, True where the pixel counts; None if every pixel counts. A pixel that
+                does not count adds nothing, and the render gets no gradient there.
+            weights: [H, W] float32, not negative: relative weight of each pixel. Only their ratios
+                matter; None weighs all pixels alike.
         """

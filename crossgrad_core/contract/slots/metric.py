@@ -15,15 +15,15 @@ from crossgrad_core.contract.scene import View
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A held-out view beside its photo, as results compare them. Nothing in it may be changed.
+    """A held-out view and its photo, as results compare them. Nothing in it may be changed.
 
     Attributes:
         view: The view.
         render: [H, W, 3] uint8 on the CPU, rounded as if it had been written to a file.
         photo: [H, W, 3] uint8.
-        mask: [H, W] bool, True where the pixel counts; None where every pixel counts.
-        drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None
-            where only the rounded one is there.
+        mask: [H, W] bool, True where the pixel counts; None if every pixel counts.
+        drawn: [H, W, 3] floating point on the CPU, the render before clamping and rounding; None if
+            only the rounded render is known.
         points: [S, 3] SfM points that the view observed, local frame; may be empty.
     """
 
@@ -36,22 +36,22 @@ class Compared:
 
 
 class Metric(Component):
-    """Measures one figure of every held-out view.
+    """A measure of one figure of every held-out view.
 
     Attributes:
-        figure: What the figure is called and how it is shown.
+        figure: Name and format of the figure.
     """
 
     slot: ClassVar[str] = "metrics"
     figure: ClassVar[Figure]
 
     def described(self) -> Figure:
-        """The figure as the metric measures it with its options; by default `figure`.
+        """Return the figure as the metric measures it with its options; by default `figure`.
 
-        Its definition and the reason why there is none may depend on them, its name may not.
+        `definition` and `undefined` of the figure may depend on the options, its name may not.
         """
         return self.figure
 
     @abstractmethod
     def measure(self, compared: Compared) -> float | None:
-        """The figure of one view; None where there is none, such as without a pixel that counts."""
+        """Return the figure of one view; None if it is undefined, such as if no pixel counts."""

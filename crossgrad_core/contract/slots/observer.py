@@ -8,13 +8,15 @@ from crossgrad_core.contract.component import Component
 class Observer(Component):
     """A plugin that implements event hooks or wraps hooks (`@hookimpl(wrapper=True)`).
 
-    It ends no run: it catches what can fail. It changes the model through answers only, answers
-    finite numbers to finite ones, keeps at most 0.1 MB of each step in memory, and holds up a step
-    by less than 0.1 s per call on a small scene (events are off the clock).
+    An observer must not end a run: it catches its own errors. It changes the model through hook
+    results only, and returns finite numbers for finite inputs. It stores at most 0.1 MB per step in
+    memory and delays a step by less than 0.1 s per call on a small scene (the time of events does
+    not count as training).
 
     Attributes:
-        needs_separate_gradients: Whether it looks at the gradients of single views; the run then
-            keeps them apart, which costs memory and changes no bit of the training.
+        needs_separate_gradients: Whether it reads the gradients of single views. The run then
+            stores these gradients separately, which costs memory and changes no bit of the
+            training.
     """
 
     slot: ClassVar[str] = "observers"

@@ -14,21 +14,21 @@ STATE = "operator"
 
 
 class Operator(Component):
-    """Turns the gradients of K views into one per tensor.
+    """A method that combines the gradients of K views into one gradient per tensor.
 
     Most operators need only the K x K Gramians of the gradients: see `GramianOperator`.
 
     Attributes:
-        separate: Whether it needs the views' gradients apart. Where not, the backward passes
-            accumulate into one gradient: same bits, no copies.
-        views: For which K the operator has a meaning.
-        identity_at_one: Whether it leaves the gradient of a single view as it is. A run with K = 1
-            then reports that the operator does nothing.
-        default_grouping: Name of the grouping it needs unless the user names another; None where
-            it needs no labels.
-        sparse_rows: Whether `aggregate` hands on what `total` and `combine` answer as it is, sparse
-            or dense. It holds for the class that says so and for subclasses that keep its
-            `aggregate`; other classes get dense gradients only.
+        separate: Whether it needs the separate gradients of the views. If not, the backward passes
+            accumulate into one gradient, with the same bits and without copies.
+        views: Supported values of K.
+        identity_at_one: Whether it returns the gradient of a single view unchanged. A run with
+            K = 1 then reports that the operator does nothing.
+        default_grouping: Name of the grouping that it needs if the user names none; None if it
+            needs no labels.
+        sparse_rows: Whether `aggregate` returns the results of `total` and `combine` unchanged,
+            sparse or dense. Subclasses inherit this value only if they keep `aggregate`; other
+            classes get dense gradients only.
     """
 
     slot: ClassVar[str] = "operators"
@@ -47,38 +47,38 @@ class Operator(Component):
 
     @property
     def resolved_grouping(self) -> str | None:
-        """The grouping it needs with its options as they are, where the user names none."""
+        """The grouping that it needs with its present options if the user names none."""
         return self.default_grouping
 
     def is_identity(self, views: int) -> bool:
-        """Whether the result is the plain sum, whatever the gradients of that many views are."""
+        """Return True if the result for this number of views is always the plain sum."""
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Whether it, or an operator that it consists of, does nothing with so many views."""
+        """Return True if it, or an operator that it contains, does nothing with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:
-        """Whether the labels of the views make a difference to it."""
+        """Return True if its result depends on the labels of the views."""
         return False
 
     @abstractmethod
     def aggregate(
         self, context: AggregateContext, state: PluginState
     ) -> tuple[AggregateResult, PluginState]:
-        """One gradient per tensor, and the new state.
+        """Return one gradient per tensor, and the new state.
 
-        The place of a view in the step means nothing. Views are told apart by labels, losses,
-        distances or gradients; views that differ in none of these count alike.
+        The result must not depend on the position of a view in the step, only on labels, losses,
+        distances and gradients. Views that are equal in these count equally.
 
         Args:
-            context: The gradients of the K views and what is known about them.
-            state: What this operator returned last.
+            context: The gradients of the K views and further data of the views.
+            state: The state that this operator returned last.
         """
 
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
-        """Answers the hook with this operator's directions."""
+        """Implement the hook with this operator's gradients."""
         answer = self.aggregate(context, context.state(STATE))
         aggregated, state = with_state(answer, AggregateResult, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}

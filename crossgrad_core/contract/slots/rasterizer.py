@@ -14,21 +14,20 @@ from crossgrad_core.contract.scene import Camera
 
 
 class Rasterizer(Component):
-    """Draws Gaussians by one common rule set (see docs/rasterizers.md).
+    """A renderer of Gaussians that follows one common rule set (see docs/rasterizers.md).
 
     Attributes:
         max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
-        near: Gaussians whose centre is nearer than this camera depth are not drawn, local units.
+        near: Camera depth in local units; Gaussians with a nearer centre are not drawn.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        provides: Optional outputs it can give: `depth`, `pixels`, `abs_gradient`, `directions`,
-            `count`.
+        provides: Optional outputs that it can compute: `depth`, `pixels`, `abs_gradient`,
+            `directions`, `count`.
         responses: Pixel responses that it draws.
-        devices: Torch device types it runs on.
-        batched: Whether `render_views` is faster than one view after the other. The views of a
-            step are then drawn in one call, with the graphs of all of them alive.
+        devices: Torch device types that it supports.
+        batched: Whether `render_views` is faster than single renders. The views of a step are then
+            drawn in one call, with the graphs of all views alive.
         deterministic: Whether the same input gives the same bits.
-        sparse_rows: Whether it heeds `Gaussians.on_demand`. It holds for the very class that says
-            so, not for those that inherit from it.
+        sparse_rows: Whether it supports `Gaussians.on_demand`; subclasses do not inherit this.
     """
 
     slot: ClassVar[str] = "rasterizers"
@@ -46,16 +45,16 @@ class Rasterizer(Component):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: object) -> None:
-        # A class that inherits it may look at Gaussians before its parent asks for their rows.
+        # A subclass may read Gaussians before its parent requests their rows.
         if "sparse_rows" not in vars(cls):
             cls.sparse_rows = False
 
     @classmethod
     def speed(cls, device: str) -> float:  # noqa: ARG003 - for those that run somewhere
-        """How fast it is on a device, for `--rasterizer auto`, which takes the fastest.
+        """Return a speed rank on a device; `--rasterizer auto` chooses the highest rank.
 
-        The scale is a rank: 1 the readable reference, 10 compiled kernels on a CPU, 100 on a GPU. 0
-        keeps `auto` from taking it: where it does not run, or where it is for those who name it.
+        The ranks are 1 for the readable reference, 10 for compiled kernels on a CPU, 100 on a GPU.
+        With 0, `auto` never chooses it: it does not support the device, or the user must name it.
 
         Args:
             device: Torch device type.
@@ -64,10 +63,10 @@ class Rasterizer(Component):
 
     @classmethod
     def missing(cls, device: str) -> str:  # noqa: ARG003 - for those that need a package
-        """Return what it lacks on this machine to run on a device, and how to install it.
+        """Return what is missing on this machine to run on a device, and how to install it.
 
-        Empty where nothing is missing, or where it does not run on the device at all. `--device
-        auto` shows it if a GPU is there and no rasterizer uses it.
+        Empty if nothing is missing, or if the rasterizer does not support the device. `--device
+        auto` shows this text if there is a GPU that no rasterizer uses.
 
         Args:
             device: Torch device type.
@@ -75,13 +74,13 @@ class Rasterizer(Component):
         return ""
 
     def self_test(self, device: str) -> None:
-        """Finds out before a run trains whether this machine draws rightly; by default does not.
+        """Check before training that this machine renders correctly; by default without a check.
 
         Args:
             device: Torch device.
 
         Raises:
-            UserError: It does not.
+            UserError: The machine renders incorrectly.
         """
 
     @abstractmethod
@@ -92,9 +91,9 @@ class Rasterizer(Component):
         background: Tensor,
         outputs: frozenset[str] = frozenset(),
     ) -> Render:
-        """Draws the Gaussians over `background` [3].
+        """Render the Gaussians over `background` [3].
 
-        Image, alpha and (where asked for) depth are differentiable in all tensors of `gaussians`;
+        Image, alpha and (if requested) depth are differentiable in all tensors of `gaussians`;
         the backward pass fills `Render.screen`. `outputs` names the optional outputs to compute.
         """
 
@@ -104,10 +103,10 @@ class Rasterizer(Component):
         backgrounds: Sequence[Tensor],
         outputs: frozenset[str] = frozenset(),
     ) -> list[Render]:
-        """Draws several views, each with its own Gaussians and background [3].
+        """Render several views, each with its own Gaussians and background [3].
 
-        The renders are those of `render`. By default they are drawn one after the other; a
-        rasterizer for a GPU may draw them together. One backward pass goes through all of them.
+        The results equal those of `render`. By default the views are rendered one after another; a
+        rasterizer for a GPU may render them together. One backward pass covers all views.
         """
         return [
             self.render(gaussians, camera, background, outputs)

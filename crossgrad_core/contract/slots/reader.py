@@ -10,25 +10,25 @@ from crossgrad_core.contract.scene_options import SceneOptions
 
 
 class Reader(Component):
-    """Reads a scene from a folder."""
+    """A reader of scenes from folders."""
 
     slot: ClassVar[str] = "readers"
 
     @abstractmethod
     def accepts(self, path: Path) -> bool:
-        """Whether the folder looks like something this reader can read."""
+        """Return True if the folder seems to be in a format that this reader can read."""
 
     def nearly_accepts(self, path: Path) -> bool:
-        """Whether a file in the folder is nearly of this reader's format.
+        """Return True if a file in the folder is nearly in this reader's format.
 
-        It is asked if no reader accepts the folder. `read` then says what the file lacks.
+        This is called if no reader accepts the folder. `read` then reports what is missing.
         """
         return False
 
     @abstractmethod
     def read(self, path: Path, options: SceneOptions) -> Scene:
-        """The scene.
+        """Return the scene.
 
         Raises:
-            UserError: The folder cannot be read; says which file, what is wrong and what to do.
+            UserError: The folder cannot be read; names the file, the problem and what to do.
         """

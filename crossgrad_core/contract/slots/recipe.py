@@ -29,19 +29,20 @@ class Facts:
         planned: Steps that the run was planned with; None while only its seconds are known.
         total: Steps that the run has now, after the clock made it longer or shorter.
         mode: Whether the published schedule is stretched to the run.
-        reference: Length that the schedule is written for, if that is not the length of the run.
+        schedule_length: Length that the schedule is written for; None for the length of the run or
+            the published length.
         views_per_step: Views of each step, K.
-        views_because: Why K is not the usual one of the sampler; empty if it is.
+        views_because: Why K is not the default of the sampler; empty if it is the default.
         photos: Number of training photos.
         pixels: Pixels of a training photo, mean.
-        photos_per_point: Training photos that an SfM point lies in, median; 0 if there are none.
+        photos_per_point: Median number of training photos that show an SfM point; 0 without points.
         own_points: Whether the run starts from the points of the scene.
-        batched: Whether a batch rule scales rates and averages with K.
+        batched: Whether a batch rule scales learning rates and Adam's averages with K.
         scale: Local units per unit of the scene's own frame.
         start: Primitives at the start; None before they are counted.
         backbone: The backbone, fitted to the scene.
-        densifier: Name -> that densifier with the options that the user set.
-        provides: Screen statistics of the rasterizer that draws.
+        densifier: Name -> the densifier of this name with the options that the user set.
+        provides: Screen statistics that the rasterizer of the run provides.
         given: The settings that the user set, with their values.
     """
 
@@ -66,25 +67,25 @@ class Facts:
 
     @property
     def published(self) -> bool:
-        """Whether the schedule has the published numbers, whatever the length of the run."""
+        """Whether the schedule uses the published numbers, whatever the length of the run."""
         return is_published(self.mode, self.schedule_length)
 
     @property
     def unit(self) -> Unit:
-        """What schedules count, unless the recipe says otherwise."""
+        """The unit that schedules count in, unless the recipe decides otherwise."""
         unit: Unit = self.given.get("schedule_unit") or ("steps" if self.published else "views")
         return unit
 
     @property
     def steps(self) -> int | None:
-        """Planned steps; with `--schedule absolute` those that the schedule is written for."""
+        """Planned steps; with `--schedule absolute`, the steps that the schedule is written for."""
         schedule = self.schedule(self.unit)
         if self.mode == "absolute":
             return schedule.step_of(schedule.length)
         return self.planned
 
     def intervals(self) -> list[Decision]:
-        """Return the rows of evaluations and checkpoints, which no result depends on."""
+        """Return the rows of evaluations and checkpoints, which do not change any result."""
         steps = self.planned or self.total
         return [
             Decision("eval_every", max(1, steps // 10), "a tenth of the run"),
@@ -93,7 +94,7 @@ class Facts:
 
     @property
     def views(self) -> int | None:
-        """Planned views, which say how long the run is; None before they are planned."""
+        """Planned views, which measure the length of the run; None before they are planned."""
         steps = self.steps
         return None if steps is None else self.views_per_step.paced(steps).views(steps)
 
@@ -109,11 +110,11 @@ class Facts:
 
 
 class Recipe(Component):
-    """Decides every setting that the user leaves open.
+    """A rule set that decides every setting that the user leaves open.
 
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
-            the length. What the user sets wins.
+            the length. Settings of the user override them.
         rasterizer_options: Options that a rasterizer must have to be chosen for this recipe.
     """
 
@@ -123,10 +124,10 @@ class Recipe(Component):
 
     @abstractmethod
     def decide(self, facts: Facts) -> list[Decision]:
-        """Return one row for each setting; rows of settings that the user set are left out."""
+        """Return one row for each setting; rows of settings that the user set are ignored."""
 
 
 def with_rows(rows: Iterable[Decision], others: Sequence[Decision]) -> list[Decision]:
-    """Return the rows of one recipe, of which those of another one replace or follow some."""
+    """Return `rows` with `others` merged: a row of `others` replaces its setting or is appended."""
     table = {row.setting: row for row in rows}
     return [*(table | {row.setting: row for row in others}).values()]

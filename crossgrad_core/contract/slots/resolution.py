@@ -1,4 +1,4 @@
-"""The resolution slot: at which scale the views of a step are rendered and compared."""
+"""The resolution slot: the scale at which the views of a step are rendered and compared."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -15,44 +15,44 @@ STATE = "resolution"
 
 
 def octave(scale: float) -> int:
-    """The power of two nearest to a scale: 0 at full size, -1 at half of it.
+    """Return the rounded base-2 logarithm of a scale: 0 at full size, -1 at half size.
 
-    Reducing a photo takes detail away, and the loss falls with it. Losses of one octave compare;
-    a running loss begins anew where the octave changes.
+    A reduced photo contains less detail, so its loss is lower. Only losses of the same octave are
+    comparable; a running mean of losses must start again when the octave changes.
     """
     return round(log2(scale))
 
 
 class Resolution(Component):
-    """Chooses, for the views that the sampler drew, the scale of each.
+    """A rule that chooses the scale of each view that the sampler drew.
 
-    A view of scale s is rendered with its camera in s times its size, and compared with its photo
-    reduced to that size by area. Evaluation is always at full size. Screen statistics reach density
-    control in units of the full photo.
+    A view of scale s is rendered with its camera resized by s, and compared with its photo reduced
+    to this size by an area filter. Evaluation is always at full size. Density control gets screen
+    statistics in units of the full photo.
 
     Attributes:
-        strided: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, in
-            each step another one, and compared with these pixels of its photo.
+        strided: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, and
+            compared with these pixels of its photo. The pixel differs from step to step.
     """
 
     slot: ClassVar[str] = "resolutions"
     strided: ClassVar[bool] = False
 
     def fitted_to(self, scene: Scene) -> "Resolution":
-        """This resolution with what it measures of the scene; by default as it is.
+        """Return this resolution with values measured from the scene; by default unchanged.
 
-        It is written to config.yaml, so that a run which goes on asks that one.
+        The result is written to config.yaml, and a resumed run uses the written one.
         """
         return self
 
     def messages(self, schedule: Schedule) -> tuple[str, ...]:
-        """What to note about the scales of a run with this schedule; asked anew as it changes."""
+        """Return messages about the scales under this schedule; called again when it changes."""
         return ()
 
     def pixels(self, schedule: Schedule, step: int) -> float:
-        """Pixels that all steps up to and including this one render, in photos of full size.
+        """Return the pixels rendered in all steps up to and including this one, in full photos.
 
-        Budgets of seconds plan with them. By default every view has its full size.
+        Time budgets use this number for planning. By default every view has its full size.
         """
         return schedule.pace.views(step)
 
@@ -60,14 +60,14 @@ class Resolution(Component):
     def scales(
         self, context: ScaleContext, state: PluginState
     ) -> tuple[tuple[float, ...], PluginState]:
-        """One scale in (0, 1] for each view of `context.draw`, and the new state.
+        """Return one scale in (0, 1] for each view of `context.draw`, and the new state.
 
         Random numbers come from `context.rng`.
         """
 
     @hookimpl
     def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
-        """Answers with this resolution's scales."""
+        """Implement the hook with this resolution's scales."""
         answer = self.scales(context, context.state(STATE))
         scales, state = with_state(answer, Sequence, self, "scales")
         return ScaleResult(tuple(scales), states={STATE: state})

@@ -1,4 +1,4 @@
-"""The rule slot: acts during training, and is not part of the basic loop."""
+"""The rule slot: plugins that act during training and are not part of the basic loop."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +16,12 @@ from crossgrad_core.contract.slots.backbone import Backbone
 class Rule(Component):
     """A plugin that changes the training through hooks (`@hookimpl`), if a run selects it.
 
-    Its state goes by the name under which it is installed, and so does its random generator.
+    Its state and its random generator are named after the name under which it is installed.
 
     Attributes:
-        copies: Copies of the parameters that its state holds at most, including those of the step
-            before and of the state to go back to; growth leaves memory for them.
+        copies: Maximum number of copies of the parameters in its state, including the copies in the
+            state of the previous step and in the rollback state. Growth leaves memory for these
+            copies.
     """
 
     slot: ClassVar[str] = "rules"
@@ -29,20 +30,20 @@ class Rule(Component):
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         """Return why the rule would change nothing in this run; empty if it would change something.
 
-        A new run is refused if the user asks for a rule that would change nothing.
+        A new run is refused if the user selects a rule that would change nothing.
         """
         return ""
 
 
 @dataclass(frozen=True, eq=False)
 class GaussiansContext(StepContext):
-    """For `crossgrad_view_gaussians`.
+    """The context of `crossgrad_view_gaussians`.
 
     Attributes:
         view: The training view that is rendered.
-        gaussians: The Gaussians that the backbone decoded for it, with their graph; if another rule
-            has changed them already, the changed ones.
-        rngs: Name of a rule -> its generator, from which all of its random numbers must come.
+        gaussians: The Gaussians that the backbone decoded for the view, with their graph and with
+            the changes of earlier rules.
+        rngs: Name of a rule -> its generator, the only source of its random numbers.
     """
 
     view: View
@@ -52,13 +53,13 @@ class GaussiansContext(StepContext):
 
 @dataclass(frozen=True, eq=False)
 class GaussiansResult(Answer):
-    """Answer of `crossgrad_view_gaussians`: the Gaussians that are rendered, as many as before."""
+    """Result of `crossgrad_view_gaussians`: the Gaussians to render, in the same number."""
 
     gaussians: Gaussians
 
 
 @dataclass(frozen=True, eq=False)
 class FinalEdit(DensifyResult):
-    """Answer of `crossgrad_final_edit`: the edit of a finished run, and a line for its log."""
+    """Result of `crossgrad_final_edit`: the edit of a finished run, and a line for its log."""
 
     note: str

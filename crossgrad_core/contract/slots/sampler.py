@@ -1,4 +1,4 @@
-"""The sampler slot: which views are rendered in a step."""
+"""The sampler slot: the choice of the views of a step."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -11,16 +11,16 @@ STATE = "sampler"
 
 
 class Sampler(Component):
-    """Chooses the K training views of a step, given its state and the last step's record.
+    """A method that chooses the K training views of a step from its state and the last record.
 
     Attributes:
-        views: For which K the sampler has a meaning, unless its options say otherwise.
-        default_views: K where the user names none, unless its options say otherwise.
-        default_grouping: Name of the grouping it needs unless the user names another; None where
-            it needs no groups.
-        own_labels: Labels of its draws where it makes its own groups and ignores the grouping.
-        reads_groups: Whether the groups of the training views make a difference to its draws.
-        groups: How many groups it needs; None for any number.
+        views: Supported values of K, unless its options change them.
+        default_views: K if the user sets none, unless its options change it.
+        default_grouping: Name of the grouping that it needs if the user names none; None if it
+            needs no groups.
+        own_labels: Labels of its samples if it makes its own groups and ignores the grouping.
+        reads_groups: Whether its samples depend on the groups of the training views.
+        groups: Number of groups that it needs; None for any number.
     """
 
     slot: ClassVar[str] = "samplers"
@@ -33,29 +33,29 @@ class Sampler(Component):
 
     @property
     def view_counts(self) -> ViewCounts:
-        """For which K the sampler has a meaning with its options as they are."""
+        """Values of K that the sampler supports with its present options."""
         return self.views
 
     @property
     def resolved_views(self) -> int:
-        """K where the user names none."""
+        """K if the user sets none."""
         return self.default_views
 
     def counts(self, views: int) -> frozenset[int]:
-        """How many views a step of a run with K = `views` may have; by default always K.
+        """Return the possible numbers of views per step in a run with K = `views`; by default K.
 
-        A sampler whose steps differ names all numbers: an operator that has no meaning for one of
-        them is refused.
+        A sampler with a varying number of views returns all numbers. An operator that does not
+        support one of the numbers is refused.
         """
         return frozenset({views})
 
     @abstractmethod
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:
-        """The views of this step and the new state. Random numbers come from `context.rng`."""
+        """Return the views of this step and the new state; randomness comes from `context.rng`."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
-        """Answers the hook with this sampler's draw."""
+        """Implement the hook with this sampler's choice."""
         answer = self.sample(context, context.state(STATE))
         draw, state = with_state(answer, ViewSample, self, "sample")
         return SampleResult(draw, states={STATE: state})

@@ -1,9 +1,10 @@
-"""One pass over the float32 gradients of K views: Gramians, weighted sums, overlaps.
+"""Single passes over the float32 gradients of K views: Gramians, weighted sums, overlaps.
 
-Tensors are handed over by address: `addresses` [T, K] int64 holds the place of the first element of
-view k's gradient of tensor t, 0 where the view does not touch the tensor; `sizes` [T] counts
-elements. The work is cut into chunks of `CHUNK` elements whatever the number of threads, and
-partial sums are added in the order of the chunks: same input, same bits.
+Tensors are passed by address. `addresses` [T, K] int64 contains the address of the first element of
+view k's gradient of tensor t, or 0 if the view does not touch the tensor. `sizes` [T] contains the
+numbers of elements. The work is split into chunks of `CHUNK` elements, independent of the number of
+threads, and partial sums are added in the order of the chunks. So the same input gives the same
+bits.
 """
 
 from typing import Any
@@ -22,15 +23,15 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = NDArray[np.float32]
 
-#: Elements of one chunk, 64 kB per view: a chunk of sixteen views stays in the second cache.
+#: Elements of one chunk, 64 kB per view: a chunk of sixteen views fits into the L2 cache.
 CHUNK = 16384
-#: Elements of a chunk that a weighted sum works on at a time.
+#: Elements of a chunk that a weighted sum processes at a time.
 PIECE = 1024
 
 
 @strict_kernel
 def chunk_table(sizes: Ints) -> Ints:
-    """[C, 2] tensor and first element of each chunk."""
+    """Return [C, 2], tensor and first element of each chunk."""
     total = 0
     for size in sizes:
         total += (size + CHUNK - 1) // CHUNK
@@ -46,14 +47,14 @@ def chunk_table(sizes: Ints) -> Ints:
 
 @strict_device
 def row(address: int, start: int, length: int) -> NDArray[np.float32]:
-    """Inside kernels: the `length` elements from element `start` of the tensor at `address`."""
+    """Return `length` elements from element `start` of the tensor at `address` (in kernels)."""
     pointer: Any = float32_pointer(address + 4 * start)  # type: ignore[call-arg]
     return carray(pointer, (length,))
 
 
 @strict_device
 def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> None:
-    """Gramian of more than four rows, in tiles of two by two; the chunk stays in cache."""
+    """Compute the Gramian of more than four rows in 2 x 2 tiles; the chunk stays in cache."""
     tile = np.empty((2, 2))
     for i in range(0, count, 2):
         i1 = min(i + 1, count - 1)
@@ -71,7 +72,7 @@ def _many_dots(rows: Ints, count: int, start: int, length: int, out: Floats) -> 
 
 @strict_device
 def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, out: Floats) -> None:
-    """Upper triangle of one chunk's Gramian; rows of absent views stay as they are (zero)."""
+    """Compute the upper triangle of one chunk's Gramian; rows of absent views stay zero."""
     views = addresses.size
     rows = np.empty(views, np.int64)
     places = np.empty(views, np.int64)
@@ -102,7 +103,7 @@ def _chunk_gramian(addresses: Ints, start: int, length: int, compact: Floats, ou
 
 @strict_kernel
 def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
-    """[T, K, K] sums of the chunks' Gramians, with Neumaier's compensation; both triangles.
+    """Return [T, K, K], the sums of the chunks' Gramians (Neumaier compensation), both triangles.
 
     Args:
         partial: [C, K, K], upper triangles.
@@ -131,14 +132,14 @@ def summed(partial: Floats, table: Ints, tensors: int) -> Floats:
 
 @strict_kernel
 def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Floats) -> None:
-    """Writes the Gramian of each chunk, in one pass; NaN or infinite where a view is not finite.
+    """Write the Gramian of each chunk in one pass; NaN or infinite if a view is not finite.
 
     Args:
         jobs: From `share` or `alone`.
         addresses: [T, K].
         sizes: [T].
         table: [C, 2] from `chunk_table`.
-        partial: [C, K, K], zero; what `summed` adds up.
+        partial: [C, K, K], zero at first; the input of `summed`.
     """
     compact = np.empty(partial.shape[1:])
     chunks = table.shape[0]
@@ -151,7 +152,7 @@ def gramians(jobs: Jobs, addresses: Ints, sizes: Ints, table: Ints, partial: Flo
 
 @strict_device
 def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, dense: Rows) -> bool:
-    """Fills `dense` [K * CHUNK] with one chunk of each view; returns whether anything is in it."""
+    """Fill `dense` [K * CHUNK] with one chunk of each view; return False if no row is in it."""
     first = np.searchsorted(rows, start // width)
     end = np.searchsorted(rows, (start + length - 1) // width + 1)
     if first == end:
@@ -172,11 +173,11 @@ def _spread(addresses: Ints, rows: Ints, width: int, start: int, length: int, de
 def spread_gramian(
     jobs: Jobs, addresses: Ints, rows: Ints, width: int, size: int, partial: Floats
 ) -> None:
-    """Writes what `gramians` finds for gradients that are zero but in some rows, to the bit.
+    """Write the Gramians of gradients that are zero except in some rows, bit by bit as `gramians`.
 
     Args:
         jobs: From `share`.
-        addresses: [K] of the values [R * width]; 0 where a view does not touch the tensor.
+        addresses: [K] addresses of the values [R * width]; 0 if a view does not touch the tensor.
         rows: [R], sorted.
         width: Elements of a row.
         size: Elements of the tensor.
@@ -194,7 +195,8 @@ def spread_gramian(
                 if addresses[k] != 0:
                     places[k] = dense.ctypes.data + 4 * k * CHUNK
             _chunk_gramian(places, 0, length, compact, partial[c])
-            # Numba frees an array after the last line that names it, even if its address is held.
+            # Numba frees an array after the last line that names it, even if its address is still
+            # used.
             dense[0] = np.float32(0.0)
         c = next_job(jobs, chunks)
 
@@ -203,7 +205,7 @@ def spread_gramian(
 def _weighted(
     rows: Ints, weights: Floats, count: int, start: int, wide: Floats, narrow: Rows
 ) -> None:
-    """Fills `narrow` with the sum of weights times rows, rounded once.
+    """Fill `narrow` with the sum of weights times rows, rounded once.
 
     In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
     """
@@ -250,7 +252,7 @@ def _divide(a: Rows, divisor: float) -> None:
 
 @strict_device
 def _plain(rows: Ints, count: int, divisor: float, start: int, narrow: Rows) -> None:
-    """Fills `narrow` with the rows added in order in float32, the bits of accumulation, divided."""
+    """Fill `narrow` with the rows added in order in float32 (as in accumulation), then divide."""
     n = narrow.size
     a = row(rows[0], start, n)
     if count == 1:
@@ -296,7 +298,7 @@ def _combine_pieces(
     first: int,
     end: int,
 ) -> None:
-    """Results pass through a piece of fast memory, as they may overwrite one of the rows."""
+    """Compute results in a buffer in fast memory, because they may overwrite one of the rows."""
     wide = np.empty(PIECE)
     narrow = np.empty(PIECE, np.float32)
     for start in range(first, end, PIECE):
@@ -328,7 +330,7 @@ def _combine_chunk(
         for i in range(result.size):
             result[i] = 0.0
     elif count == 2 and (out == rows[0] or out == rows[1]):
-        # Two views, one of them overwritten: the commonest case. Both sums are commutative.
+        # The most common case: two views, one of them overwritten. Both sums are commutative.
         this = 0 if out == rows[0] else 1
         a, b = row(out, first, end - first), row(rows[1 - this], first, end - first)
         if plain:
@@ -350,15 +352,15 @@ def combine(
     sizes: Ints,
     table: Ints,
 ) -> None:
-    """Writes the weighted sums of all tensors, in one pass over all views.
+    """Write the weighted sums of all tensors, in one pass over all views.
 
     Args:
         jobs: From `share` or `alone`.
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
         plain: [T] whether to add the rows in float32 in the order of the views instead.
-        divisor: What plain sums are divided by, in float32.
-        out: [T] addresses of the results; one may be that of a view.
+        divisor: Divisor of plain sums, in float32.
+        out: [T] addresses of the results; a result may overwrite the gradient of a view.
         sizes: [T].
         table: From `chunk_table`.
     """
@@ -373,7 +375,7 @@ def combine(
 
 @strict_kernel
 def overlapping(a: int, b: int, size: int) -> bool:
-    """Whether two tensors share the place of a non-zero element."""
+    """Return True if two tensors have a common non-zero element."""
     x, y = row(a, 0, size), row(b, 0, size)
     for start in range(0, size, CHUNK):
         shared = 0

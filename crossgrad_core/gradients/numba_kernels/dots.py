@@ -1,7 +1,7 @@
 """Dot products of a few float32 rows in float64, each row read once.
 
-Sums may be reordered within a call, which lets them run in vector registers. Products of float32
-numbers are exact in float64, and squares from 1e-90 to 1e77 are neither lost nor infinite there.
+Sums may be reordered within a call, so that they run in vector registers. Products of float32
+numbers are exact in float64, and squares from 1e-90 to 1e77 neither underflow nor overflow there.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ Out = NDArray[np.float64]
 
 @sum_device
 def dots_1(a: Row, out: Out) -> None:
-    """Upper triangle of the Gramian of one row."""
+    """Compute the upper triangle of the Gramian of one row."""
     aa = 0.0
     for i in range(a.size):
         x = np.float64(a[i])
@@ -25,7 +25,7 @@ def dots_1(a: Row, out: Out) -> None:
 
 @sum_device
 def dots_2(a: Row, b: Row, out: Out) -> None:
-    """Upper triangle of the Gramian of two rows."""
+    """Compute the upper triangle of the Gramian of two rows."""
     aa = ab = bb = 0.0
     for i in range(a.size):
         x, y = np.float64(a[i]), np.float64(b[i])
@@ -37,7 +37,7 @@ def dots_2(a: Row, b: Row, out: Out) -> None:
 
 @sum_device
 def dots_3(a: Row, b: Row, c: Row, out: Out) -> None:
-    """Upper triangle of the Gramian of three rows."""
+    """Compute the upper triangle of the Gramian of three rows."""
     aa = ab = ac = bb = bc = cc = 0.0
     for i in range(a.size):
         x, y, z = np.float64(a[i]), np.float64(b[i]), np.float64(c[i])
@@ -53,7 +53,7 @@ def dots_3(a: Row, b: Row, c: Row, out: Out) -> None:
 
 @sum_device
 def dots_4(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
-    """Upper triangle of the Gramian of four rows."""
+    """Compute the upper triangle of the Gramian of four rows."""
     aa = ab = ac = ad = bb = bc = bd = cc = cd = dd = 0.0
     for i in range(a.size):
         x, y, z, w = np.float64(a[i]), np.float64(b[i]), np.float64(c[i]), np.float64(d[i])
@@ -74,7 +74,7 @@ def dots_4(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
 
 @sum_device
 def dots_2x2(a: Row, b: Row, c: Row, d: Row, out: Out) -> None:
-    """Dot products of the rows (a, b) with the rows (c, d)."""
+    """Compute the dot products of the rows (a, b) with the rows (c, d)."""
     ac = ad = bc = bd = 0.0
     for i in range(a.size):
         x, y, z, w = np.float64(a[i]), np.float64(b[i]), np.float64(c[i]), np.float64(d[i])

@@ -8,7 +8,7 @@ from crossgrad_core.gradients.numba_kernels.pointers import float32_pointer
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Elements that a thread looks at in one go.
+#: Elements that a thread processes at a time.
 PART = 2**15
 _ALL_BUT_SIGN = np.uint32(0x7FFFFFFF)
 
@@ -21,14 +21,17 @@ def largest_bits(
     starts: NDArray[np.int64],
     found: NDArray[np.uint32],
 ) -> None:
-    """Of numbers of one sign the larger has the larger bits; infinity and NaN come last.
+    """Write the bits of the largest magnitude in each part of float32 arrays.
+
+    Without sign, a larger number has larger bits; infinity and NaN have the largest bits.
 
     Args:
         jobs: From `share`.
-        addresses: [T] of arrays of float32.
-        sizes: [T] their elements.
-        starts: [T + 1] first part of each, of `PART` elements, the last one of what is left.
-        found: [parts] written: the largest in each part.
+        addresses: [T] addresses of float32 arrays.
+        sizes: [T] numbers of elements.
+        starts: [T + 1] index of the first part of each array. A part contains `PART` elements; the
+            last part of an array may be shorter.
+        found: [parts] output: the largest bits in each part.
     """
     parts = len(found)
     part = next_job(jobs, parts)
@@ -39,7 +42,7 @@ def largest_bits(
         size, first = sizes[tensor], (part - starts[tensor]) * PART
         bits = carray(float32_pointer(addresses[tensor]), size).view(np.uint32)
         own = bits[first : min(size, first + PART)]
-        # Four runs at a time: memory is waited for less than with one.
+        # Read four streams at a time, which waits less for memory than one stream.
         quarter = len(own) // 4
         p, q = own[:quarter], own[quarter : 2 * quarter]
         r, s = own[2 * quarter : 3 * quarter], own[3 * quarter : 4 * quarter]

@@ -1,4 +1,4 @@
-"""Arrays from addresses, so that one compiled kernel takes any number of tensors."""
+"""Arrays from addresses, so that one compiled kernel supports any number of tensors."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def float32_pointer(typing_context: Any, address: Any) -> Any:  # noqa: ANN401, ARG001
-    """Inside kernels: int64 address -> pointer to float32, which `numba.carray` makes an array."""
+    """Convert an int64 address to a float32 pointer for `numba.carray` (in kernels)."""
     signature = types.CPointer(types.float32)(types.int64)  # type: ignore[no-untyped-call]
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ANN401

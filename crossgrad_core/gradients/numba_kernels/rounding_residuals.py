@@ -1,7 +1,8 @@
-"""Gramians to twice the digits of float64, for operators that need them now and then.
+"""Gramians with twice the digits of float64, for operators that need them occasionally.
 
-One product at a time, with what rounding takes from products and sums added up beside them (Ogita,
-Rump and Oishi 2005): as exact as 106-bit arithmetic, ten times as slow as plain sums.
+Products are added one at a time, and the rounding errors of products and sums are added separately
+(Ogita, Rump and Oishi 2005). This is as exact as 106-bit arithmetic and ten times as slow as plain
+sums.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ Floats = NDArray[np.float64]
 
 @strict_kernel
 def add_products(rows: Floats, high: Floats, low: Floats) -> None:
-    """Adds the Gramian of `rows` [K, P] to the upper triangle of high + low, [K, K] each."""
+    """Add the Gramian of `rows` [K, P] to the upper triangle of high + low, [K, K] each."""
     views, size = rows.shape
     for i in range(views):
         for j in range(i, views):
@@ -29,16 +30,16 @@ def add_products(rows: Floats, high: Floats, low: Floats) -> None:
 
 @strict_kernel
 def add_row_products(rows: Floats, high: Floats, low: Floats) -> None:
-    """Adds the Gramians of `rows` [K, N, d], primitive by primitive, to high + low [N, K, K]."""
+    """Add the Gramians of `rows` [K, N, d], primitive by primitive, to high + low [N, K, K]."""
     for n in range(rows.shape[1]):
         add_products(rows[:, n], high[n], low[n])
 
 
 @strict_kernel
 def left_over(high: Floats, low: Floats, gramians: Floats) -> Floats:
-    """[B, K, K] high + low - gramians from the upper triangles of the first two.
+    """Return [B, K, K], high + low - gramians, from the upper triangles of `high` and `low`.
 
-    Either triangle of a Gramian gets its own: matrix products may round them differently.
+    Both triangles of `gramians` are used, because matrix products may round them differently.
     """
     result = np.zeros(gramians.shape)
     blocks, views, _ = gramians.shape

@@ -1,6 +1,6 @@
 """Row-wise Gramians and weighted sums: one small Gramian per primitive.
 
-Addresses are those of `dense`; row i of a tensor of width d starts at element i * d.
+Addresses have the same meaning as in `dense`; row i of a tensor of width d starts at element i * d.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from crossgrad_core.gradients.numba_kernels.dense import Flags, Floats, Ints, ro
 from crossgrad_core.numerics.jit import strict_device, strict_kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Rows that one task works on.
+#: Rows of one task.
 ROWS = 2048
 
 
@@ -37,13 +37,13 @@ def _gramian_task(addresses: Ints, widths: Ints, first: int, end: int, out: Floa
 
 @strict_kernel
 def row_gramians(jobs: Jobs, addresses: Ints, widths: Ints, out: Floats) -> None:
-    """Adds the Gramians of the rows of a block of T tensors to `out`.
+    """Add the Gramians of the rows of a block of T tensors to `out`.
 
     Args:
         jobs: From `share`.
-        addresses: [T, K]; 0 where a view does not touch the tensor.
+        addresses: [T, K]; 0 if a view does not touch the tensor.
         widths: [T] elements per row.
-        out: [N, K, K] float64, zero.
+        out: [N, K, K] float64, zero at first.
     """
     count = out.shape[0]
     tasks = (count + ROWS - 1) // ROWS
@@ -74,13 +74,13 @@ def _combine_task(
 
 @strict_kernel
 def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: int) -> None:
-    """Writes sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
+    """Write sum_k weights[i, k] * row i of view k; a weight of 0 leaves the row out.
 
     Args:
         jobs: From `share`.
         addresses: [K]; 0 leaves the view out.
         weights: [N, K].
-        out: Address of the result; may be that of a view.
+        out: Address of the result; may be the address of a view's gradient.
         width: Elements per row.
     """
     count = weights.shape[0]
@@ -94,7 +94,7 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
 
 @strict_kernel
 def row_overlaps(a: int, b: int, count: int, width: int, out: Flags) -> None:
-    """Sets out[i] where row i of two tensors shares the place of a non-zero element."""
+    """Set out[i] where rows i of two tensors have a common non-zero element."""
     x, y = row(a, 0, count * width), row(b, 0, count * width)
     for i in range(count):
         for j in range(i * width, i * width + width):

@@ -32,22 +32,22 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
     *,
     from_zero: Collection[str] = (),
 ) -> None:
-    """One step of Adam on every tensor that has a gradient, in place on `params` and `state`.
+    """Take one Adam step on every tensor with a gradient, in place on `params` and `state`.
 
     A tensor without gradient (None or absent) keeps value, moments and step count. Gradients too
-    small or too large for float32 arithmetic are treated as the constants of this module say;
-    within [1e-17, 1e18] the result is that of `torch.optim.Adam` to rounding. A NaN in a gradient
-    spreads to its element, as it does there.
+    small or too large for float32 arithmetic are limited by the constants in `coefficients`. Within
+    [1e-17, 1e18] the result equals `torch.optim.Adam` up to rounding. As there, a NaN in a gradient
+    makes its element NaN.
 
     Args:
         params: Floating-point tensors of any shape, by name.
         grads: Gradients of the same shapes and types.
-        state: Moments and step counts; missing ones start at zero.
+        state: Moments and step counts; missing entries start at zero.
         lrs: Learning rate of every tensor that has a gradient.
-        rule: Decay of the moments, and what is added to the root of the second.
-        scales: By tensor name, not 0; what gradients are multiplied by first. None: 1 everywhere.
-        from_zero: Names of tensors with a gradient that hold nothing yet: they count as zero, and
-            become the step.
+        rule: Decays of the moments, and eps.
+        scales: Tensor name -> factor for the gradient, not 0. None: 1 for all tensors.
+        from_zero: Names of uninitialised tensors with a gradient: they count as zero, and receive
+            the step.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not fit its tensor.
@@ -70,7 +70,7 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
 def counted(
     name: str, param: Tensor, state: AdamState, lr: float, rule: AdamRule, scale: float
 ) -> Coefficients:
-    """Counts one more step of a tensor, whose moments start at zero; the coefficients of the step.
+    """Count one more step of a tensor and return the coefficients of the step.
 
     Args:
         name: Name of the tensor.
@@ -78,7 +78,7 @@ def counted(
         state: Moments and step counts; changed.
         lr: Learning rate.
         rule: As in `adam_step`.
-        scale: What the gradient is multiplied by.
+        scale: Factor for the gradient.
     """
     if name not in state.steps:
         state.exp_avg[name] = torch.zeros_like(param, memory_format=torch.contiguous_format)
@@ -89,7 +89,7 @@ def counted(
 
 
 def update_tensors(updates: Iterable[Update]) -> None:
-    """Applies one step to tensors and their moments: fused on the CPU in float32, else by torch."""
+    """Apply one step to tensors and their moments: fused for float32 on the CPU, else by torch."""
     fused = []
     for update in updates:
         param, grad, exp_avg, exp_avg_sq, step = update
@@ -111,12 +111,12 @@ def update_tensors(updates: Iterable[Update]) -> None:
 def _update_fused(updates: Sequence[Update]) -> None:
     from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    # Held until the step is taken: a copy would be gone before.
+    # Keep references until the step is done, because copies would be freed before.
     laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
     addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
     sizes = [param.numel() for param, *_ in laid_out]
     update_at(addresses, sizes, [step for *_, step in updates])
-    # NumPy wrote behind autograd's back: a graph that still holds the old values must notice.
+    # NumPy wrote without autograd, so graphs that hold the old values must be invalidated.
     for param, _, exp_avg, exp_avg_sq, _ in updates:
         for tensor in (param, exp_avg, exp_avg_sq):  # Older versions of torch take one at a time.
             torch.autograd.graph.increment_version(tensor)
@@ -125,10 +125,10 @@ def _update_fused(updates: Sequence[Update]) -> None:
 def update_on_gpu(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """The same step by torch's fused Adam, which leaves what is subnormal as it is.
+    """Apply the same step by torch's fused Adam, which keeps subnormal numbers.
 
-    An infinite gradient, which is looked for in no step of a GPU, makes the parameter NaN: that is
-    found.
+    Steps on a GPU do not check for infinite gradients. An infinite gradient makes the parameter
+    NaN, which the check of parameters finds.
     """
     grad = grad if step.scale == 1.0 else grad * step.scale
     grad = grad.nan_to_num(nan, nan, nan).clamp(-LARGEST, LARGEST)
@@ -154,7 +154,7 @@ def update_on_gpu(
 def update_reference(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """The same step in plain torch; any device and floating type."""
+    """Apply the same step in plain torch, for any device and floating-point type."""
     grad = grad if step.scale == 1.0 else grad * step.scale
     grad = _without(grad.clamp(-LARGEST, LARGEST), TINY)
     exp_avg.mul_(step.beta1).add_(grad, alpha=1 - step.beta1)
@@ -167,7 +167,7 @@ def update_reference(
 
 
 def _without(values: Tensor, floor: float) -> Tensor:
-    """The values, 0 where the absolute value lies below `floor`; NaN stays."""
+    """Return the values, with 0 where the absolute value is below `floor`; NaN stays."""
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 

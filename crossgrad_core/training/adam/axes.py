@@ -1,8 +1,8 @@
-"""Steps of positions in the units of their Gaussians: along each axis by a share of its length.
+"""Position steps in units of the Gaussians: along each axis, by a share of its length.
 
-Adam gives every position steps of one length, whatever is drawn there: a Gaussian of a wall that a
-camera stands before jumps over its neighbours while one of the ground below a drone hardly moves.
-Scenes that are photographed from very different distances have both (docs/schedules.md).
+Adam gives every position steps of the same length. Then a small Gaussian of a near wall jumps over
+its neighbours, while a large Gaussian of the ground below a drone hardly moves. Scenes with very
+different camera distances contain both (docs/schedules.md).
 """
 
 from math import inf, log, nan
@@ -15,18 +15,18 @@ from torch import Tensor
 from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.numerics.rotations import rotation_matrices
 
-#: An axis counts as so many times shorter or longer than the usual one, at most.
+#: Largest ratio, in either direction, of an axis length to the typical axis length.
 LIMIT: Final = 5.0
-#: Gaussians that are looked at to find the usual one, at most.
+#: Largest number of Gaussians that are sampled for the typical length.
 _SAMPLE = 1024
 
 
 @torch.no_grad()
 def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Tensor) -> None:
-    """Adds steps to positions, stretched along the axes of their Gaussians, in place.
+    """Add steps to positions in place, stretched along the axes of their Gaussians.
 
-    A step has the given length along an axis that is as long as the usual one: the median, over the
-    Gaussians, of the middle one of their three axes.
+    A step keeps its length along an axis of typical length. The typical length is the median, over
+    the Gaussians, of the middle one of their three axis lengths.
 
     Args:
         positions: [N, 3].
@@ -45,28 +45,28 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
         from crossgrad_core.training.adam.numba_kernels.axes import move_rows
 
         move_rows(*(each.detach().numpy() for each in arrays))
-        # NumPy wrote behind autograd's back: a graph that holds the old values must notice.
+        # NumPy wrote without autograd, so graphs that hold the old values must be invalidated.
         torch.autograd.graph.increment_version(positions)
     else:
         positions.add_(stretched(steps, factors, quats))
 
 
 def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
-    """[N, 3] the steps times factors [N, 3] along the axes of rotations `quats` [N, 4]."""
+    """Return the steps [N, 3] times factors [N, 3] along the axes of rotations `quats` [N, 4]."""
     rotations = rotation_matrices(quats)
     along = torch.einsum("nji,nj->ni", rotations, steps)
     return torch.einsum("nij,nj->ni", rotations, factors * along)
 
 
 def _usual(scales: Tensor) -> Tensor | float:
-    """The median, of Gaussians evenly spread over memory, of the middle one of their axes.
+    """Return the median middle log scale of Gaussians that are evenly spread over memory.
 
-    What is not finite is left out, so that it spoils no other Gaussian.
+    Values that are not finite are left out, so that they do not affect other Gaussians.
     """
     some = scales[:: -(-len(scales) // _SAMPLE)]
-    if is_native([some]):  # NumPy begins sooner than torch.
+    if is_native([some]):  # NumPy has less overhead than torch.
         rows = some.numpy()
-        # NaN comes last, as it does where torch sorts.
+        # NaN comes last, as in torch's sort.
         a, b, c = np.where(np.isnan(rows), np.float32(inf), rows).T
         lengths = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
         lengths = lengths[np.isfinite(lengths)]

@@ -1,15 +1,15 @@
-"""The numbers of one step of Adam."""
+"""The coefficients of one Adam step."""
 
 from dataclasses import dataclass
 from math import sqrt
 
-# Gradients and first moments below this count as 0: against eps = 1e-15 they move a parameter by
-# less than 1e-14 of its learning rate, but as they decay they would become subnormal.
+# Gradients and first moments below this count as 0, because they would become subnormal during
+# decay. With eps = 1e-15 they move a parameter by less than 1e-14 of its learning rate.
 TINY = 1e-30
 
 
-# Second moments below float32's smallest normal number count as 0: their root, 1e-19, is nothing
-# against eps = 1e-15, and subnormal numbers are slow on most processors.
+# Second moments below float32's smallest normal number count as 0, because subnormal numbers are
+# slow on most processors. Their root, 1e-19, is negligible against eps = 1e-15.
 SMALLEST_NORMAL = 2.0**-126
 
 
@@ -20,7 +20,7 @@ LARGEST = 1e18
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The numbers of one tensor's step.
+    """The coefficients of one tensor's step.
 
     Attributes:
         beta1: Decay of the first moment.
@@ -28,8 +28,8 @@ class Coefficients:
         lr: Learning rate.
         age: t, steps so far as bias correction counts them, this one included.
         eps: Added to the root of the corrected second moment.
-        scale: What the gradient is multiplied by.
-        from_zero: Whether the tensor holds nothing yet: it counts as zero, and becomes the step.
+        scale: Factor for the gradient.
+        from_zero: Whether the tensor is uninitialised: it counts as zero, and receives the step.
     """
 
     beta1: float

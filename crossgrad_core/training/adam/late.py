@@ -1,11 +1,12 @@
-"""Steps of Adam put off for rows that no view of a step drew, and caught up with when needed.
+"""Deferred Adam steps: rows that no view of a step drew take their step later, when needed.
 
-Such a row has a gradient of zero; Adam moves it all the same, by moments that fade. What it is
-behind with is done row by row when the row is next drawn, or all at once when somebody reads the
-tensor, by the same float32 operations in the same order: the bits are those of steps taken at once.
+Such a row has a gradient of zero, but Adam still moves it by its decaying moments. The deferred
+steps are applied row by row when the row is next drawn, or to all rows when the tensor is read.
+They use the same float32 operations in the same order, so the bits are the same as without
+deferral.
 
-Steps that are taken are under way for a while: nobody reads such a tensor before it is drawn or
-asked for, so that the other threads work on it while this one does what one thread alone can do.
+Steps run in the background on other threads while this thread continues with serial work. The
+tensor is not read before it is drawn or requested, and then the reader waits.
 """
 
 from dataclasses import dataclass, field
@@ -25,24 +26,24 @@ from crossgrad_core.training.adam.coefficients import Coefficients
 if TYPE_CHECKING:
     from crossgrad_core.numerics.jobs import Begun
 
-#: Steps that a row may be late with: tables stay short.
+#: Largest number of deferred steps of a row, so that tables stay short.
 LONGEST: Final = 256
-#: Share of the rows from which on a step is taken with all of them, in the order of memory: to
-#: bring those left out up to date later takes longer.
+#: Share of the rows from which on all rows take the step, in memory order, because deferred updates
+#: would take longer.
 MOST_ROWS: Final = 0.15
-#: Second moments that fade faster may be gone before the kernel looks again.
+#: With a smaller beta2, second moments may vanish before the kernel checks again.
 LEAST_BETA2: Final = 0.5
 
 
 @dataclass(eq=False)
 class _Behind:
-    """The rows of one tensor.
+    """The deferred steps of one tensor.
 
     Attributes:
-        done: [N] steps that each row has had.
-        before: Steps before the first of `room`; no row has had fewer.
-        room: [LONGEST, 5] both betas, step size, scale of the root and eps of each step since.
-        count: Steps since.
+        done: [N] number of steps that each row has taken.
+        before: Number of steps before the first step in `room`; every row has taken these.
+        room: [LONGEST, 5] both betas, step size, scale of the root and eps of each later step.
+        count: Number of steps in `room`.
     """
 
     done: NDArray[np.int32]
@@ -51,21 +52,21 @@ class _Behind:
     count: int = 0
 
     def add(self, *numbers: float) -> None:
-        """Adds a step."""
+        """Add a step."""
         self.room[self.count] = numbers
         self.count += 1
         vars(self).pop("table", None)
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
-        """The steps as the kernel wants them, flat."""
+        """The steps as a flat table for the kernel."""
         steps = self.room[: self.count]
-        # What is above this step or below it from here on.
+        # Upper and lower bounds over this and all later steps.
         later = steps[::-1]
         most = np.maximum.accumulate(later[:, 2])[::-1]
         least = np.minimum.accumulate(later[:, 3])[::-1]
-        # Unless the first moment fades faster than the root of the second, and that slowly enough
-        # to stay a normal number between two looks, nothing is known of what is to come.
+        # The bound is valid only if the first moment decays faster than the root of the second, and
+        # the second stays a normal number between two checks.
         beta1, beta2 = steps[:, 0], steps[:, 1]
         fades = bool(((beta1 <= np.sqrt(beta2)) & (beta2 >= LEAST_BETA2)).all())
         most = most if fades else np.full_like(most, inf)
@@ -73,7 +74,7 @@ class _Behind:
 
 
 class Late:
-    """The steps that rows of tensors are behind with, by tensor name; empty if nothing is late."""
+    """The deferred steps of rows of tensors, by tensor name."""
 
     def __init__(self) -> None:
         self._behind: dict[str, _Behind] = {}
@@ -81,23 +82,23 @@ class Late:
 
     @property
     def names(self) -> frozenset[str]:
-        """The tensors of which rows may be behind, or which a step is changing."""
+        """The tensors with deferred steps of rows, or with a step that still runs."""
         return frozenset(self._behind).union(self._under_way)
 
     def finish(self, name: str | None = None) -> None:
-        """Returns when no step is under way any more; rows that are late stay so.
+        """Wait until no step runs any more; deferred steps stay deferred.
 
         Args:
             name: The tensor; None: all.
         """
         for each in [name] if name is not None else list(self._under_way):
             if (begun := self._under_way.get(each)) is not None:
-                # One that fails is no step, and stays to fail again.
+                # A failed step is kept, so that it raises its error again.
                 begun.end()
                 del self._under_way[each]
 
     def forget(self) -> None:
-        """Forgets all steps; nobody changes a tensor any more when this returns."""
+        """Discard all steps; no thread changes a tensor after the return."""
         for begun in self._under_way.values():
             begun.leave()
         self._under_way, self._behind = {}, {}
@@ -105,15 +106,15 @@ class Late:
     def step(
         self, name: str, param: Tensor, grad: Tensor, adam: AdamState, step: Coefficients
     ) -> None:
-        """Takes a step with the rows that `grad` (sparse) has; the others are late from now on.
+        """Take a step with the rows of `grad` (sparse) and defer the step of all other rows.
 
-        Where it has many rows, the step is taken with all of them, and none is late. It may be
-        under way when this returns (`finish`).
+        If `grad` contains many rows, all rows take the step and none is deferred. The step may
+        still run after the return; `finish` waits for it.
 
         Args:
             name: Name of the tensor; its count in `adam` includes this step.
             param: The tensor, float32 and contiguous, on the CPU.
-            grad: Its gradient by rows, which nobody changes any more.
+            grad: Its sparse gradient, which must not change any more.
             adam: Moments and counts.
             step: The coefficients of the step.
         """
@@ -146,13 +147,13 @@ class Late:
     def catch_up(
         self, name: str, param: Tensor, adam: AdamState, rows: Tensor | None = None
     ) -> None:
-        """Takes the steps that rows of a tensor are behind.
+        """Apply the deferred steps of rows of a tensor.
 
         Args:
             name: Name of the tensor.
             param: The tensor.
             adam: Moments and counts.
-            rows: [R] int32, each once; None: all, and nothing of the tensor is late any more.
+            rows: [R] int32, each once; None means all rows, and no step stays deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)
@@ -162,7 +163,7 @@ class Late:
             from crossgrad_core.numerics.jobs import Begun
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
-            # Of one type in any case: for another one the kernel would be compiled once more.
+            # Always the same type, because another type would compile the kernel again.
             which = np.empty(0, np.int32) if rows is None else rows.numpy()
             flat, width = _flat(name, param, adam), _width(param)
             steps, before = behind.table, behind.before
@@ -177,17 +178,17 @@ class Late:
 
 
 def _flat(name: str, param: Tensor, adam: AdamState) -> tuple[NDArray[np.float32], ...]:
-    """The tensor and its moments, flat."""
+    """Return the tensor and its moments as flat arrays."""
     tensors = (param, adam.exp_avg[name], adam.exp_avg_sq[name])
     return tuple(tensor.detach().view(-1).numpy() for tensor in tensors)
 
 
 def _width(param: Tensor) -> int:
-    """Elements of a row."""
+    """Return the number of elements of a row."""
     return param.numel() // max(1, param.shape[0])
 
 
 def _changed(name: str, param: Tensor, adam: AdamState) -> None:
-    """Lets graphs that hold the old values notice that NumPy wrote behind autograd's back."""
+    """Invalidate graphs that hold the old values, because NumPy wrote without autograd."""
     for tensor in (param, adam.exp_avg[name], adam.exp_avg_sq[name]):
         torch.autograd.graph.increment_version(tensor)

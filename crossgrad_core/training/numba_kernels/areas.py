@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.numerics.jit import kernel
 
-#: A pixel counts where at least this share of what it covers does.
+#: A pixel counts if at least this share of its area counts.
 _COUNTS = 0.5
 
 
@@ -18,12 +18,12 @@ def reduce_by_area(
     small: NDArray[np.uint8],
     counts: NDArray[np.bool_],
 ) -> None:
-    """Writes the mean of what each new pixel covers; the order of all sums is fixed.
+    """Write the mean of the area of each new pixel; the order of all sums is fixed.
 
     Args:
         image: [H, 3 W], contiguous.
-        kept: [H, W], pixels that count; [0, 0] where all do.
-        small: [h, w, 3], h <= H and w <= W: the means, 0 where nothing counts.
+        kept: [H, W], pixels that count; [0, 0] if all pixels count.
+        small: [h, w, 3], h <= H and w <= W: the means; 0 if no pixel of the area counts.
         counts: [h, w], new pixels that count.
     """
     masked = kept.size > 0

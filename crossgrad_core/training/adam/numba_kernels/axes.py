@@ -17,10 +17,10 @@ from crossgrad_core.numerics.simd import (
     where,
 )
 
-#: Rows of one job; fixed, so that the split does not depend on the number of threads.
+#: Rows of one job; fixed, so that results do not depend on the number of threads.
 _ROWS = 1 << 13
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
-#: Squares below it have lost their digits.
+#: Squares below this have lost precision.
 _SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]
@@ -30,9 +30,9 @@ _Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 @device
 def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
-    """Turns steps into the frames of the Gaussians, stretches them there, and turns them back.
+    """Rotate steps into the frames of the Gaussians, stretch them there, and rotate them back.
 
-    The frame of a quaternion that is as good as zero is the world's.
+    A quaternion that is nearly zero counts as the identity.
     """
     a, b, c = steps
     w, x, y, z = quats
@@ -45,7 +45,7 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
     r00, r01, r02 = one - (yy + zz), xy - wz, xz + wy
     r10, r11, r12 = xy + wz, one - (xx + zz), yz - wx
     r20, r21, r22 = xz - wy, yz + wx, one - (xx + yy)
-    # The order of these sums decides about last bits: runs are repeated with it.
+    # The order of these sums determines the last bits, and runs must be repeatable.
     p = factors[0] * fma(r20, c, fma(r10, b, r00 * a))
     q = factors[1] * fma(r21, c, fma(r01, a, r11 * b))
     r = factors[2] * fma(r22, c, fma(r02, a, r12 * b))
@@ -60,7 +60,7 @@ def _stretched(steps: _Three, factors: _Three, quats: _Four) -> _Three:
 def _move_chunks(
     jobs: Jobs, positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats
 ) -> None:
-    # What is left over at the end is worked on here.
+    # Buffers for the last rows of a job.
     place, step = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 3), np.float32)
     factor, quat = np.zeros((LANES, 3), np.float32), np.zeros((LANES, 4), np.float32)
     rows = len(positions)
@@ -87,12 +87,12 @@ def _move_chunks(
 
 
 def move_rows(positions: _Floats, steps: _Floats, factors: _Floats, quats: _Floats) -> None:
-    """Adds to positions [N, 3] the steps [N, 3] times factors [N, 3] along the axes of `quats`.
+    """Add steps [N, 3] times factors [N, 3] along the axes of `quats` to positions [N, 3].
 
     Args:
-        positions: Changed.
-        steps: In the frame of the positions.
-        factors: By axis.
+        positions: Positions, changed in place.
+        steps: Steps in the frame of the positions.
+        factors: Factors by axis.
         quats: [N, 4] rotations, wxyz of any length.
     """
     run = serial if len(positions) <= _ROWS else parallel

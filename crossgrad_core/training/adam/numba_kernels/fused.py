@@ -13,7 +13,7 @@ from crossgrad_core.numerics.jobs import Jobs, next_job, parallel, serial
 from crossgrad_core.training.adam.coefficients import LARGEST, SMALLEST_NORMAL, TINY, Coefficients
 
 _CHUNK = 1 << 16  # elements; fixed, so that the split does not depend on the number of threads
-_RUN = 1 << 13  # elements that are left out together where nothing has moved them yet
+_RUN = 1 << 13  # elements that are skipped together if nothing has moved them yet
 
 _ZERO = np.float32(0)
 _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORMAL, LARGEST))
@@ -29,11 +29,11 @@ Numbers: TypeAlias = tuple[
 def update(
     param: _Floats, grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats, numbers: Numbers
 ) -> None:
-    """Applies one step in place on `param`, `exp_avg` and `exp_avg_sq`; all 1-D of one length."""
+    """Apply one step in place to `param`, `exp_avg` and `exp_avg_sq`; all 1-D of equal length."""
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
-        g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes
+        g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes through
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m
@@ -47,7 +47,7 @@ def update(
 
 @kernel
 def moves(grad: _Floats, exp_avg: _Floats, exp_avg_sq: _Floats) -> bool:
-    """Whether the step changes a bit: gradient and moments of what was never drawn are 0."""
+    """Return True if a gradient or moment is not 0; otherwise the step changes nothing."""
     few = min(64, len(grad))
     for end in (few, len(grad)):
         count = 0
@@ -66,14 +66,14 @@ def _update_chunks(
     numbers: _Floats,
     from_zero: NDArray[np.bool_],
 ) -> None:
-    """Updates tensors, chunk by chunk through all of them.
+    """Update all tensors, chunk by chunk.
 
     Args:
         jobs: From `share`.
-        addresses: [T, 4] of each tensor's values, gradient and moments.
-        sizes: [T] elements.
-        numbers: [T, 9] of each tensor's step.
-        from_zero: [T] whether a tensor holds nothing yet: zeros are written to it first.
+        addresses: [T, 4] addresses of each tensor's values, gradient and moments.
+        sizes: [T] numbers of elements.
+        numbers: [T, 9] coefficients of each tensor's step.
+        from_zero: [T] whether a tensor is uninitialised; zeros are then written to it first.
     """
     chunks = 0
     for size in sizes:
@@ -101,8 +101,8 @@ def _update_chunks(
 
 
 def numbers_of(step: Coefficients) -> Numbers:
-    """The numbers of a step in the type of the kernels; rates beyond it are infinite."""
-    with np.errstate(over="ignore"):  # What they make of the parameters is found and named.
+    """Return the coefficients of a step as float32; rates beyond float32 are infinite."""
+    with np.errstate(over="ignore"):  # The check of parameters reports the effect.
         return (
             np.float32(step.beta1),
             np.float32(1 - step.beta1),
@@ -119,16 +119,16 @@ def numbers_of(step: Coefficients) -> Numbers:
 def update_at(
     addresses: Sequence[Sequence[int]], sizes: Sequence[int], steps: Sequence[Coefficients]
 ) -> None:
-    """Applies a step to each of T tensors, in place.
+    """Apply a step to each of T tensors, in place.
 
     Args:
-        addresses: [T, 4] of each tensor's values, its gradient and both moments, float32, without
-            gaps.
-        sizes: [T] elements.
-        steps: [T].
+        addresses: [T, 4] addresses of each tensor's values, gradient and both moments, float32,
+            contiguous.
+        sizes: [T] numbers of elements.
+        steps: [T] coefficients.
     """
     numbers = np.array([numbers_of(step) for step in steps], np.float32).reshape(-1, 9)
-    # No more elements than a chunk has are not worth waking other threads for.
+    # For at most one chunk of elements, other threads are not worth their overhead.
     run = serial if sum(sizes) <= _CHUNK else parallel
     where = np.array(addresses, np.int64).reshape(-1, 4)
     from_zero = np.array([step.from_zero for step in steps], np.bool_)

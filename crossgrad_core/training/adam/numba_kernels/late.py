@@ -1,11 +1,11 @@
-"""Adam by rows: steps of the rows that have a gradient, and steps without one, many at a time.
+"""Adam by rows: steps of the rows with a gradient, and many steps at once of rows without one.
 
-Bit for bit what `fused` does to a whole tensor. A gradient of zero leaves of a step
+The bits are the same as with `fused` on a whole tensor. With a gradient of zero, a step is
 
     m = beta1 m,   v = beta2 v,   p -= step_size * (m / (sqrt(v) * root_scale + eps))
 
-with the flushes to zero of `coefficients`, so that eight elements take any number of steps in
-registers: memory is read and written once.
+with the flushes to zero of `coefficients`. So eight elements take any number of steps in registers,
+and memory is read and written only once.
 """
 
 import numpy as np
@@ -38,25 +38,25 @@ from crossgrad_core.training.adam.numba_kernels.fused import Numbers, moves, upd
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
-#: Numbers of a step in a table of steps: both betas, step size, scale of the root, eps, and of this
-#: and all later steps the largest step size and the smallest scale of the root.
+#: Columns of a table of steps: both betas, step size, scale of the root, eps, and the largest step
+#: size and the smallest scale of the root over this and all later steps.
 BETA1, BETA2, STEP_SIZE, ROOT_SCALE, EPS, MOST, LEAST = range(7)
 NUMBERS = 7
 
-#: Rows that one task works on, and short rows that lie side by side for a step.
+#: Rows of one task, and short rows that are gathered into contiguous memory for a step.
 _ROWS = 1024
 _GATHERED = 128
 #: Elements that a step with all rows gathers at a time, in whole cache lines (sixteen rows of any
-#: width): with what they move they stay in the first-level cache.
+#: width). With parameters and moments, they fit into the first-level cache.
 _AT_ONCE = 768
-#: Long rows that are taken together where they follow one another.
+#: Long rows that are updated together if they are consecutive.
 _SIDE_BY_SIDE = 16
-#: Elements of a cache line, and rows that memory is asked for ahead of time.
+#: Elements of a cache line, and rows that are prefetched.
 _LINE, _AHEAD = 16, 6
-#: Steps between two looks at whether a parameter still moves.
+#: Steps between two checks of whether a parameter still moves.
 _LOOK = 32
-#: A step of less than half a unit in the last place (2^-25 or more) leaves a parameter as it is;
-#: half of that is kept for the rounding of the estimate.
+#: A step of less than half a unit in the last place (2^-25 or more) does not change a parameter.
+#: Half of this is reserved for the rounding of the estimate.
 _STILL = np.float32(2.0**-26)
 # Second moments above it stay normal numbers for `_LOOK` steps of beta2 >= 1/2.
 _STEADY = np.float32(2.0**-90)
@@ -67,9 +67,9 @@ _TINY, _SMALLEST_NORMAL, _LARGEST = (np.float32(v) for v in (TINY, SMALLEST_NORM
 
 @device
 def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
-    """Whether no step from `row` of the table on changes a bit of the eight parameters.
+    """Return True if no step from `row` of the table on changes a bit of the eight parameters.
 
-    The moments' quotient |m| / sqrt(v) falls from step to step while v is a normal number.
+    The ratio |m| / sqrt(v) of the moments decreases with every step while v is a normal number.
     """
     zero = splat(_ZERO)
     root = where(splat(_STEADY) <= v, square_root(v), zero)
@@ -82,7 +82,7 @@ def _rests(p: Lanes, m: Lanes, v: Lanes, steps: Floats, row: int) -> bool:
 def _eight(
     p: Lanes, m: Lanes, v: Lanes, first: int, end: int, steps: Floats
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """Takes the steps from `first` to before `end` of the table with eight elements."""
+    """Apply the steps from `first` to before `end` of the table to eight elements."""
     zero, tiny, normal = splat(_ZERO), splat(_TINY), splat(_SMALLEST_NORMAL)
     k = end if bits(larger(magnitude(m), v) <= zero) == _ALL else first
     while k < end:
@@ -104,7 +104,7 @@ def _eight(
 
 @device
 def _bring_near(rows: Ints, k: int, width: int, p: Floats, m: Floats, v: Floats) -> None:
-    """Asks for the memory of row k of the list, if there is one, before it is needed."""
+    """Prefetch the memory of row k of the list, if there is one."""
     if k >= rows.size:
         return
     at = np.intp(rows[k]) * width
@@ -128,24 +128,24 @@ def catch_up(
     before: int,
     steps: Floats,
 ) -> None:
-    """Takes the steps without gradient that rows of a tensor are behind.
+    """Apply the deferred steps without gradient to rows of a tensor.
 
     Args:
         jobs: From `share`.
-        whole: Whether all rows are meant.
-        rows: [R] the rows, each once, where not all are meant.
+        whole: Whether to update all rows.
+        rows: [R] the rows to update, each once; unused if `whole`.
         width: Elements of a row.
         param: [N * width].
         exp_avg: [N * width].
         exp_avg_sq: [N * width].
-        done: [N] steps that each row has had; written.
-        before: Steps before the first of the table; no row has had fewer.
-        steps: [T * NUMBERS] the steps since.
+        done: [N] number of steps that each row has taken; updated.
+        before: Number of steps before the table; every row has taken these.
+        steps: [T * NUMBERS] the table of later steps.
     """
     count = done.size if whole else rows.size
     end = steps.size // NUMBERS
     left = width % LANES
-    # What is left over of a row is worked on here, the rest of the eight being zero.
+    # Buffer for the last elements of a row; the unused lanes are zero.
     rest = np.zeros(3 * LANES, np.float32)
     tasks = (count + _ROWS - 1) // _ROWS
     task = next_job(jobs, tasks)
@@ -188,12 +188,12 @@ def catch_up(
 def _stepped(
     p: Lanes, m: Lanes, v: Lanes, g: Lanes, numbers: Numbers
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """One step with sixteen elements and their gradient, as `update` does it."""
+    """Apply one step to sixteen elements with their gradient, as in `update`."""
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     zero, tiny, most = splat_wide(_ZERO), splat_wide(_TINY), splat_wide(_LARGEST)
     least = splat_wide(-_LARGEST)
     g = splat_wide(scale) * g
-    # Comparisons with NaN are false, so that it passes.
+    # Comparisons with NaN are false, so NaN passes through.
     g = where(most < g, most, where(g < least, least, g))
     g = where(magnitude(g) < tiny, zero, g)
     m = fma(splat_wide(beta1), m, splat_wide(new1) * g)
@@ -217,12 +217,12 @@ def _step_row(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Takes one step with a row of WIDE elements or more.
+    """Apply one step to a row of WIDE elements or more.
 
-    Its gradient is row `place` of `grad` if it is drawn, else zero.
+    Its gradient is row `place` of `grad` if it was drawn, else zero.
     """
     at, begin, g = row * width, place * width, splat_wide(_ZERO)
-    # The last sixteen overlap with others: worked out before these are written.
+    # The last sixteen elements overlap with earlier ones, so compute them before these are written.
     tail = at + width - WIDE
     if drawn:
         g = load_wide(grad, begin + width - WIDE)
@@ -253,11 +253,11 @@ def update_rows(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Takes one step with rows of a tensor and their gradients.
+    """Apply one step to rows of a tensor with their gradients.
 
     Args:
         jobs: From `share`.
-        rows: [R], sorted, each once: where they follow one another, memory is read in one go.
+        rows: [R], sorted, each once; consecutive rows are updated as one piece of memory.
         width: Elements of a row.
         param: [N * width].
         grad: [R * width].
@@ -311,7 +311,7 @@ def update_all(
     exp_avg_sq: Floats,
     numbers: Numbers,
 ) -> None:
-    """Takes one step with all rows of a tensor, of which those not listed have no gradient.
+    """Apply one step to all rows of a tensor; rows that are not listed have no gradient.
 
     Args:
         jobs: From `share`.
