@@ -99,9 +99,9 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
     Args:
         runs: The runs.
         asked: The settings that the grid names.
-        earlier: Runs of earlier grids, by the table of their sweep. If the table lists another,
-            unfinished run that fits, none of the earlier runs counts. If that run does not fit,
-            the table belongs to another grid and is ignored.
+        earlier: Runs of earlier grids, by the table of their sweep. If all runs are earlier runs,
+            none of them counts, because the current run has not ended. If a current run exists but
+            does not fit, the table belongs to another grid and is ignored.
     """
     fitting = [run for run in runs if asked.fits(run)]
     current = [run for run in fitting if run not in earlier]

@@ -135,7 +135,7 @@ class Wrong:
         model: The model.
         strength: Strength of the contradiction, as a text for the table.
         views: The wrong views, or an empty set if all views are wrong.
-        causes: Words, one of which the correct cause contains.
+        causes: Words. The correct cause contains at least one of them.
     """
 
     model: Model

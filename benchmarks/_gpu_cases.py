@@ -59,7 +59,7 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            "--split": "every",  # As gsplat's trainer has it, where photos lie in one folder.
+            "--split": "every",  # As in gsplat's trainer, for photos in one folder.
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
         if self.part == "long":

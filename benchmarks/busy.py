@@ -3,10 +3,11 @@
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
 Idle OpenMP threads spin for a while. This is fastest if no other program runs. Otherwise spinning
-takes the core from a process that needs it: another program, or even the thread for which they
-wait. Each round measures every policy, without other programs and with one computing program per
-core. The table shows medians over the rounds in ms. It also shows the time of one process with one
-thread, without and with a second such process, because "two cores" may be one physical core.
+takes the core from a process that needs it: another program, or even the thread for which the
+spinning threads wait. Each round measures every policy, without other programs and with one
+computing program per core. The table shows medians over the rounds in ms. It also shows the time of
+one process with one thread, without and with a second such process, because "two cores" may be one
+physical core.
 """
 
 import argparse

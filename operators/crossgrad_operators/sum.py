@@ -18,7 +18,7 @@ from crossgrad_core.plugin import (
 class Sum(MatrixOperator):
     """u = sum of g_k, equal to one backward pass through the sum of the losses.
 
-    No Gramian and no separate gradients are needed. Both ways give bit-identical results.
+    No Gramian and no separate gradients are needed. Separate gradients give the same bits.
     """
 
     separate: ClassVar[bool] = False

@@ -20,7 +20,7 @@ from crossgrad_operators.numba_kernels.digits import (
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
 #: Smallest pivot of a Cholesky factor of cosines. Smaller pivots are rounding noise of a singular
-#: matrix. The null vector then dominates the solution, which is the result that callers need.
+#: matrix. The null vector, which callers look for, then dominates the solution.
 PIVOT = 1e-15
 
 #: Greatest number of Jacobi sweeps. Six are enough for 16 rows, and eight with 32 digits.

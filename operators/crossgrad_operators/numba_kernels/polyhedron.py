@@ -243,7 +243,7 @@ def forget(problem: Polyhedron) -> None:
 def approach(problem: Polyhedron) -> int:
     """Improve the multipliers of the nearest point while the ridge pulls towards `centre`.
 
-    The algorithm is that of Lawson and Hanson.
+    The method is the algorithm of Lawson and Hanson.
 
     Returns:
         The number of active constraints, whose factor `substitute` can use.

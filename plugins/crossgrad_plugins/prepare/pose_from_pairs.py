@@ -3,7 +3,7 @@
 All pairs with photos that have poses are used. The relative pose of a pair gives a rotation and a
 direction from the other photo. The distance comes from the direction of a second pair, or from
 points that the other photo shows. Each distance gives a candidate pose. The best pose has the most
-agreeing matches, where a pair counts only if enough of its matches agree. Source of the relative
+agreeing matches. A pair counts only if enough of its matches agree. Source of the relative
 pose: Hartley and Zisserman, Multiple View Geometry, 9.6. The rest is our own method.
 """
 
@@ -179,7 +179,7 @@ def _places(
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """A half-line on which a photo lies according to one pair.
+    """A half-line that contains the centre of a photo according to one pair.
 
     Attributes:
         rotation: [3, 3] world to the photo.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _FILE: Final = "placed.json"
-#: The ground is the height below which this percentage of all points lies.
+#: Percentile of the points' heights that is taken as the ground.
 _GROUND: Final = 5.0
 
 

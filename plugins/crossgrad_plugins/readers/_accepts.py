@@ -168,7 +168,7 @@ class Kind:
         return [path for path in inside.files("*") if path.suffix.lower() == self.suffix]
 
     def one(self, inside: Inside, named: str | None) -> Path:
-        """Return the file named by `reader.file`, or the only file of this kind, or almost so.
+        """Return the file named by `reader.file`, or else the only file that (almost) matches.
 
         Raises:
             UserError: There is no such file, there are several, or the name leads out of the scene.

@@ -61,7 +61,7 @@ def check_scene_folder(scene: Path) -> None:
     """Refuse an unreadable folder, and the model's folder in place of the scene's folder.
 
     Raises:
-        UserError: The path is not there, is a file, may not be listed or lies within `sparse`.
+        UserError: The path is missing, is a file, is not readable, or is inside `sparse`.
     """
     try:
         if scene.is_dir():

@@ -210,7 +210,7 @@ def read_model(folder: Path) -> ColmapModel:
     """Read a model. If binary and text files exist, the binary files are read, as in COLMAP.
 
     Raises:
-        UserError: A file is missing, cut short or not what its name says.
+        UserError: A file is missing, truncated, or has another content than its name says.
     """
     return read_binary(folder) if _has(folder, "bin") else read_text(folder)
 
