@@ -1,4 +1,4 @@
-"""Which runs are what a grid asks for: the folder of a sweep keeps those of earlier grids, too."""
+"""Selection of the runs that a grid asks for, as a sweep's folder may hold runs of older grids."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from crossgrad_plugins.sweep.grid import Choice, Grid
 from crossgrad_plugins.sweep.job import Layout
 from crossgrad_plugins.sweep.summary import earlier_rows
 
-#: What a run decides at its start.
+#: Values that a run decides at its start.
 _LEFT_OPEN: Final = ("auto", ABSENT)
-#: Paths, which a grid may name from its own folder, and what a run replaces by its decisions.
+#: Paths, which a grid may name from its own folder, and settings that a run replaces.
 _OTHERWISE: Final = ("exposure_from", "data.init", "plan")
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The settings that a grid names for an arm on a scene; what it leaves out may be anything.
+    """The settings that a grid names for an arm on a scene. Other settings may have any value.
 
     Attributes:
         config: The configuration.
-        settings: Those that can make an arm.
-        has_length: Whether a length is named.
+        settings: The named settings that can define an arm.
+        has_length: True if a length is named.
     """
 
     config: RunConfig
@@ -37,13 +37,13 @@ class Asked:
     def of(
         cls, grid: Grid, choice: Choice, scene: str | None, assignments: Sequence[str] = ()
     ) -> "Asked":
-        """What the grid says, without a look at the scene.
+        """Return the settings that the grid names, without reading the scene.
 
         Args:
             grid: The grid.
-            choice: A configuration of it.
-            scene: A scene of it.
-            assignments: `KEY=VALUE` texts that win over the grid.
+            choice: A configuration of the grid.
+            scene: A scene of the grid.
+            assignments: `KEY=VALUE` texts that override the grid.
 
         Raises:
             UserError: A setting does not exist or has a wrong value.
@@ -54,7 +54,7 @@ class Asked:
         return cls(config, named, bool(LENGTHS & settings.keys()))
 
     def fits(self, run: Run) -> bool:
-        """Whether a run has all that is named; what a run decides or does not know fits."""
+        """Return whether a run has all named settings. Undecided or unknown settings fit."""
         return (not self.has_length or self._fits_length(run)) and all(
             asked in {run.settings.get(name, asked), *_LEFT_OPEN}
             for name, asked in self.settings.items()
@@ -69,7 +69,7 @@ class Asked:
             return (run.length, bound) == (length, asked.max_views)
         if asked.max_views is None:
             return found.get("steps") == asked.steps
-        # A run writes a length in views down in steps.
+        # A run stores a length in views as a number of steps.
         views = ViewsPerStepSpec.parsed(str(found.get("views_per_step") or 1))
         return asked.max_views == found.get("max_views") or (
             views.steps_of(asked.max_views) == found.get("steps")
@@ -77,7 +77,7 @@ class Asked:
 
 
 def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
-    """Those of the runs that were what, by the table of their sweep, other runs are now.
+    """Return the runs that the table of their sweep assigns to earlier grids.
 
     Raises:
         UserError: A table cannot be read.
@@ -94,14 +94,14 @@ def of_earlier_grids(runs: Sequence[Run]) -> frozenset[Run]:
 
 
 def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> list[Run]:
-    """Of runs with one label, scene and seed those that the grid asks for.
+    """Return the runs that the grid asks for, from runs with one label, scene and seed.
 
     Args:
         runs: The runs.
-        asked: What the grid names.
-        earlier: Runs of earlier grids by the table of their sweep. Where it has another run that
-            has not ended, none of these counts; where that run is not what is asked for, the table
-            is that of another grid, and says nothing.
+        asked: The settings that the grid names.
+        earlier: Runs of earlier grids, by the table of their sweep. If all runs are earlier runs,
+            none of them counts, because the current run has not ended. If a current run exists but
+            does not fit, the table belongs to another grid and is ignored.
     """
     fitting = [run for run in runs if asked.fits(run)]
     current = [run for run in fitting if run not in earlier]
@@ -110,10 +110,10 @@ def asked_for(runs: Sequence[Run], asked: Asked, earlier: frozenset[Run]) -> lis
 
 
 def only(runs: Sequence[Run], label: str) -> Run:
-    """The first of runs with one label, scene and seed, which the others repeat.
+    """Return the first of runs with one label, scene and seed, if the other runs repeat it.
 
     Raises:
-        UserError: They are different configurations.
+        UserError: The runs have different configurations.
     """
     first, *others = runs
     for other in others:
@@ -130,7 +130,7 @@ def only(runs: Sequence[Run], label: str) -> Run:
 
 
 def _difference(first: Run, second: Run) -> str:
-    """In which settings that both have two runs differ; empty where in none."""
+    """Return the differences in settings that both runs have, or an empty text."""
     found = [
         f"{name} {value} against {second.settings[name]}"
         for name, value in first.settings.items()

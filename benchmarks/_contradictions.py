@@ -1,4 +1,4 @@
-"""Scenes in memory that are right, and what makes them contradict themselves."""
+"""Correct scenes in memory, and changes that make them contradict themselves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from crossgrad_core.scene.frame import make_frame
 
 Floats: TypeAlias = NDArray[np.float64]
 Photo: TypeAlias = NDArray[np.uint8]
-#: One photo in so many is held out.
+#: One photo in this number of photos is held out.
 EVERY: Final = 8
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 
@@ -29,16 +29,16 @@ class MemoryPhoto:
     pixels: Photo
 
     def image(self) -> Tensor:
-        """[H, W, 3] uint8."""
+        """Return the pixels [H, W, 3] uint8."""
         return torch.from_numpy(self.pixels)
 
     def mask(self) -> None:
-        """Every pixel counts."""
+        """Return None: every pixel counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A scene as a reader finds it, with its photos.
+    """A scene as a reader finds it, including its photos.
 
     Attributes:
         rotations: [V, 3, 3] world to camera.
@@ -60,7 +60,7 @@ class Model:
 
     @classmethod
     def of(cls, scene: Scene) -> "Model":
-        """The model of a scene that was read."""
+        """Return the model of a scene that was read."""
         cameras = [view.camera for view in scene.views]
         centers = scene.similarity.to_input(np.stack([each.center.numpy() for each in cameras]))
         rotations = np.stack([each.world_to_camera[:3, :3].numpy() for each in cameras])
@@ -80,12 +80,12 @@ class Model:
         return np.asarray(-np.einsum("vji,vj->vi", self.rotations, self.translations))
 
     def posed(self, rotations: Floats, centers: Floats) -> "Model":
-        """The model with other poses."""
+        """Return the model with other poses."""
         translations = -np.einsum("vij,vj->vi", rotations, centers)
         return replace(self, rotations=rotations, translations=translations)
 
     def views(self, chosen: NDArray[np.int64]) -> "Model":
-        """The model with some of its views."""
+        """Return the model with some of its views."""
         return replace(
             self,
             rotations=self.rotations[chosen],
@@ -96,11 +96,11 @@ class Model:
         )
 
     def name(self, view: int) -> str:
-        """The name of a view."""
+        """Return the name of a view."""
         return f"{view:04d}.png"
 
     def scene(self) -> Scene:
-        """The scene that is built from it."""
+        """Return the scene that is built from the model."""
         count = len(self.photos)
         test = tuple(range(0, count, EVERY))
         train = tuple(i for i in range(count) if i % EVERY)
@@ -133,9 +133,9 @@ class Wrong:
 
     Attributes:
         model: The model.
-        strength: How strong, in words: a row of the table.
-        views: The views that are wrong; empty if all are.
-        causes: Words of which the right cause has one.
+        strength: Strength of the contradiction, as a text for the table.
+        views: The wrong views, or an empty set if all views are wrong.
+        causes: Words. The correct cause contains at least one of them.
     """
 
     model: Model
@@ -148,13 +148,13 @@ Kind: TypeAlias = Callable[[Model, np.random.Generator], Wrong]
 
 
 def some_views(model: Model, rng: np.random.Generator, most: float = 0.25) -> NDArray[np.int64]:
-    """One to a quarter of the views."""
+    """Return a random selection of one view up to the share `most` of all views."""
     count = len(model.photos)
     return np.sort(rng.choice(count, rng.integers(1, max(2, int(most * count) + 1)), replace=False))
 
 
 def opengl_axes(model: Model, _: np.random.Generator) -> Wrong:
-    """Camera axes y up, z backward."""
+    """Change camera axes to y up, z backward."""
     turned = replace(
         model, rotations=_FLIP @ model.rotations, translations=model.translations @ _FLIP
     )
@@ -162,14 +162,14 @@ def opengl_axes(model: Model, _: np.random.Generator) -> Wrong:
 
 
 def camera_to_world(model: Model, _: np.random.Generator) -> Wrong:
-    """Poses inverted."""
+    """Invert the poses."""
     inverse = model.rotations.transpose(0, 2, 1)
     turned = replace(model, rotations=inverse, translations=model.centers)
     return Wrong(turned, "all", frozenset(), ("camera-to-world",))
 
 
 def exchanged(model: Model, rng: np.random.Generator) -> Wrong:
-    """Pairs of photos exchanged."""
+    """Exchange pairs of photos."""
     views = rng.permutation(len(model.photos))[
         : 2 * int(rng.integers(1, max(2, len(model.photos) // 5)))
     ]
@@ -181,7 +181,7 @@ def exchanged(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def mirrored(model: Model, rng: np.random.Generator) -> Wrong:
-    """Photos mirrored left to right."""
+    """Mirror photos left to right."""
     every = rng.random() < 0.4
     views = np.arange(len(model.photos)) if every else some_views(model, rng)
     photos = list(model.photos)
@@ -193,7 +193,7 @@ def mirrored(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def rotated(model: Model, rng: np.random.Generator) -> Wrong:
-    """Photos rotated by 90 or 180 degrees, in the size of their camera."""
+    """Rotate photos by 90 or 180 degrees, and resize them to the size of their camera."""
     every, turns = rng.random() < 0.4, int(rng.integers(1, 4))
     views = np.arange(len(model.photos)) if every else some_views(model, rng)
     photos = list(model.photos)
@@ -207,7 +207,7 @@ def rotated(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def focal(model: Model, rng: np.random.Generator) -> Wrong:
-    """A wrong focal length."""
+    """Multiply the focal length by a wrong factor."""
     factor = float(rng.choice([0.5, 0.7, 0.8, 0.9, 0.95, 1.05, 1.1, 1.25, 1.5, 2.0]))
     wrong = replace(model, calibrations=model.calibrations * [factor, factor, 1, 1])
     causes = ("focal", "another size")
@@ -215,7 +215,7 @@ def focal(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def nonsense(model: Model, rng: np.random.Generator) -> Wrong:
-    """Cameras that are turned by some angle, or stand elsewhere."""
+    """Rotate cameras by some angle."""
     views, angle = some_views(model, rng), float(rng.choice([10.0, 30.0, 180.0]))
     rotations = model.rotations.copy()
     for view in views:
@@ -227,7 +227,7 @@ def nonsense(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def principal_point(model: Model, rng: np.random.Generator) -> Wrong:
-    """A principal point that is off."""
+    """Move the principal point, or set it to zero."""
     share = float(rng.choice([0.0, 0.05, 0.1, 0.2]))
     sizes = np.array([photo.shape[1::-1] for photo in model.photos], dtype=np.float64)
     off = share * sizes * rng.choice([-1.0, 1.0], 2)
@@ -238,14 +238,14 @@ def principal_point(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def scaled_points(model: Model, rng: np.random.Generator) -> Wrong:
-    """Points in another unit."""
+    """Scale the points to another unit."""
     factor = float(rng.choice([0.1, 0.3048, 0.8, 0.9, 1.1, 1.25, 3.2808, 10.0]))
     strength = f"x {max(factor, 1 / factor):.2f}"
     return Wrong(replace(model, points=model.points * factor), strength, frozenset(), ("units",))
 
 
 def shifted(model: Model, rng: np.random.Generator) -> Wrong:
-    """All photos shifted by one."""
+    """Shift all photos by one view."""
     step = int(rng.choice([-1, 1]))
     photos = model.photos[step:] + model.photos[:step]
     causes = ("shifted", "other photos")
@@ -253,7 +253,7 @@ def shifted(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
-    """Half of the photos at each other's poses."""
+    """Assign half of the photos to each other's poses."""
     views = rng.permutation(len(model.photos))[: len(model.photos) // 2]
     photos = list(model.photos)
     for a, b in zip(views, np.roll(views, 1), strict=True):
@@ -262,7 +262,7 @@ def half_elsewhere(model: Model, rng: np.random.Generator) -> Wrong:
 
 
 def points_y_z(model: Model, _: np.random.Generator) -> Wrong:
-    """Points in a world with other axes than the poses."""
+    """Exchange y and z of the points, so that their axes differ from the axes of the poses."""
     matrix = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return Wrong(
         replace(model, points=model.points @ matrix.T), "all", frozenset(), ("other axes",)
@@ -286,7 +286,7 @@ KINDS: Final[dict[str, Kind]] = {
 
 
 def varied(model: Model, rng: np.random.Generator) -> Model:
-    """A right scene: some photos and points, cropped or stretched photos, tracks or none."""
+    """Vary a correct scene: fewer photos and points, cropped or stretched photos, no tracks."""
     count = int(rng.integers(8, len(model.photos) + 1))
     model = model.views(np.sort(rng.choice(len(model.photos), count, replace=False)))
     if rng.random() < 0.5:
@@ -301,7 +301,7 @@ def varied(model: Model, rng: np.random.Generator) -> Model:
 
 
 def harmless(model: Model, rng: np.random.Generator) -> Model:
-    """Other light, noise, JPEG, another frame: nothing that contradicts."""
+    """Change light, noise, JPEG quality or frame, without a contradiction."""
     photos = list(model.photos)
     if rng.random() < 0.5:
         gains = 2.0 ** rng.normal(0.0, 0.5, len(photos))
@@ -329,7 +329,7 @@ def _moved(model: Model, rng: np.random.Generator) -> Model:
 
 
 def _cropped(model: Model, rng: np.random.Generator) -> Model:
-    """Photos cropped off centre, their principal points moved with them."""
+    """Crop photos off centre, and move their principal points accordingly."""
     height, width = model.photos[0].shape[:2]
     left, top = int(rng.uniform(0, 0.2) * width), int(rng.uniform(0, 0.2) * height)
     photos = [np.ascontiguousarray(photo[top:, left:]) for photo in model.photos]
@@ -343,7 +343,7 @@ def _cropped(model: Model, rng: np.random.Generator) -> Model:
 
 
 def _stretched(model: Model, rng: np.random.Generator) -> Model:
-    """Photos with pixels that are not square: fx and fy differ."""
+    """Stretch photos to non-square pixels, so that fx and fy differ."""
     height, width = model.photos[0].shape[:2]
     new_width = round(width * rng.uniform(0.8, 1.25))
     photos = [np.array(Image.fromarray(each).resize((new_width, height))) for each in model.photos]

@@ -1,4 +1,4 @@
-"""Another capture of a place, and tables of figures on its views that say what they are of."""
+"""Another capture of a place, and tables of figures on its views, with a record of their origin."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ from crossgrad_plugins.compare.run import Run
 if TYPE_CHECKING:
     from crossgrad_core.contract.scene import Scene
 
-#: What a table is of, as it stands in the file beside it.
+#: Origin of a table, as stored in the JSON file next to it.
 Origin: TypeAlias = dict[str, object]
 PLY = "point_cloud.ply"
 
@@ -30,8 +30,8 @@ class Capture:
 
     Attributes:
         path: Its folder.
-        scene: The scene, nothing held out.
-        digest: What it is known by, wherever it lies, in this size of photos.
+        scene: The scene, without held-out views.
+        digest: Fingerprint of the scene for this size of photos, independent of its path.
     """
 
     path: Path
@@ -40,10 +40,10 @@ class Capture:
 
     @classmethod
     def read(cls, path: Path, max_size: int) -> "Capture":
-        """The capture in a folder.
+        """Read the capture in a folder.
 
         Raises:
-            UserError: It cannot be read.
+            UserError: The capture cannot be read.
         """
         reading = {"split": "none", "max_size": max_size}
         config = configured({"scene": path, "data": reading})
@@ -53,12 +53,12 @@ class Capture:
 
 @dataclass(frozen=True)
 class Table:
-    """The figures of a run on the views of another capture, a row for each view.
+    """The figures of a run on the views of another capture, with one row per view.
 
     Attributes:
         run: The run.
         capture: The capture.
-        file: Whether its PLY is drawn, on black, instead of its model.
+        file: True if the run's PLY is drawn on black, instead of its model.
     """
 
     run: Run
@@ -67,17 +67,17 @@ class Table:
 
     @property
     def path(self) -> Path:
-        """The table, as `crossgrad eval RUN --on SCENE` names it."""
+        """Path of the table, as named by `crossgrad eval RUN --on SCENE`."""
         what = "of_ply_on" if self.file else "on"
         return self.run.results.folder / f"per_view_{what}_{self.capture.path.absolute().name}.csv"
 
     @property
     def is_unmarked(self) -> bool:
-        """Whether nothing says what the table is of, as of those that `crossgrad eval` writes."""
+        """True if the table has no record of its origin, as tables of `crossgrad eval`."""
         return self._origin() is None
 
     def figures(self, name: str) -> dict[str, float]:
-        """Photo -> a figure, where the view has one; evaluated where the table is not of this.
+        """Return photo -> figure. The run is evaluated if the table has another origin.
 
         Raises:
             UserError: There is no such figure, or the run cannot be evaluated.
@@ -98,12 +98,12 @@ class Table:
         origin = self._origin()
         if origin is not None:
             return all(origin.get(key) == value for key, value in self._wanted().items())
-        # Kept tables of before are without; these runs cannot be evaluated again.
+        # Old tables have no record of their origin, and their runs cannot be evaluated again.
         views = {view.name for view in self.capture.scene.views}
         return not self._has_checkpoint() and all(row["name"] in views for row in self._rows())
 
     def _origin(self) -> Origin | None:
-        """What the table is of; None where that is not known, or of a table of other bytes."""
+        """Return the table's origin, or None if it is unknown or belongs to other content."""
         path = self.path.with_suffix(".json")
         if not path.is_file():
             return None
@@ -112,7 +112,7 @@ class Table:
         return dict(found) if isinstance(found, dict) and written else None
 
     def _wanted(self) -> Origin:
-        """What the table has to be of; without the PLY where that is no longer there."""
+        """Return the origin that the table must have, without the PLY if the file is missing."""
         wanted: Origin = {"scene": self.capture.digest, "step": self.run.number("step")}
         ply = self.run.results.folder / PLY
         if self.file and ply.is_file():
@@ -144,7 +144,7 @@ class Table:
 
 
 def no_figure(name: str, offered: list[str]) -> UserError:
-    """That there is no figure of that name, and which ones there are."""
+    """Return the error for an unknown figure, with the names of the available figures."""
     return UserError(
         "there is no such figure",
         where="--figure",

@@ -7,31 +7,31 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-#: The last one is the readable reference: it takes part where K is 1, for comparison.
+#: The last one is the reference in plain torch, which takes part only for K = 1.
 RASTERIZERS = ("gsplat", "gswarp", "torch")
 BACKBONES = ("vanilla", "pixel", "mip", "distance", "scaffold", "octree")
 VIEWS = (1, 2, 4, 8)
 OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
-#: Gaussians of the made-up clouds, and megapixels of their photos.
+#: Gaussians of the random clouds, and megapixels of their photos.
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
-#: Lengths of runs with the settings that `crossgrad run` has if nothing is asked.
+#: Lengths of runs with the default settings of `crossgrad run`.
 USUAL = (1_000, 7_000, 30_000)
-#: Steps of a long run that have a row, beside its last.
+#: Steps of a long run that have a row, in addition to the last step.
 STOPS = (7_000, 15_000)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row.
+    """A row of the table.
 
     Attributes:
         part: `sizes`, `steps`, `long` or `usual`.
-        rasterizer: Its name.
-        backbone: Its name.
+        rasterizer: Name of the rasterizer.
+        backbone: Name of the backbone.
         views: K.
-        operator: Its name.
-        steps: How many are measured.
-        gaussians: Of a made-up cloud; 0 for SCENE.
+        operator: Name of the operator.
+        steps: Number of measured steps.
+        gaussians: Number of Gaussians of a random cloud, or 0 for SCENE.
     """
 
     part: str
@@ -44,12 +44,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """The folder of its runs."""
+        """Name of the folder with the runs of the case."""
         split = ("every",) if self.part in {"long", "usual"} else ()
         return "-".join(map(str, (*vars(self).values(), *split)))
 
     def command(self, scene: Path, out: Path) -> list[str]:
-        """The command that trains a run of the parts `long` and `usual`."""
+        """Return the command that trains a run of the parts `long` and `usual`."""
         options = {
             "--device": "cuda",
             "--rasterizer": self.rasterizer,
@@ -59,7 +59,7 @@ class Case:
             "--steps": self.steps,
             "--metrics": "psnr",
             "--out": out,
-            "--split": "every",  # As gsplat's trainer has it, where photos lie in one folder.
+            "--split": "every",  # As in gsplat's trainer, for photos in one folder.
             "--eval-every": max(1, min(1_000, self.steps // 7)),
         }
         if self.part == "long":
@@ -68,7 +68,7 @@ class Case:
         return [sys.executable, "-m", "crossgrad_core", "run", str(scene), "-q", *given]
 
     def config(self, scene: Path) -> dict[str, Any]:
-        """The settings of a case that is measured in this process."""
+        """Return the settings of a case that is measured in this process."""
         return {
             "scene": str(scene),
             "device": "cuda",
@@ -85,7 +85,7 @@ class Case:
 
 
 def cases(steps: int, long: int) -> Iterator[Case]:
-    """All rows, the short ones first."""
+    """Yield all rows, the short cases first."""
     fast = RASTERIZERS[:-1]
     for rasterizer, count in product(fast, SIZES):
         for views, operator in ((1, "sum"), (2, "pcgrad")):
@@ -101,10 +101,10 @@ def cases(steps: int, long: int) -> Iterator[Case]:
 
 
 def is_chosen(case: Case, only: Sequence[str] | None) -> bool:
-    """Whether a case has one of the texts in its name, or there is none."""
+    """Return whether the name of a case contains one of the texts, or no texts are given."""
     return not only or any(text in case.name for text in only)
 
 
 def stops(steps: int) -> tuple[int, ...]:
-    """The steps of a long run whose figures are in the table."""
+    """Return the steps of a long run that have figures in the table."""
     return (*(stop for stop in STOPS if stop < steps), steps)

@@ -1,4 +1,4 @@
-"""gsplat's own trainer, from the folder of its examples, and what it says of itself."""
+"""gsplat's own trainer, started from the folder of its examples, and its statistics."""
 
 import json
 import subprocess
@@ -10,15 +10,15 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Stop:
-    """Figures of the trainer after some steps.
+    """Figures of the trainer after a number of steps.
 
     Attributes:
-        step: How many.
-        seconds: Of the clock since its loop began; evaluations on the way are in them.
-        psnr: Of the held-out photos, dB; None where it has not evaluated.
-        gaussians: Their number.
-        mib: Most memory of the GPU, MiB.
-        file: Where it says so.
+        step: Number of steps.
+        seconds: Wall time since the start of the training loop, including evaluations.
+        psnr: PSNR of the held-out photos in dB, or None without an evaluation.
+        gaussians: Number of Gaussians.
+        mib: Peak memory of the GPU in MiB.
+        file: File that contains these figures.
     """
 
     step: int
@@ -32,14 +32,14 @@ class Stop:
 def trained(
     examples: Path, scene: Path, runs: Path, stops: Sequence[int], limit: float | None
 ) -> tuple[list[Stop], str]:
-    """Trains where the last stop has not been reached; the stops reached, and what went wrong.
+    """Train up to the last stop if it is missing. Return the reached stops and a failure text.
 
     Args:
         examples: The folder of gsplat's examples.
-        scene: The scene, COLMAP; photos as they are.
-        runs: Where its folder goes.
-        stops: Steps at which it evaluates and says what it has; it ends at the last one.
-        limit: Seconds after which it is stopped.
+        scene: The COLMAP scene. Photos keep their size.
+        runs: Folder in which the result folder is made.
+        stops: Steps at which the trainer evaluates and saves. The last stop ends the training.
+        limit: Seconds after which the trainer is stopped.
     """
     folder, why = runs / f"gsplat-trainer-{stops[-1]}", ""
     wanted = [str(stop) for stop in stops]
@@ -73,7 +73,7 @@ def _told(folder: Path, step: int) -> Path:
 
 
 def _failure(command: list[str], folder: Path, limit: float | None) -> str:
-    """Runs a command in a folder; why it did not come to its end, else nothing."""
+    """Run a command in a folder. Return the reason of a failure, or an empty text."""
     try:
         ended = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, check=False, timeout=limit

@@ -1,4 +1,4 @@
-"""Facts about the machine and the process that every benchmark line carries."""
+"""Facts about the machine and the process that are part of every benchmark line."""
 
 import os
 import platform
@@ -10,12 +10,12 @@ from pathlib import Path
 
 
 def facts() -> dict[str, str | int | float]:
-    """Describes where and when a figure was measured.
+    """Return facts about the machine, the time and the software of a measurement.
 
     Returns:
-        ``cpu`` (model name), ``cores`` (those this process may use), ``threads`` (numba's number),
-        ``load`` (1-minute load average at the call, -1 where the system has none), ``date`` (UTC,
-        ISO 8601) and the versions ``python``, ``torch``, ``numba`` and ``numpy``.
+        ``cpu`` (model name), ``cores`` (usable by this process), ``threads`` (of numba), ``load``
+        (1-minute load average at the call, or -1 if unavailable), ``date`` (UTC, ISO 8601) and the
+        versions ``python``, ``torch``, ``numba`` and ``numpy``.
     """
     import numba
 
@@ -33,7 +33,7 @@ def facts() -> dict[str, str | int | float]:
 
 
 def code() -> str:
-    """The commit of the checkout, with a `+` where files differ from it; the version elsewhere."""
+    """Return the commit (with a `+` if files are changed), or the version without a checkout."""
     root = Path(__file__).parents[1]
     try:
         head = _git(root, "rev-parse", "--short=7", "HEAD")
@@ -48,13 +48,13 @@ def _git(root: Path, *arguments: str) -> str:
 
 
 def peak_mib() -> float:
-    """Returns the largest resident memory of this process so far, in MiB (NaN on Windows)."""
+    """Return the largest resident memory of this process so far, in MiB (NaN on Windows)."""
     if sys.platform == "win32":
         return float("nan")
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # Linux counts KiB, macOS bytes.
+    # ru_maxrss is in KiB on Linux and in bytes on macOS.
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 

@@ -1,4 +1,4 @@
-"""Claims of the paper with what tests them, its tables, and the plan of `make paper`, as data."""
+"""The paper's claims with their tests, its tables, and the plan of `make paper`, as data."""
 
 import csv
 from collections.abc import Iterator, Mapping
@@ -11,12 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 HERE = Path(__file__).parent
 DATA = HERE / "paper_data"
-#: How many methods are run on each of the other backbones, and compared there.
+#: Number of methods that are run and compared on each of the other backbones.
 BEST = 2
-#: Grids as they stand in the repository.
+#: Grids as stored in the repository.
 GRIDS = HERE / "grids" / "paper"
 
-#: How the first of two compares with the second.
+#: Expected relation of the first arm to the second arm.
 Expected: TypeAlias = Literal["better", "worse", "equal", "not better"]
 
 
@@ -29,8 +29,8 @@ class Pairing(_Part):
 
     Attributes:
         first: Name of an arm.
-        second: Name of another one.
-        scenes: The only scenes that count; empty for all that both have.
+        second: Name of another arm.
+        scenes: Scenes that count, or empty for all scenes that both arms have.
     """
 
     first: str
@@ -42,9 +42,9 @@ class Reading(_Part):
     """A figure of diagnostics.csv, averaged over the probes of a run.
 
     Attributes:
-        column: Its column.
-        block: Its block; `each` averages over single blocks, too.
-        metric: In which metric gradients are measured.
+        column: Column of the table.
+        block: Block of the gradients. `each` averages over single blocks, too.
+        metric: Metric in which gradients are measured.
     """
 
     column: str
@@ -53,13 +53,13 @@ class Reading(_Part):
 
 
 class Probe(_Part):
-    """A figure of the gradients of an arm's runs, alone or against another one of the same runs.
+    """A figure of the gradients of an arm's runs, or the difference of two figures of these runs.
 
     Attributes:
-        arm: Name of the arm, which has the observer `diagnostics`.
+        arm: Name of the arm, which uses the observer `diagnostics`.
         first: The figure.
-        second: What is taken away from it; None for nothing.
-        scenes: The only scenes that count; empty for all.
+        second: The figure that is subtracted, or None.
+        scenes: Scenes that count, or empty for all.
     """
 
     arm: str
@@ -72,14 +72,14 @@ class Arithmetic(_Part):
     """A statement about figures of the paper's own tables: shares of a gap within bounds.
 
     Attributes:
-        table: Table of `method` and `base`.
+        table: Table that contains `method` and `base`.
         method: The row that closes the gap.
-        base: The row from which the gap is counted.
-        target_table: Table of `target`.
-        target: The row up to which it is counted.
-        low: The least share.
+        base: The row at which the gap starts.
+        target_table: Table that contains `target`.
+        target: The row at which the gap ends.
+        low: The smallest share.
         high: The largest share.
-        scenes: On how many scenes that holds.
+        scenes: Number of scenes for which the statement has to be true.
     """
 
     table: str
@@ -93,16 +93,16 @@ class Arithmetic(_Part):
 
 
 class Check(_Part):
-    """Test of a statement: exactly one of four kinds.
+    """A test of a statement, of exactly one of four kinds.
 
     Attributes:
         test: Two arms.
         probe: A figure of the gradients.
         arithmetic: The paper's own figures.
-        none: Why nothing tests it.
-        expected: What the statement says of `test`, or of the sign of `probe`.
-        within: What it says of the value of `probe`.
-        margin: What counts as no difference; None for 0.1 dB.
+        none: Reason why nothing tests the statement.
+        expected: The statement about `test`, or about the sign of `probe`.
+        within: The bounds for the value of `probe` in the statement.
+        margin: Largest difference that counts as none, or None for 0.1 dB.
     """
 
     test: Pairing | None = None
@@ -126,7 +126,7 @@ class Check(_Part):
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """The arms whose runs it needs."""
+        """The arms whose runs the check needs."""
         if self.test is not None:
             return self.test.first, self.test.second
         return () if self.probe is None else (self.probe.arm,)
@@ -137,8 +137,8 @@ class Claim(Check):
 
     Attributes:
         id: A short name, unique.
-        where: Where it stands.
-        says: What it says.
+        where: Place of the statement in the paper.
+        says: The statement.
     """
 
     id: str
@@ -147,15 +147,15 @@ class Claim(Check):
 
 
 class Row(_Part):
-    """Test of a row of a table.
+    """A test of a row of a table.
 
     Attributes:
-        first: The arm that stands for the row.
-        second: The arm that stands for the reference; with `first` only.
-        probe: A figure of the gradients instead.
-        none: Why nothing tests it.
-        expected: What the row says of the sign of `probe`.
-        margin: What counts as no difference of `probe`.
+        first: The arm that represents the row.
+        second: The arm that represents the reference, only used with `first`.
+        probe: A figure of the gradients that is used instead.
+        none: Reason why nothing tests the row.
+        expected: The row's statement about the sign of `probe`.
+        margin: Largest difference of `probe` that counts as none.
     """
 
     first: str | None = None
@@ -166,7 +166,7 @@ class Row(_Part):
     margin: float | None = None
 
     def check(self, expected: Expected) -> Check:
-        """As a check, where the paper's figures say `expected`."""
+        """Return the row as a check, if the paper's figures say `expected`."""
         if self.first is not None and self.second is not None:
             return Check(test=Pairing(first=self.first, second=self.second), expected=expected)
         return Check(probe=self.probe, none=self.none, expected=self.expected, margin=self.margin)
@@ -176,11 +176,11 @@ class Table(_Part):
     """A table of the paper.
 
     Attributes:
-        id: Its label.
-        title: What it is about.
-        reference: The method that the others are compared with; None where rows are gains already.
-        note: What the reader should know.
-        rows: Method -> what tests it.
+        id: Label of the table.
+        title: Topic of the table.
+        reference: The method with which the rows are compared, or None if rows are gains already.
+        note: Remarks for the reader.
+        rows: Method -> its test.
     """
 
     id: str
@@ -198,14 +198,14 @@ class Section(_Part):
 
 
 class Claims(_Part):
-    """Everything that the paper says.
+    """All claims of the paper.
 
     Attributes:
         source: The paper.
-        untestable: Why figures on the paper's scenes are not tested.
-        recipes: Scenes of the paper -> what those who have them can do.
-        tables: Its tables.
-        sections: Claims of its text.
+        untestable: Reason why figures on the paper's scenes are not tested.
+        recipes: Scenes of the paper -> instructions for readers who have these scenes.
+        tables: Tables of the paper.
+        sections: Claims of the paper's text.
     """
 
     source: str
@@ -215,7 +215,7 @@ class Claims(_Part):
     sections: tuple[Section, ...]
 
     def checks(self) -> Iterator[Check]:
-        """Everything that is tested."""
+        """Yield all checks."""
         for table in self.tables:
             yield from (row.check("better") for row in table.rows.values())
         for section in self.sections:
@@ -223,12 +223,12 @@ class Claims(_Part):
 
 
 class BestOf(_Part):
-    """A grid whose arms are run with the best of other grids' methods.
+    """A grid whose arms are run with the best methods of other grids.
 
     Attributes:
         grid: The grid.
-        candidates: Arms that they are chosen from.
-        scaffold_like: Backbone -> the tuned arms whose rates it takes, with one view and with more.
+        candidates: Arms from which the best methods are chosen.
+        scaffold_like: Backbone -> tuned arms whose rates it uses, for one view and for more views.
     """
 
     grid: str
@@ -237,14 +237,14 @@ class BestOf(_Part):
 
 
 class Plan(_Part):
-    """The order and the rates of `make paper`.
+    """The order and the learning rates of `make paper`.
 
     Attributes:
-        tuning: The grid that factors of rates are read off.
-        grids: The grids that are measured, in their order.
-        rates: Arm -> the tuned arm whose factors it takes; `default` for the rest.
-        fixed_rates: Grids whose arms set their own.
-        best_of: The grid that depends on the others' results.
+        tuning: The grid that gives the factors of the learning rates.
+        grids: The measured grids, in order.
+        rates: Arm -> the tuned arm whose factors it uses. `default` applies to other arms.
+        fixed_rates: Grids whose arms set their own rates.
+        best_of: The grid that depends on the results of the other grids.
     """
 
     tuning: str
@@ -268,19 +268,19 @@ Tables: TypeAlias = Mapping[str, Mapping[str, list[Figure]]]
 
 
 def read_claims() -> Claims:
-    """The paper's claims."""
+    """Return the paper's claims."""
     text = (DATA / "claims.yaml").read_text(encoding="utf-8")
     return Claims.model_validate(yaml.safe_load(text))
 
 
 def read_plan() -> Plan:
-    """The plan of `make paper`."""
+    """Return the plan of `make paper`."""
     text = (DATA / "plan.yaml").read_text(encoding="utf-8")
     return Plan.model_validate(yaml.safe_load(text))
 
 
 def read_tables() -> Tables:
-    """The figures of the paper's tables."""
+    """Return the figures of the paper's tables."""
     found: dict[str, dict[str, list[Figure]]] = {}
     with (DATA / "tables.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -291,7 +291,7 @@ def read_tables() -> Tables:
 
 
 def values(tables: Tables, table: str, method: str, metric: str) -> dict[str, float]:
-    """Scene -> the value of a method; scenes without one are left out."""
+    """Return scene -> value of a method, without scenes that have no value."""
     return {
         figure.scene: figure.value
         for figure in tables[table][method]

@@ -1,4 +1,4 @@
-"""The page docs/results/paper.md: every table and claim with our figure and the verdict."""
+"""The page docs/results/paper.md: all tables and claims, with our figures and verdicts."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,9 +14,9 @@ from crossgrad_plugins.compare.narrative import claim
 from crossgrad_plugins.compare.ranking import noise, standings
 from crossgrad_plugins.compare.run import Run
 
-#: Arms whose runs carry probes of the gradients.
+#: Arms whose runs contain probes of the gradients.
 WATCHED = ("one view, 2x stretched", "symmetric")
-#: What the second view is compared at, and with which arms.
+#: What is equal in a comparison of two views with one view -> the two arms.
 EQUAL = {
     "equal steps": ("two random views", "one view, 1x"),
     "equal views": ("two random views", "one view, 2x stretched"),
@@ -26,17 +26,17 @@ EQUAL = {
         "one view, 2x stretched, published rates",
     ),
 }
-#: Differences of the paper below this count as none.
+#: Differences of the paper below this value, in dB, count as none.
 _SAME = 0.1
 _HEAD = "| {} | the paper | command | ours | verdict |"
 
 
 def page(claims: Claims, results: Results, tables: Tables, extra: Sequence[str] = ()) -> str:
-    """The page.
+    """Return the page.
 
     Args:
-        claims: What the paper says.
-        results: What the grids came to.
+        claims: The paper's claims.
+        results: The results of the grids.
         tables: The figures of the paper.
         extra: Arms of the other backbones, in pairs by backbone.
     """
@@ -160,7 +160,7 @@ def _section(
 
 
 def _command(check: Check, results: Results) -> str:
-    """What runs the arms of a check."""
+    """Return the command that runs the arms of a check."""
     if check.arithmetic is not None:
         return "`python benchmarks/paper.py page`"
     grids = dict.fromkeys(results.grids[arm] for arm in check.arms if arm in results.grids)
@@ -168,7 +168,7 @@ def _command(check: Check, results: Results) -> str:
 
 
 def _expected(tables: Tables, table: Table, method: str) -> Expected:
-    """What the mean difference of a row to the table's reference says."""
+    """Return the relation to the table's reference, by the mean difference of a row."""
     found = _differences(tables, table, method)
     mean = fmean(found.values()) if found else 0.0
     if abs(mean) < _SAME:
@@ -177,7 +177,7 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Scene -> PSNR of a method above the reference; the figures of a table of gains."""
+    """Return scene -> PSNR of a method minus the reference, or the figures of a table of gains."""
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
         return gains
@@ -205,7 +205,7 @@ def _figures(tables: Tables, table: str, method: str) -> str:
 
 
 def _second_view(results: Results) -> Iterator[str]:
-    """The gain of the second view on each scene, at equal steps, views and seconds."""
+    """Yield the gain of the second view on each scene, at equal steps, views and seconds."""
     yield from (
         "## What the second view buys, scene by scene",
         "",
@@ -218,7 +218,7 @@ def _second_view(results: Results) -> Iterator[str]:
         for scene in _scenes(results)
         for name, (a, b) in EQUAL.items()
     }
-    # One table, one family of comparisons.
+    # All rows of the table are one family of comparisons.
     whole = [
         key
         for key, each in contrasts.items()
@@ -238,7 +238,7 @@ def _second_view(results: Results) -> Iterator[str]:
 
 
 def _lacking(results: Results, scene: str, name: str) -> str:
-    """Which pairs of a comparison on a scene are still to come; empty where none is."""
+    """Return the number of finished pairs of an unfinished comparison, or an empty text."""
     wanted, missing = results.missing(EQUAL[name], (scene,))
     if not wanted:
         return ": in no grid"
@@ -282,7 +282,7 @@ def _other_backbones(results: Results, extra: Sequence[str]) -> Iterator[str]:
 
 
 def _by_scene(results: Results) -> Iterator[str]:
-    """Cameras, gradients and gains beside one another, a row for each scene."""
+    """Yield a table of cameras, gradients and gains with one row per scene."""
     yield from ("## Cameras and gradients by scene", "")
     watched = results.runs.get(WATCHED[0], {})
     if not any(probe_rows(run) for run in watched.values()):
@@ -336,7 +336,7 @@ def _cell(row: Mapping[str, str], column: str) -> str:
 
 
 def _trajectories(results: Results) -> Iterator[str]:
-    """Conflict, ratios and variances over training, a row for each probe."""
+    """Yield a table of conflicts, ratios and variances over training, one row per probe."""
     yield from ("## Trajectories", "")
     rows = [line for arm in WATCHED for line in _trajectory(arm, results)]
     if not rows:
@@ -367,7 +367,7 @@ def _trajectory(arm: str, results: Results) -> Iterator[str]:
 
 
 def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[str]:
-    """The cells of one probe; a table of its rows for each seed."""
+    """Yield the cells of one probe. `tables` contains its rows for each seed."""
 
     def over_seeds(column: str, block: str) -> str:
         reading = Reading(column=column, block=block)
@@ -383,9 +383,9 @@ def _probe(tables: Sequence[Sequence[Mapping[str, str]]], run: Run) -> Iterator[
 
 
 def _with_interval(row: Mapping[str, str], column: str) -> str:
-    """An estimate with its 95 % interval; no value >= 0 may be credible beside one below 0."""
+    """Return an estimate with its 95 % interval. A negative estimate has no interval above 0."""
     value, low, high = (row.get(f"{column}{end}", "") for end in ("", "_low", "_high"))
-    # Tables of before 2026-11-25 have [0, 0] there.
+    # Tables from before 2026-11-25 contain [0, 0] in this case.
     if value and float(value) < 0.0 and not any(float(end) for end in (low, high) if end):
         return f"{_cell(row, column)} (none, the estimate is below 0)"
     if not low or not high:

@@ -1,4 +1,4 @@
-"""Runs of the paper's grids by arm, and what of them is still to come."""
+"""Runs of the paper's grids by arm, and the runs that are still missing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,21 +16,21 @@ from crossgrad_plugins.compare.load_runs import read_runs
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.sweep.grid import Grid, choices, scene_name
 
-#: Rows of diagnostics.csv that join blocks.
+#: Rows of diagnostics.csv that combine several blocks.
 JOINED = ("all", "opacities+f_dc")
 PROBES, CAMERAS = "diagnostics.csv", "cameras.csv"
 
 
 @dataclass(frozen=True)
 class Results:
-    """The runs of all grids, and what is still to come.
+    """The runs of all grids, and the runs that are still missing.
 
     Attributes:
-        runs: Arm -> scene and seed -> run, of those that finished.
-        planned: Arm -> scenes and seeds that its grid has.
+        runs: Arm -> scene and seed -> finished run.
+        planned: Arm -> scenes and seeds in its grid.
         failed: Arm -> scenes and seeds whose run failed.
-        grids: Arm -> the grid that it belongs to.
-        left_out: Arm -> folders of its runs that are not what the grid asks for.
+        grids: Arm -> its grid.
+        left_out: Arm -> folders of its runs that the grid does not ask for.
     """
 
     runs: Mapping[str, Runs]
@@ -40,7 +40,7 @@ class Results:
     left_out: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def missing(self, arms: Sequence[str], scenes: Sequence[str] = ()) -> tuple[int, int]:
-        """How many pairs of scene and seed the arms share by plan, and how many are to come."""
+        """Return the number of pairs (scene, seed) that the arms share, and of missing pairs."""
         shared = frozenset.intersection(*(self.planned.get(arm, frozenset()) for arm in arms))
         wanted = {each for each in shared if not scenes or each[0] in scenes}
         ended = {
@@ -56,16 +56,16 @@ class Results:
 def read_results(
     sweeps: Mapping[str, Path], grids: Mapping[str, Grid], assignments: Sequence[str] = ()
 ) -> Results:
-    """Reads the runs of all sweeps that there are.
+    """Read the runs of all existing sweeps.
 
     Args:
-        sweeps: Grid -> the folder of its sweep, which need not be there.
+        sweeps: Grid -> folder of its sweep, which may be missing.
         grids: Grid -> its content.
-        assignments: `KEY=VALUE` texts that the sweeps were started with.
+        assignments: `KEY=VALUE` texts with which the sweeps were started.
 
     Raises:
         UserError: Runs of one scene differ in views or photos, a file is damaged, or an arm has
-            several configurations that its grid does not tell apart.
+            several configurations that its grid does not distinguish.
     """
     planned, home = {}, {}
     for name, grid in grids.items():
@@ -102,7 +102,7 @@ def _chosen(
     dict[str, frozenset[tuple[str, int]]],
     dict[str, tuple[Path, ...]],
 ]:
-    """Arm -> the runs that its grid asks for, what failed of them, and which runs it does not."""
+    """Return by arm the runs that its grid asks for, the failed runs, and the other runs."""
     runs: dict[str, dict[tuple[str, int], Run]] = {}
     failed: dict[str, frozenset[tuple[str, int]]] = {}
     left_out: dict[str, tuple[Path, ...]] = {}
@@ -122,7 +122,7 @@ def _chosen(
 
 
 def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
-    """The rows of a table of the observer `diagnostics`; none where the run did not have it."""
+    """Return the rows of a table of the observer `diagnostics`, or none without the observer."""
     path = run.results.folder / file
     if not path.is_file():
         return []
@@ -133,7 +133,7 @@ def probe_rows(run: Run, file: str = PROBES) -> list[dict[str, str]]:
 def probed(
     run: Run, reading: Reading, rows: Sequence[Mapping[str, str]] | None = None
 ) -> float | None:
-    """A figure of a run's gradients, averaged over its probes; None where it has none."""
+    """Return a figure of a run's gradients, averaged over probes, or None if it is missing."""
     found = [
         number(row, reading.column)
         for row in (probe_rows(run) if rows is None else rows)
@@ -144,7 +144,7 @@ def probed(
 
 
 def number(row: Mapping[str, str], column: str) -> float | None:
-    """A cell as a number; None where it is empty or not finite."""
+    """Return a cell as a number, or None if it is empty or not finite."""
     text = row.get(column, "")
     value = float(text) if text else float("nan")
     return value if isfinite(value) else None

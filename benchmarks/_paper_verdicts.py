@@ -14,10 +14,10 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.statistics import Estimate, Verdict, corrected, estimate, verdicts
 
-#: A p-value below which something is sure, and the share of pairs whose loss leaves a claim open.
+#: Largest significant p-value, and the share of lost pairs that leaves a claim open.
 _SURE, _LOST = 0.05, 0.25
-#: What verdicts are about: where the exposure of a held-out photo is guessed wrongly, plain PSNR is
-#: the guess more than the scene, and arms look alike that are not.
+#: The figure of the verdicts. If the exposure of held-out photos is guessed wrongly, plain PSNR
+#: depends more on this guess than on the scene, so that different arms look alike.
 PSNR = Quantity.of("psnr_cc")
 PLAIN = Quantity.of("psnr")
 
@@ -38,8 +38,8 @@ class Answer:
 
     Attributes:
         outcome: The verdict.
-        figure: Our figure with its interval; empty without one.
-        detail: What else is to be said of the verdict; empty where nothing is.
+        figure: Our figure with its interval, or an empty text.
+        detail: Further remarks on the verdict, or an empty text.
     """
 
     outcome: Outcome
@@ -49,7 +49,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class _Measured:
-    """A test with its contrast; None where there are no runs."""
+    """A test with its contrast, which is None without runs."""
 
     check: Check
     contrast: Contrast | None
@@ -60,12 +60,12 @@ class _Measured:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The judgement on a comparison, beside the others of its table.
+    """The judgement on a comparison, corrected for the other comparisons of its table.
 
     Attributes:
-        verdict: Of `crossgrad compare`.
-        is_small: Whether the difference is surely within the margin.
-        is_not_above: Whether it is surely not above the margin.
+        verdict: Verdict of `crossgrad compare`.
+        is_small: True if the difference is surely within the margin.
+        is_not_above: True if the difference is surely not above the margin.
     """
 
     verdict: Verdict = Verdict.INCONCLUSIVE
@@ -74,16 +74,16 @@ class Judgement:
 
 
 def answers(checks: Sequence[Check], results: Results, tables: Tables) -> list[Answer]:
-    """The answers to checks that are shown in one table, whose p-values are corrected together."""
+    """Return the answers to the checks of one table, whose p-values are corrected together."""
     measured = [_measured(check, results) for check in checks]
-    # Two statements about the same two arms are one comparison.
+    # Two statements about the same two arms count as one comparison.
     family = {_key(each): _estimate(each) for each in measured if _is_judged(each)}
     found = dict(zip(family, judgements(list(family.values())), strict=True))
     return [_answer(each, found.get(_key(each)), tables) for each in measured]
 
 
 def judgements(family: Sequence[Estimate]) -> list[Judgement]:
-    """The judgements on comparisons that are shown together."""
+    """Return the judgements on comparisons that are shown together."""
     small = corrected([each.p_equivalent for each in family])
     above = corrected([each.p_above for each in family])
     return [
@@ -134,7 +134,7 @@ def _measured(check: Check, results: Results) -> _Measured:
 def paired(
     pairing: Pairing, results: Results, quantity: Quantity = PSNR, regime: str | None = None
 ) -> Contrast:
-    """Two arms at the ends of their runs."""
+    """Return the contrast of two arms at the end of their runs."""
 
     def reading(run: Run) -> float | None:
         hidden = pairing.scenes and run.scene not in pairing.scenes
@@ -146,7 +146,7 @@ def paired(
 
 
 def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
-    """A figure of the gradients, or its difference to another one, run by run."""
+    """Return a figure of the gradients, or its difference to another figure, run by run."""
     pairs = []
     for (scene, seed), run in sorted(results.runs.get(probe.arm, {}).items()):
         if probe.scenes and scene not in probe.scenes:
@@ -165,7 +165,7 @@ def _of_gradients(probe: Probe, results: Results, margin: float) -> Contrast:
 
 
 def figure_of(found: Contrast, *, signed: bool = True) -> str:
-    """An estimate with its 95 % interval and its pairs; empty without a pair."""
+    """Return an estimate with its 95 % interval and number of pairs, or "" without pairs."""
     if found.estimate is None:
         return ""
     quantity, center = found.quantity, found.estimate.center
@@ -181,7 +181,7 @@ def figure_of(found: Contrast, *, signed: bool = True) -> str:
 
 
 def with_plain(pairing: Pairing, results: Results, found: Contrast) -> str:
-    """The figure, and beside it the estimate of plain PSNR."""
+    """Return the figure, followed by the estimate of plain PSNR."""
     text = figure_of(found)
     plain = paired(pairing, results, PLAIN)
     if not text or plain.estimate is None:
@@ -224,7 +224,7 @@ def _judged(each: _Measured, judgement: Judgement) -> Answer:
 
 
 def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outcome:
-    """Whether a value lies within bounds, by its 95 % interval."""
+    """Return whether a value is within bounds, judged by its 95 % interval."""
     low, high = interval
     if within[0] <= low and high <= within[1]:
         return Outcome.HOLDS
@@ -232,14 +232,14 @@ def _located(within: tuple[float, float], interval: tuple[float, float]) -> Outc
 
 
 def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Outcome:
-    """The verdict on a statement about two arms, from the judgement on their difference.
+    """Return the outcome of a statement about two arms, from the judgement on their difference.
 
-    What holds on all scenes together is open where some scene surely contradicts it.
+    A statement that is true for all scenes together is open if a scene surely contradicts it.
     """
     ahead = found.favours == found.first
     verdict = judgement.verdict
     if verdict is Verdict.INCONCLUSIVE:
-        # What has one side only can be settled where the other side is open.
+        # A one-sided statement can be decided although the two-sided verdict is open.
         settled = expected == "not better" and judgement.is_not_above
         return Outcome.HOLDS if settled else Outcome.OPEN
     holds = {
@@ -254,7 +254,7 @@ def outcome_of(expected: Expected, judgement: Judgement, found: Contrast) -> Out
 
 
 def _calculated(claim: Arithmetic, tables: Tables) -> Answer:
-    """A statement about shares of a gap, from the paper's own figures."""
+    """Return the answer to a statement about shares of a gap, from the paper's own figures."""
     method = values(tables, claim.table, claim.method, "PSNR")
     base = values(tables, claim.table, claim.base, "PSNR")
     target = values(tables, claim.target_table, claim.target, "PSNR")

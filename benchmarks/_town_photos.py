@@ -1,9 +1,9 @@
-"""Photos of a town of boxes and trees, by rays: what is hit, what colour it has, what the sun sees.
+"""Photos of a town of boxes and trees by ray casting, with colours, shading and shadows.
 
-Coordinates are metres, z up. A box is a row x, y, half its width and depth, bottom, top, cosine and
-sine of its turn, height of its middle, radius of the ball around it; a tree is an ellipsoid x, y,
-z, horizontal and vertical radius. Patterns are procedural, with details from 3 cm to several
-metres, so that an overview and a close-up of one wall both have something to learn.
+Coordinates are metres, z up. A box is a row x, y, half width, half depth, bottom, top, cosine and
+sine of its rotation, height of its middle, radius of its bounding sphere. A tree is an ellipsoid x,
+y, z, horizontal and vertical radius. Patterns are procedural, with details from 3 cm to several
+metres, so that overviews and close-ups of a wall both contain details to learn.
 """
 
 import math
@@ -26,7 +26,7 @@ kernel = njit(error_model="numpy")
 
 @kernel
 def _lot(x: int, y: int, z: int) -> float:
-    """A number in [0, 1) that three integers draw."""
+    """Return a hash of three integers as a number in [0, 1)."""
     h = (x * 374761393 + y * 668265263 + z * 2147483647 + 1013904223) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF
@@ -35,7 +35,7 @@ def _lot(x: int, y: int, z: int) -> float:
 
 @kernel
 def _noise(x: float, y: float, k: int) -> float:
-    """Smooth noise in [0, 1] with a period of about 1."""
+    """Return smooth noise in [0, 1] with a period of about 1."""
     i, j = math.floor(x), math.floor(y)
     a, b = x - i, y - j
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
@@ -47,7 +47,7 @@ def _noise(x: float, y: float, k: int) -> float:
 
 @kernel
 def _grain(x: float, y: float, k: int, finest: float) -> float:
-    """Octaves of noise from 4 m to `finest`, 0 in the mean."""
+    """Return octaves of noise from 4 m to `finest`, with mean 0."""
     total, frequency, weight = 0.0, 0.25, 0.5
     while frequency * finest <= 1:
         total += weight * (_noise(x * frequency + 17.3 * k, y * frequency + 5.1 * k, k) - 0.5)
@@ -59,7 +59,7 @@ def _grain(x: float, y: float, k: int, finest: float) -> float:
 
 @kernel
 def _part(x: float, size: float) -> tuple[int, float]:
-    """The number of the piece of `size` that x lies in, and where in it, from 0 to 1."""
+    """Return the index of the interval of length `size` that contains x, and the position in it."""
     whole = math.floor(x / size)
     return int(whole), x / size - whole
 
@@ -76,7 +76,7 @@ def _window(k: int, column: int, row: int, across: float, up: float) -> Vector:
 
 @kernel
 def _wall(u: float, v: float, k: int) -> Vector:
-    """Colour of a wall at u along it and v above the ground: bricks or plaster, shops, windows."""
+    """Return the colour of a wall at u along it and v above the ground, with shops and windows."""
     red, green = 0.35 + 0.5 * _lot(k, 1, 7), 0.32 + 0.42 * _lot(k, 2, 7)
     blue = 0.28 + 0.4 * _lot(k, 3, 7)
     tone = 1 + 0.55 * _grain(u, v, k, 0.03)
@@ -117,7 +117,7 @@ def _roof(x: float, y: float, k: int) -> Vector:
 
 @kernel
 def _road(a: float, b: float, along: float, road: float, tone: float) -> Vector:
-    """Asphalt with lines and crossings; a and b are the distances from the middles of two roads."""
+    """Return the colour of asphalt. a and b are the distances from the middles of two roads."""
     near, far = min(a, b), max(a, b)
     line = near < 0.09 and _part(along, 4.0)[1] < 0.5
     crossing = road / 2 + 0.5 < far < road / 2 + 3 and abs(_part(near, 0.6)[1] - 0.5) < 0.22
@@ -127,7 +127,7 @@ def _road(a: float, b: float, along: float, road: float, tone: float) -> Vector:
 
 @kernel
 def _ground(x: float, y: float, k: int, pitch: float, road: float) -> Vector:
-    """Roads every `pitch` metres in both directions, pavements beside them, grass elsewhere."""
+    """Return the colour of the ground: roads every `pitch` metres, pavements, and grass."""
     grain = _grain(x, y, k + 57, 0.03)
     a = abs(x - pitch * math.floor(x / pitch + 0.5))
     b = abs(y - pitch * math.floor(y / pitch + 0.5))
@@ -154,7 +154,7 @@ def _sky(way: Vector, k: int) -> Vector:
 
 @kernel
 def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, int]:
-    """Distance of a box if it is nearer than `best`, and the axis of the face; else -1."""
+    """Return distance and face axis of a box nearer than `best`, else `best` and -1."""
     x, y, z = eye[0] - box[0], eye[1] - box[1], eye[2] - box[8]
     along = x * way[0] + y * way[1] + z * way[2]
     if along > box[9] or x * x + y * y + z * z - along * along > box[9] * box[9]:
@@ -165,7 +165,7 @@ def _hit_box(eye: Vector, way: Vector, box: Array, best: float) -> tuple[float, 
     least, most = (-box[2], -box[3], box[4]), (box[2], box[3], box[5])
     entry, exit_, face = _NEAR, best, -1
     for axis in range(3):
-        # A ray along a face divides by 0: infinities compare as they should.
+        # A ray parallel to a face divides by 0. Comparisons with infinities are still correct.
         first = (least[axis] - begin[axis]) / ahead[axis]
         second = (most[axis] - begin[axis]) / ahead[axis]
         if min(first, second) > entry:
@@ -191,17 +191,17 @@ def _hit_tree(eye: Vector, way: Vector, tree: Array, best: float) -> float:
 def first_hit(
     eye: Vector, way: Vector, boxes: Array, trees: Array, any_hit: bool
 ) -> tuple[float, int, int, int]:
-    """What a ray meets first.
+    """Return the first object that a ray hits.
 
     Args:
-        eye: Where it begins.
+        eye: Start of the ray.
         way: Unit vector.
         boxes: [B, 10].
         trees: [T, 5].
-        any_hit: Whether the first thing found is enough.
+        any_hit: True if any hit is enough.
 
     Returns:
-        Distance, kind, number, and the axis of a box's face.
+        Distance, kind, index, and the axis of a box's face.
     """
     best, kind, number, face = FAR, SKY, -1, 0
     if way[2] < 0 and -eye[2] / way[2] < best:
@@ -223,7 +223,7 @@ def first_hit(
 
 @kernel
 def _of_box(at: Vector, box: Array, face: int, k: int) -> tuple[Vector, Vector]:
-    """Colour and normal of a box."""
+    """Return colour and normal of a box."""
     c, s, x, y = box[6], box[7], at[0] - box[0], at[1] - box[1]
     p, q = c * x + s * y, c * y - s * x
     if face == 2:
@@ -237,7 +237,7 @@ def _of_box(at: Vector, box: Array, face: int, k: int) -> tuple[Vector, Vector]:
 
 @kernel
 def _of_tree(at: Vector, tree: Array, k: int) -> tuple[Vector, Vector]:
-    """Colour and normal of a tree."""
+    """Return colour and normal of a tree."""
     x, y = (at[0] - tree[0]) / tree[3] ** 2, (at[1] - tree[1]) / tree[3] ** 2
     z = (at[2] - tree[2]) / tree[4] ** 2
     norm = math.sqrt(x * x + y * y + z * z)
@@ -250,7 +250,7 @@ def _of_tree(at: Vector, tree: Array, k: int) -> tuple[Vector, Vector]:
 def _seen(
     eye: Vector, way: Vector, boxes: Array, trees: Array, sun: Vector, town: Array
 ) -> tuple[float, Vector]:
-    """Distance (FAR in the sky) and colour of what a ray meets."""
+    """Return distance (FAR for the sky) and colour of the first hit of a ray."""
     seed, pitch, road = int(town[0]), town[1], town[2]
     distance, kind, number, face = first_hit(eye, way, boxes, trees, False)
     if kind == SKY:
@@ -283,19 +283,19 @@ def photograph(
     size: tuple[int, int],
     rays: int,
 ) -> tuple[Array, Array]:
-    """A photo, and the depth at the centres of its pixels.
+    """Return a photo, and the depth at the centres of its pixels.
 
     Args:
-        camera: [3] centre, [3, 3] axes to the right, down and ahead, and focal length in pixels;
-            the principal point is the middle.
-        things: [B, 10] boxes, [T, 5] trees, unit vector towards the sun, and [3] number of the
-            patterns, metres from road to road, width of a road.
+        camera: [3] centre, [3, 3] axes to the right, down and ahead, and focal length in pixels.
+            The principal point is the middle of the photo.
+        things: [B, 10] boxes, [T, 5] trees, unit vector towards the sun, and [3] seed of the
+            patterns, distance of roads in metres, width of a road.
         size: Width and height.
-        rays: Rays of a pixel are `rays` x `rays`, beside the one of the depth.
+        rays: A pixel has `rays` x `rays` rays, and one more ray for the depth.
 
     Returns:
-        [height, width, 3] in [0, 1], and [height, width] the depth along the camera's axis, 0 where
-        there is sky.
+        [height, width, 3] in [0, 1], and [height, width] depth along the camera's axis, 0 for the
+        sky.
     """
     (eye, axes, focal), (boxes, trees, sun, town), (width, height) = camera, things, size
     image, depth = np.zeros((height, width, 3)), np.zeros((height, width))

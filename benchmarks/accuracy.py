@@ -1,9 +1,9 @@
-"""Holds a fast rasterizer against the float64 reference on a fixed case; prints one JSON line.
+"""Compares a fast rasterizer with the float64 reference on a fixed case, as one JSON line.
 
     python benchmarks/accuracy.py CASE.npz [--rasterizer numba]
 
-A case holds `means`, `quats`, `scales`, `opacities`, `colors`, a camera (`viewmat`, `K`, `width`,
-`height`) and `v_image`, the gradient of the loss by the image.
+A case contains `means`, `quats`, `scales`, `opacities`, `colors`, a camera (`viewmat`, `K`,
+`width`, `height`) and `v_image`, the gradient of the loss with respect to the image.
 """
 
 import argparse
@@ -27,7 +27,7 @@ GRADIENTS = (*INPUTS, "mean_gradient", "abs_gradient")
 
 
 def main() -> None:
-    """Reads the command line, measures, prints."""
+    """Read the command line, measure, and print the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("case", type=Path)
     parser.add_argument("--rasterizer", default="numba")
@@ -61,7 +61,7 @@ def main() -> None:
 def draw(
     name: str, case: dict[str, Any], dtype: torch.dtype, options: dict[str, float]
 ) -> dict[str, Tensor]:
-    """Renders a case and its gradients: image, alpha, pixels and each of `GRADIENTS`."""
+    """Render a case. Return image, alpha, pixel counts and each gradient of `GRADIENTS`."""
     rasterizer = build(Rasterizer, name, options)
     tensors = [torch.from_numpy(case[key]).to(dtype).requires_grad_() for key in INPUTS]
     outputs = frozenset({"pixels", "abs_gradient"})
@@ -78,7 +78,7 @@ def draw(
 
 
 def camera_of(case: dict[str, Any]) -> Camera:
-    """The camera of a case."""
+    """Return the camera of a case."""
     k = case["K"].astype(np.float64)
     pose = torch.from_numpy(case["viewmat"].astype(np.float64))
     size = int(case["width"]), int(case["height"])
@@ -86,12 +86,12 @@ def camera_of(case: dict[str, Any]) -> Camera:
 
 
 def mean_abs(found: Tensor, expected: Tensor) -> float:
-    """Mean absolute difference."""
+    """Return the mean absolute difference."""
     return float((found.double() - expected).abs().mean())
 
 
 def relative_l2(found: Tensor, expected: Tensor) -> float:
-    """Norm of the difference by the norm of what is expected."""
+    """Return the norm of the difference divided by the norm of the expected tensor."""
     return float((found.double() - expected).norm() / expected.norm())
 
 

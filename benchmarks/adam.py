@@ -2,7 +2,7 @@
 
     python benchmarks/adam.py [--gaussians N] [--reps N] [--threads N]
 
-The optimizers take turns, so that a change of the machine's load meets all of them.
+The optimizers alternate, so that changes of the machine's load affect all of them.
 """
 
 import argparse
@@ -23,7 +23,7 @@ FLOATS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "f_dc": 3, "f_res
 
 
 def tensors(gaussians: int, seed: int, scale: float) -> dict[str, Tensor]:
-    """Normal random tensors shaped like those of the vanilla backbone."""
+    """Return normal random tensors with the shapes of the vanilla backbone's tensors."""
     generator = torch.Generator().manual_seed(seed)
     return {
         name: scale * torch.randn(gaussians, floats, generator=generator)
@@ -32,7 +32,7 @@ def tensors(gaussians: int, seed: int, scale: float) -> dict[str, Tensor]:
 
 
 def ours(params: dict[str, Tensor], grads: dict[str, Tensor]) -> Callable[[], object]:
-    """A step of `adam_step`."""
+    """Return a function that takes a step of `adam_step`."""
     state, rates = AdamState(), dict.fromkeys(params, 1e-3)
     return lambda: adam_step(params, grads, state, rates)
 
@@ -40,7 +40,7 @@ def ours(params: dict[str, Tensor], grads: dict[str, Tensor]) -> Callable[[], ob
 def theirs(
     params: dict[str, Tensor], grads: dict[str, Tensor], *, fused: bool
 ) -> Callable[[], object]:
-    """A step of `torch.optim.Adam`, fused or by foreach operators."""
+    """Return a step of `torch.optim.Adam`, fused or by foreach operators."""
     for name, param in params.items():
         param.requires_grad_()
         param.grad = grads[name]
@@ -49,7 +49,7 @@ def theirs(
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--gaussians", type=int, default=111_785)
     parser.add_argument("--reps", type=int, default=30)

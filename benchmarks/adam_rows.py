@@ -1,10 +1,10 @@
-"""Median milliseconds of a step of Adam by rows: with the rows that are drawn, or with all of them.
+"""Median milliseconds of a sparse Adam step: with the rows that are drawn, or with all rows.
 
     python benchmarks/adam_rows.py [--rows N] [--reps N]
 
-Rows are drawn at random in runs of 64, another choice in each step, as in Gaussians kept in the
-order of space; what is late is caught up with before the step. Prints a table of both ways by the
-share that is drawn: it is where `MOST_ROWS` (crossgrad_core/training/adam/late.py) comes from.
+Rows are drawn at random in runs of 64, like Gaussians stored in Morton order, with a new choice in
+each step. Deferred updates of these rows are flushed before the step. The table shows both ways by
+the share of drawn rows. `MOST_ROWS` (crossgrad_core/training/adam/late.py) is based on it.
 """
 
 import argparse
@@ -22,13 +22,13 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
 
-#: Rows that are drawn together, choices of rows that take turns, and shares.
+#: Rows that are drawn together, number of alternating choices of rows, and shares.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 
 def milliseconds(count: int, share: float, most: float, reps: int) -> float:
-    """The median of a step with catching up, of [count, 15, 3] elements."""
-    late.MOST_ROWS = most  # type: ignore[misc] - both ways are to be measured
+    """Return the median milliseconds of a step with the flush, for [count, 15, 3] elements."""
+    late.MOST_ROWS = most  # type: ignore[misc] - both ways are measured
     rng = np.random.default_rng(0)
     param, state, rows_late = torch.randn(count, 15, 3), AdamState(), late.Late()
     drawn = [
@@ -49,7 +49,7 @@ def milliseconds(count: int, share: float, most: float, reps: int) -> float:
 
 
 def main() -> None:
-    """Prints the table and the machine."""
+    """Print the table and the machine."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rows", type=int, default=112_000)
     parser.add_argument("--reps", type=int, default=32)

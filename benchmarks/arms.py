@@ -1,9 +1,9 @@
-"""The arms of a sweep, scene by scene: how good, at what cost, and by which code.
+"""Tables of a sweep's arms, scene by scene: quality, cost and commit.
 
     crossgrad sweep benchmarks/grids/backbones.yaml
     python benchmarks/arms.py runs/sweeps/backbones > tables.md
 
-Means over seeds and, where there are several, standard deviations. Imports no torch.
+Values are means over seeds, with standard deviations if there are several seeds. Imports no torch.
 """
 
 import argparse
@@ -24,24 +24,24 @@ from crossgrad_plugins.compare.quantity import Quantity
 from crossgrad_plugins.compare.run import Run
 
 PSNR = Quantity.of("psnr")
-#: Overall, and the regimes as scenes call them.
+#: Overall, and the regimes by their names in scenes.
 REGIMES = {"overall": (None,), "far": ("far", "aerial"), "near": ("near", "street")}
-#: Numbers of summary.json, and what they are called.
+#: Numbers of summary.json -> titles of their columns.
 NUMBERS = {"step": "steps", "views": "views", "primitives": "Gaussians", "cpu_seconds": "CPU s"}
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs by arm, scene and seed; an arm with runs of several lengths is one for each of them."""
+    """Runs by arm, scene and seed. An arm with several lengths is split into one arm per length."""
 
     by_arm: dict[str, dict[tuple[str, int], Run]]
 
     @classmethod
     def read(cls, places: Sequence[Path]) -> "Runs":
-        """All finished runs at or below the places, without those of earlier grids of a sweep.
+        """Read all finished runs at or below the places, without runs of a sweep's earlier grids.
 
         Raises:
-            UserError: There is none, a file is damaged, runs of one scene differ in views or
+            UserError: There are no runs, a file is damaged, runs of one scene differ in views or
                 photos, or an arm has several configurations with one seed.
         """
         found = read_runs(places, skip_broken=False)
@@ -65,25 +65,25 @@ class Runs:
 
     @property
     def scenes(self) -> list[str]:
-        """Scenes that any arm has."""
+        """Scenes of all arms, sorted."""
         return sorted({scene for runs in self.by_arm.values() for scene, _ in runs})
 
     def of(self, arm: str, scene: str) -> list[Run]:
-        """The runs of an arm on a scene, by seed."""
+        """Return the runs of an arm on a scene, by seed."""
         return [run for (at, _), run in sorted(self.by_arm.get(arm, {}).items()) if at == scene]
 
     def difference(self, first: str, second: str, regime: str) -> Contrast:
-        """The PSNR of the first arm minus that of the second at the end of their runs."""
+        """Return the PSNR of the first arm minus the PSNR of the second arm, at the end of runs."""
         runs = self.by_arm.get(first, {}), self.by_arm.get(second, {})
         return contrast((first, second), runs, PSNR, lambda run: figure(run, regime), regime)
 
 
 def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
-    """The table of arms: how good, with which rates, at what cost.
+    """Yield the table of arms: quality, learning rates and cost.
 
     Args:
         runs: The runs.
-        figures: Metrics that are shown; of the first one, each regime, too.
+        figures: Metrics that are shown. The first metric is also shown for each regime.
     """
     regimes = [name for name in REGIMES if name != "overall"]
     titles = ("scene", "arm", "rates", "seeds", *figures[:1], *regimes, *figures[1:])
@@ -96,7 +96,7 @@ def arms(runs: Runs, figures: Sequence[str] = (PSNR.name,)) -> Iterator[str]:
 
 
 def against(runs: Runs, baseline: str) -> Iterator[str]:
-    """The table of differences from an arm, overall and by regime, with their verdicts."""
+    """Yield the table of differences from an arm, overall and by regime, with verdicts."""
     yield from head("arm", *(f"{each}, less {baseline}" for each in REGIMES))
     others = [arm for arm in runs.by_arm if arm != baseline]
     table = [runs.difference(arm, baseline, regime) for arm in others for regime in REGIMES]
@@ -107,7 +107,7 @@ def against(runs: Runs, baseline: str) -> Iterator[str]:
 
 
 def difference(found: Contrast | None) -> str:
-    """A difference with its interval, its verdict and the number of its pairs."""
+    """Return a difference with its interval, its verdict and its number of pairs."""
     if found is None or found.estimate is None:
         return ""
     center, (low, high) = found.estimate.center, found.estimate.wide
@@ -115,13 +115,13 @@ def difference(found: Contrast | None) -> str:
 
 
 def head(*titles: str) -> Iterator[str]:
-    """The lines above the rows of a table."""
+    """Yield the header lines of a table."""
     yield f"| {' | '.join(titles)} |"
     yield "|---" * len(titles) + "|"
 
 
 def figure(run: Run, regime: str, name: str = PSNR.name) -> float | None:
-    """What a run ended at, in a regime as `REGIMES` calls it; None where it has none."""
+    """Return a run's final value in a regime of `REGIMES`, or None if it is missing."""
     found = (run.final(name, each) for each in REGIMES[regime])
     return next((value for value in found if value is not None), None)
 
@@ -157,7 +157,7 @@ def _number(own: Sequence[Run], name: str) -> str:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweeps", type=Path, nargs="+")
     parser.add_argument("--figures", nargs="+", default=["psnr", "ssim"], metavar="METRIC")
@@ -173,7 +173,7 @@ def main() -> None:
 
 
 def read(places: Sequence[Path]) -> Runs:
-    """The runs at or below the places; what cannot be read ends the program with one message."""
+    """Return the runs at or below the places. An error ends the program with one message."""
     try:
         return Runs.read(places)
     except UserError as error:

@@ -1,11 +1,11 @@
-"""Seconds of a whole training step of each backbone beside vanilla's, as a Markdown table.
+"""Seconds of a whole training step of each backbone, compared with vanilla, as a Markdown table.
 
     python benchmarks/backbone_cost.py SCENE [--max-size 400] [--steps 400] [--reps 40]
 
-Each backbone is trained for --steps steps. Then one view is trained on again and again: by the
-backbone, and in turn by a vanilla model of exactly the Gaussians that the backbone draws for that
-view. So both draw the same number, and the ratio is taken pairwise, step by step. The first row is
-vanilla beside itself.
+Each backbone is trained for --steps steps. Then one view is trained on repeatedly: by the backbone,
+and alternately by a vanilla model of the same Gaussians that the backbone draws for this view. Both
+draw the same number of Gaussians, and the ratio is taken pairwise, step by step. The first row
+compares vanilla with itself.
 """
 
 import argparse
@@ -29,13 +29,13 @@ from crossgrad_core.training.start import first_state, warm_up
 from crossgrad_core.training.state import TrainState
 
 BACKBONES = ("vanilla", "pixel", "mip", "analytic", "distance", "scaffold", "octree")
-#: A step of the published schedule with all SH bands, and far enough from the next edit.
+#: A step of the published schedule with all SH bands, far enough from the next edit.
 START = 5001
 REPS_BETWEEN_EDITS = 90
 
 
 def trained(scene: Scene, config: RunConfig, steps: int) -> tuple[Setup, TrainState]:
-    """A backbone after some steps on the whole scene."""
+    """Return a backbone after some steps on the whole scene."""
     setup = assemble(config, scene, "none")
     warm_up(setup)
     state = first_state(setup)
@@ -45,15 +45,15 @@ def trained(scene: Scene, config: RunConfig, steps: int) -> tuple[Setup, TrainSt
 
 
 def on_one_view(setup: Setup, state: TrainState) -> Setup:
-    """The same run on its first training view alone, in the middle of the schedule."""
+    """Return the same run on only its first training view, in the middle of the schedule."""
     scene = replace(setup.scene, train=setup.scene.train[:1])
     state.step = START
-    state.states.pop("sampler", None)  # It remembers an order of all views.
+    state.states.pop("sampler", None)  # The sampler stores an order of all views.
     return replace(setup, scene=scene)
 
 
 def drawn(setup: Setup, state: TrainState) -> Gaussians:
-    """The Gaussians of the one view that touch a pixel."""
+    """Return the Gaussians of the single view that touch a pixel."""
     camera = setup.train_views[0].camera
     with torch.no_grad():
         gaussians = setup.backbone.decode(
@@ -65,7 +65,7 @@ def drawn(setup: Setup, state: TrainState) -> Gaussians:
 
 
 def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
-    """A vanilla state of these Gaussians."""
+    """Return a vanilla state of these Gaussians."""
     if gaussians.colors is not None:
         dc = ((gaussians.colors - 0.5) / SH_C0)[:, None, :]
         gaussians = replace(gaussians, colors=None, sh_dc=dc, sh_rest=None)
@@ -78,14 +78,14 @@ def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
 
 
 def milliseconds(setup: Setup, state: TrainState) -> float:
-    """One step."""
+    """Return the milliseconds of one step."""
     before = state.clock.train
     timed_step(setup, state)
     return 1000.0 * (state.clock.train - before)
 
 
 def row(name: str, scene: Scene, vanilla: Setup, arguments: argparse.Namespace) -> str:
-    """One line of the table."""
+    """Return one line of the table."""
     config = vanilla.config.model_copy(
         update={"backbone": ComponentChoice(name=name), "densifier": None}
     )
@@ -106,7 +106,7 @@ def row(name: str, scene: Scene, vanilla: Setup, arguments: argparse.Namespace) 
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--backbones", nargs="+", default=list(BACKBONES))

@@ -1,12 +1,13 @@
-"""The cost of waiting threads: a training step with several ways to wait, alone and among others.
+"""The cost of waiting threads: a training step with several wait policies, on idle and busy cores.
 
     python benchmarks/busy.py CASE.npz [--rounds N] [--reps N] [--threads N]
 
-OpenMP's threads spin for a while when they have nothing to do, which is quickest where nothing else
-runs, and takes the core from the process that needs it where something does: another program, or
-the very thread that they wait for. In each round every way takes its turn, alone and beside as many
-programs that compute as there are cores; the table has medians over the rounds in ms, and what one
-process of one thread takes, alone and beside a second one, as "two cores" may be one.
+Idle OpenMP threads spin for a while. This is fastest if no other program runs. Otherwise spinning
+takes the core from a process that needs it: another program, or even the thread for which the
+spinning threads wait. Each round measures every policy, without other programs and with one
+computing program per core. The table shows medians over the rounds in ms. It also shows the time of
+one process with one thread, without and with a second such process, because "two cores" may be one
+physical core.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from _machine import code, facts
 STEP = Path(__file__).with_name("step.py")
 #: Name -> environment of a process.
 WAYS = {
-    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as the command has it
+    "crossgrad": {"OMP_WAIT_POLICY": "PASSIVE"},  # as set by the command
     "OpenMP's own": {},
     "spin 1,000": {"GOMP_SPINCOUNT": "1000"},
     "spin 10,000": {"GOMP_SPINCOUNT": "10000"},
@@ -37,7 +38,7 @@ BUSY = "while True: pass"
 
 @contextmanager
 def beside(programs: int) -> Iterator[None]:
-    """So many programs compute meanwhile."""
+    """Run this number of computing programs inside the block."""
     others = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(programs)]
     try:
         yield
@@ -50,7 +51,7 @@ def beside(programs: int) -> Iterator[None]:
 def step_ms(
     way: dict[str, str], arguments: argparse.Namespace, *, threads: int, processes: int = 1
 ) -> float:
-    """Median milliseconds of a step, the mean over processes that run at the same time."""
+    """Return the median milliseconds of a step, averaged over simultaneous processes."""
     command = [sys.executable, str(STEP), str(arguments.case), "--reps", str(arguments.reps)]
     environment = {**os.environ, **way}
     running = [
@@ -64,7 +65,7 @@ def step_ms(
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("case", type=Path)
     parser.add_argument("--rounds", type=int, default=5)

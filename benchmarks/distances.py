@@ -1,14 +1,14 @@
-"""Runs of a sweep at distances from which they have no photo: photos of another capture as truth.
+"""Runs of a sweep at distances without training photos, compared with photos of another capture.
 
     python benchmarks/distances.py runs/sweeps/GRID --of city_hybrid --on city_unimodal \
         --folders ladder mid --bands 4 --baseline ARM
 
-Evaluates the finished runs of one scene on the views of another capture of the same place that they
-were not trained on, as `crossgrad eval RUN --on SCENE [--ply FILE]` does, and skips those that have
-been: beside each table stands the scene, the step and the file that it is of. The views of each
-folder stand in bands of distance, the size of a pixel on what they show, so that a table reads from
-near to far; in brackets, how many of them were measured. Only runs that kept their checkpoints can
-be evaluated.
+The finished runs of one scene are evaluated on the views of another capture of the same place, on
+which they were not trained, as by `crossgrad eval RUN --on SCENE [--ply FILE]`. Finished
+evaluations are skipped: next to each table, a file records the scene, the step and the PLY. The
+views of each folder are sorted into bands of distance by the size of a pixel on the visible
+surface, so that a table goes from near to far. The number of measured views is in brackets. Only
+runs that kept their checkpoints can be evaluated.
 """
 
 import argparse
@@ -32,13 +32,13 @@ from crossgrad_plugins.compare.run import Run
 
 @dataclass(frozen=True)
 class Band:
-    """Views of one folder that see about as near as each other.
+    """Views of one folder at similar distances.
 
     Attributes:
         folder: The regime of the views.
-        names: Photos.
-        low: The smallest size of a pixel on what is seen, units of the scene.
-        high: The largest.
+        names: Names of the photos.
+        low: The smallest size of a pixel on the visible surface, in units of the scene.
+        high: The largest such size.
     """
 
     folder: str
@@ -48,7 +48,7 @@ class Band:
 
 
 def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]:
-    """The views of the folders, each folder in so many bands of equal numbers, near ones first."""
+    """Return each folder's views in `count` bands of equal numbers, near bands first."""
     found = capture.scene
     unit = found.similarity.scale
     bands = []
@@ -64,13 +64,13 @@ def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]
 
 @dataclass(frozen=True)
 class Probes:
-    """Figures of runs on views elsewhere.
+    """Figures of runs on views of another capture.
 
     Attributes:
         runs: Arm -> scene and seed -> run.
         values: Folder of a run -> photo -> figure.
-        bands: The views.
-        quantity: What the figure is.
+        bands: The bands of views.
+        quantity: The quantity of the figures.
     """
 
     runs: Mapping[str, Mapping[tuple[str, int], Run]]
@@ -79,7 +79,7 @@ class Probes:
     quantity: Quantity
 
     def mean(self, run: Run, band: Band) -> float | None:
-        """The mean over the views of a band that the run was not trained on."""
+        """Return the mean over the measured views of a band, or None without such views."""
         found = self._measured(run, band)
         return fmean(found) if found else None
 
@@ -88,14 +88,14 @@ class Probes:
         return [known[name] for name in sorted(band.names) if name in known]
 
     def title(self, band: Band) -> str:
-        """Folder, sizes and number of views that were measured, of all runs."""
+        """Return folder, sizes and number of measured views of a band, over all runs."""
         runs = [run for own in self.runs.values() for run in own.values()]
         counts = sorted({len(self._measured(run, band)) for run in runs})
         views = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         return f"{band.folder}, {band.low:.2g} to {band.high:.2g} ({views})"
 
     def means(self) -> Iterator[str]:
-        """The table of means and standard deviations over runs."""
+        """Yield the table of means and standard deviations over runs."""
         yield from head("arm", "runs", *map(self.title, self.bands))
         for arm, runs in self.runs.items():
             cells = (self._spread(list(runs.values()), band) for band in self.bands)
@@ -108,7 +108,7 @@ class Probes:
         return f"{fmean(means):.2f}" + (f" ± {stdev(means):.2f}" if len(means) > 1 else "")
 
     def against(self, baseline: str) -> Iterator[str]:
-        """The table of differences from an arm, with their verdicts."""
+        """Yield the table of differences from an arm, with their verdicts."""
         others = [arm for arm in self.runs if arm != baseline]
         table = judged(
             contrast(
@@ -131,7 +131,7 @@ class Probes:
 def figures_of(
     runs: Sequence[Run], capture: Capture, name: str, *, file: bool
 ) -> dict[Path, dict[str, float]]:
-    """Folder of a run -> photo -> figure of its model or, drawn on black, its PLY.
+    """Return folder of a run -> photo -> figure of its model, or of its PLY drawn on black.
 
     Raises:
         UserError: There is no such figure, or a run cannot be evaluated.
@@ -155,7 +155,7 @@ def figures_of(
 
 
 def main() -> None:
-    """Evaluates what is missing and prints the tables."""
+    """Evaluate missing runs and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("sweeps", type=Path, nargs="+")
     parser.add_argument("--of", required=True, metavar="NAME", help="scene of the runs")
@@ -177,7 +177,7 @@ def main() -> None:
 def _runs(
     given: argparse.Namespace, parser: argparse.ArgumentParser
 ) -> dict[str, dict[tuple[str, int], Run]]:
-    """The runs that are wanted, by arm."""
+    """Return the requested runs, by arm."""
     runs = {
         arm: {at: run for at, run in own.items() if at[0] == given.of}
         for arm, own in read(given.sweeps).by_arm.items()
@@ -195,7 +195,7 @@ def _runs(
 def print_tables(
     given: argparse.Namespace, runs: Mapping[str, Mapping[tuple[str, int], Run]]
 ) -> None:
-    """Evaluates what is missing and prints the tables.
+    """Evaluate missing runs and print the tables.
 
     Args:
         given: The options of the command line.

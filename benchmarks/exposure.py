@@ -1,9 +1,9 @@
-"""How the photos of scenes differ in exposure, by SfM tracks: the table of docs/exposure.md.
+"""Differences in exposure between the photos of scenes, by SfM tracks, for docs/exposure.md.
 
     python benchmarks/exposure.py SCENE [SCENE ...]
 
-All photos of a scene are looked at, held-out ones included, in their full size. Seconds are those
-of the process, without reading the scene and decoding its photos.
+All photos of a scene are used in full size, including held-out photos. Seconds are CPU seconds of
+the process, without reading the scene and decoding its photos.
 """
 
 import argparse
@@ -21,7 +21,7 @@ HEADER = (
 
 
 def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
-    """The line of one scene; `told` photos have an EXIF header that tells their exposure."""
+    """Return the line of a scene. `told` photos have an EXIF header with their exposure."""
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
     auto = "gain" if gains.differ else "none"
@@ -33,7 +33,7 @@ def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
 
 
 def main() -> None:
-    """Prints a line for each scene."""
+    """Print a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", type=Path, nargs="+")
     print(HEADER)

@@ -2,8 +2,9 @@
 
     python benchmarks/extremes.py [BACKBONE ...] [--crowd 20000]
 
-Image error: largest difference of a channel of a pixel. Gradient error: largest relative L2 error
-of a parameter tensor. Both of the `numba` rasterizer in float32 against `torch` in float64.
+The image error is the largest difference in a channel of a pixel. The gradient error is the largest
+relative L2 error of a parameter tensor. Both compare the `numba` rasterizer in float32 with `torch`
+in float64.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from crossgrad_plugins.rasterizers.torch_reference import TorchRasterizer
 
 
 def cell(backbone: Backbone, case: str, crowd: int) -> str:
-    """Image and gradient error of one case."""
+    """Return image and gradient error of one case."""
     extreme = cases(crowd)[case](jittered(backbone), sample_camera())
     exact = outcome(backbone, TorchRasterizer(), extreme, torch.float64)
     found = outcome(backbone, NumbaRasterizer(), extreme, torch.float32)
@@ -31,7 +32,7 @@ def cell(backbone: Backbone, case: str, crowd: int) -> str:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("backbones", nargs="*", help="names; default: all installed")
     parser.add_argument("--crowd", type=int, default=20_000)

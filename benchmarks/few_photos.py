@@ -1,10 +1,11 @@
-"""Scenes of few training photos: a scene with all but some of its training photos left out.
+"""Scenes with few training photos, made by leaving out training photos of a scene.
 
     python benchmarks/few_photos.py OUT --photos 8 14 --draw 1 SCENES/ochota_kap_hybrid_gain ...
     crossgrad sweep benchmarks/grids/few_photos.yaml --threads 1 --scene OUT/... --scene SCENE
 
-Makes OUT/SCENE-8 and so on: links to photos and cameras, and lists of the training photos, drawn at
-random, and of those that the scene holds out. Prints in how many of them a point lies (median).
+Makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of training
+photos drawn at random, and a list of the scene's held-out photos. The program prints the median
+number of training photos in which a point is visible.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from crossgrad_core.commands import configured, photos_per_point, read_scene
 
 
 def made(scene: Path, out: Path, photos: int, draw: int) -> float:
-    """Makes the scene; in how many training photos a point of it lies."""
+    """Make the scene, and return the median number of training photos that show a point."""
     config = configured({"scene": str(scene), "data": {"max_size": 64}})
     whole, _ = read_scene(config)
     names = [view.name for view in whole.train_views]
@@ -32,7 +33,7 @@ def made(scene: Path, out: Path, photos: int, draw: int) -> float:
 
 
 def main() -> None:
-    """Makes the scenes that are asked for."""
+    """Make the requested scenes."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("scenes", type=Path, nargs="+")

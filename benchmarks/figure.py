@@ -1,4 +1,4 @@
-"""The picture of the README: two panels of a run above each other, its curve to the right.
+"""The picture of the README: two panels of a run on top of each other, and its curve to the right.
 
 python benchmarks/figure.py RUN docs/images/boruszyn.png
 """
@@ -12,7 +12,7 @@ WIDTH = 1400
 
 
 def main() -> None:
-    """Composes the picture."""
+    """Compose the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path)

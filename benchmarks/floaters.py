@@ -1,9 +1,9 @@
-"""Held-out photos of finished runs with their floaters and without: a table.
+"""A table of held-out photos of finished runs, with and without floaters.
 
     crossgrad run SCENE --seconds 600 --no-rule floaters --out RUN
     python benchmarks/floaters.py RUN ...
 
-A run that removed its floaters has none left. Nothing is written to the runs.
+A run that already removed its floaters has no floaters left. The runs are not changed.
 """
 
 import argparse
@@ -24,12 +24,12 @@ from crossgrad_core.training.step import final_edits
 from crossgrad_plugins.rules.floaters import Floaters, in_empty_space
 
 _METRICS = ("psnr", "psnr_cc")
-#: Changes of a photo below it are not shown, dB.
+#: Smaller changes of a photo are not shown, in dB.
 SMALLEST = 0.005
 
 
 def measured(setup: Setup, state: TrainState) -> EvaluationResult:
-    """The figures of the held-out views."""
+    """Return the figures of the held-out views."""
     return evaluate(
         setup.scene.test_views,
         renderer(setup, state),
@@ -39,7 +39,7 @@ def measured(setup: Setup, state: TrainState) -> EvaluationResult:
 
 
 def row(folder: Path, empty: float) -> Sequence[str]:
-    """A run's line: what was removed, how long that took, and what it did to held-out photos."""
+    """Return a run's line: removed primitives, duration, and changes of held-out photos."""
     setup, state = opened(folder, {})
     setup = setup.with_rules({"floaters": Floaters.model_construct(empty=empty)})
     primitives = state.primitives(setup)
@@ -47,7 +47,7 @@ def row(folder: Path, empty: float) -> Sequence[str]:
         eval_parameters(setup, state)[setup.backbone.positions].detach().double().cpu().numpy()
     )
     near = int(in_empty_space(positions.double().cpu().numpy(), setup.scene, empty).sum())
-    before = measured(setup, state)  # Compiles what is to be timed.
+    before = measured(setup, state)  # Also compiles the code that is timed below.
     start = perf_counter()
     list(final_edits(setup, state))
     seconds = perf_counter() - start
@@ -68,7 +68,7 @@ def row(folder: Path, empty: float) -> Sequence[str]:
 
 
 def main() -> None:
-    """Prints a line per run."""
+    """Print a line per run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument(

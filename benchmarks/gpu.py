@@ -1,19 +1,19 @@
-"""Step times, memory and quality on a GPU, as one table; what is there is not measured again.
+"""Step times, memory and quality on a GPU, as one table. Finished measurements are kept.
 
     python benchmarks/gpu.py SCENE                                 # all of it
     python benchmarks/gpu.py SCENE --gsplat-examples gsplat/examples
     python benchmarks/gpu.py SCENE --only sizes-gsplat steps-gsplat
 
-`sizes` takes steps of a made-up cloud of Gaussians, all of them seen, in photos of one megapixel;
-`steps` takes steps of SCENE with every rasterizer that runs on the GPU, every backbone, K and
-operator. Both are steps in the midst of density control, between two edits, with SH degree 3, in
-this process: seconds of the clock from an idle GPU to an idle GPU. `long` trains SCENE for 30,000
-steps as published, in processes of their own; rows are what it had after 7,000, 15,000 and all
-steps. `usual` trains it with the settings that `crossgrad run` has by itself, for several lengths.
+`sizes` takes steps on a random cloud of Gaussians, all of them visible, in photos of one megapixel.
+`steps` takes steps on SCENE with every rasterizer that runs on the GPU, every backbone, K and
+operator. Both measure steps during density control, between two edits, with SH degree 3, in this
+process. Seconds are wall time from an idle GPU to an idle GPU. `long` trains SCENE for 30,000 steps
+with the published settings, in separate processes. Its rows are the states after 7,000, 15,000 and
+all steps. `usual` trains SCENE with the default settings of `crossgrad run`, for several lengths.
 With the folder of gsplat's examples, gsplat's own trainer takes as many steps as `long` on the same
-scene. It holds out each 8th photo, our runs each 8th of each folder. Runs, gpu.csv, the curves of
-runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. Interrupted, the same
-command goes on. Without a GPU it ends with exit code 2.
+scene. It holds out each 8th photo, and our runs hold out each 8th photo of each folder. Runs,
+gpu.csv, the curves of runs (gpu_curves.csv) and gpu.md are in the folder of `--out`. After an
+interruption, the same command continues. Without a GPU the exit code is 2.
 """
 
 import argparse
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: Of gsplat's trainer, which has no name among the rasterizers.
+#: Name of gsplat's trainer in the column of rasterizers.
 THEIRS = "gsplat's trainer"
 COLUMNS = (
     "part", "rasterizer", "backbone", "views", "operator", "steps", "ms_per_step",
@@ -57,35 +57,35 @@ Row = dict[str, Any]
 
 
 class Short:
-    """Measures cases in this process, and remembers their figures in a file.
+    """Measures cases in this process, and stores their figures in a file.
 
     Args:
         scene: SCENE.
-        kept: The file, one JSON line per case.
-        place: What figures are of, besides their case: another place has others.
+        kept: The file, with one JSON line per case.
+        place: Scene, GPU and commit of the figures. Figures with another place are not used.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:
         self.scene, self._kept, self._place = scene, kept, place
         self._known: dict[str, Row] = {}
         for line in kept.read_text(encoding="utf-8").splitlines() if kept.is_file() else []:
-            # The last one may have been cut off.
+            # The last line may be truncated.
             with suppress(json.JSONDecodeError, KeyError):
                 row = json.loads(line)
                 self._known[row.pop("case")] = row
 
     def known(self, case: Case) -> Row | None:
-        """The figures of a case that was measured here before."""
+        """Return the stored figures of a case, or None."""
         return self._known.get(self._key(case))
 
     def row(self, case: Case) -> Row:
-        """The figures of a case, or why it has none, which is looked at again."""
+        """Return the figures of a case, or the reason of a failure, which is not stored."""
         if (known := self.known(case)) is not None:
             return known
         try:
             found = self._measured(case)
         except Exception as error:
-            # One case must not end the table, but for one that leaves the GPU useless.
+            # One failed case must not end the table, unless the GPU is no longer usable.
             torch.cuda.synchronize()
             return _row(case, {"note": " ".join(f"{type(error).__name__}: {error}".split())})
         row = _row(case, found)
@@ -102,7 +102,7 @@ class Short:
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.self_test("cuda")
-        keeper = RollbackGuard(state)  # A run holds a copy to which it can go back.
+        keeper = RollbackGuard(state)  # A run also holds a copy for rollback.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)
@@ -135,7 +135,7 @@ class Short:
 
 
 def steady(setup: "Setup", state: "TrainState", steps: int) -> float:
-    """Seconds of `steps` steps, all photos being there and all kernels loaded."""
+    """Return the seconds of `steps` steps after all photos and kernels are loaded."""
     for index in range(len(setup.train_views)):
         target_at(setup, state, index, 1.0)
     for _ in range(max(3, steps // 6)):
@@ -149,7 +149,7 @@ def steady(setup: "Setup", state: "TrainState", steps: int) -> float:
 
 
 def finished(folder: Path) -> Path | None:
-    """The finished run of a case, if there is one."""
+    """Return the finished run of a case, or None."""
     for summary in sorted(folder.glob("*/summary.json")):
         if json.loads(summary.read_text(encoding="utf-8")).get("status") == "finished":
             return summary.parent
@@ -157,7 +157,7 @@ def finished(folder: Path) -> Path | None:
 
 
 def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
-    """The folder of the case's finished run, trained now if need be; else None and why."""
+    """Return the folder of the case's finished run, trained now if missing, or None and why."""
     folder = out / "runs" / case.name
     if (run := finished(folder)) is not None:
         return run, ""
@@ -170,7 +170,7 @@ def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
         return place, ""
     why = " ".join(ended.stderr.split())
     if ended.returncode == 2:
-        # Bad input stays so; what failed for another reason is tried again by the next command.
+        # Invalid input stays invalid. Other failures are tried again by the next command.
         folder.mkdir(parents=True, exist_ok=True)
         refused.write_text(why, encoding="utf-8")
     return None, why
@@ -183,7 +183,7 @@ def _row(case: Case, found: Row) -> Row:
 
 
 def rows_of(case: Case, run: Path | None, why: str) -> Iterator[Row]:
-    """The figures of a long run at its stops, or why it has none."""
+    """Yield the figures of a long run at its stops, or the reason why they are missing."""
     if run is None:
         yield _row(case, {"note": why})
         return
@@ -219,7 +219,7 @@ def _paced(steps: int, views: int, seconds: float) -> Row:
 def theirs(
     examples: Path, scene: Path, out: Path, steps: int, limit: float | None = None
 ) -> Iterator[Row]:
-    """The rows of gsplat's own trainer."""
+    """Yield the rows of gsplat's own trainer."""
     own: Row = {"part": "long", "rasterizer": THEIRS, "backbone": "vanilla", "views": 1}
     own = {**dict.fromkeys(COLUMNS, ""), **own, "operator": "sum"}
     reached, why = trained(examples, scene, out / "runs", stops(steps), limit)
@@ -237,14 +237,14 @@ def theirs(
 
 
 def curve_rows(case: Case, run: Path | None) -> Iterator[Row]:
-    """Step, training seconds and PSNR of every evaluation of a long run, if there is one."""
+    """Yield step, training seconds and PSNR of every evaluation of a long run, if it exists."""
     for row in [] if run is None else read_run(run).rows:
         shown = {name: row.get(name) for name in ("step", "train_seconds", "psnr")}
         yield {"run": case.name, **shown}
 
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
-    """Writes a table."""
+    """Write a table."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()
@@ -252,7 +252,7 @@ def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Row]) -> None:
 
 
 def as_markdown(rows: Iterable[Row], machine: str) -> str:
-    """The table for people."""
+    """Return the table as Markdown."""
     shown = COLUMNS[: COLUMNS.index("gpu")]
     lines = [
         "# On a GPU",
@@ -267,7 +267,7 @@ def as_markdown(rows: Iterable[Row], machine: str) -> str:
 
 
 def _written(path: Path) -> str:
-    """When a file was written, UTC."""
+    """Return the time at which a file was written, in UTC."""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
 
 
@@ -276,7 +276,7 @@ def _rounded(value: float | None) -> float | str:
 
 
 def case_rows(case: Case, short: Short, out: Path, *, new: bool) -> tuple[list[Row], list[Row]]:
-    """The rows of a case and of its curve; none where it is neither new nor measured before."""
+    """Return the rows of a case and of its curve, or none if it is neither new nor measured."""
     if case.part not in {"long", "usual"}:
         row = short.row(case) if new else short.known(case)
         return ([] if row is None else [row]), []
@@ -287,7 +287,7 @@ def case_rows(case: Case, short: Short, out: Path, *, new: bool) -> tuple[list[R
 
 
 def run_all(arguments: argparse.Namespace, gpu: str) -> None:
-    """Measures what is missing, and writes the tables after every run."""
+    """Measure missing cases, and write the tables after every case."""
     out, scene = arguments.out.resolve(), arguments.scene.resolve()
     out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -316,7 +316,7 @@ def run_all(arguments: argparse.Namespace, gpu: str) -> None:
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases with it in their name")

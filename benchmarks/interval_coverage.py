@@ -1,16 +1,17 @@
-"""How often the intervals of sigma_w^2, sigma_b^2 and their ratio hold the truth.
+"""Coverage of the intervals of sigma_w^2, sigma_b^2 and their ratio: how often they are correct.
 
     python benchmarks/interval_coverage.py [repetitions] [noise ...]
 
-Prints the share of repetitions (nominally 95 %) per kind of noise, dimension of the gradients,
-number of near and far views, and true ratio sigma_b^2 / sigma_w^2.
+Prints the share of repetitions in which an interval contains the true value (nominally 95 %), by
+kind of noise, dimension of the gradients, number of near and far views, and true ratio
+sigma_b^2 / sigma_w^2.
 
-`normal`: independent normal components; `decaying`: standard deviations falling like 1/sqrt(k), so
+`normal`: independent normal components; `decaying`: standard deviations decrease like 1/sqrt(k), so
 that few directions dominate; `student3`: independent components of Student's t with 3 degrees of
 freedom; `radial5`: multivariate t with 5 degrees of freedom, one factor per view, so that the norms
 of the views are heavy-tailed; `lognormal`: normal components times a log-normal factor per view
-(sigma 0.5); `finite`: a population of 40 + 40 views, of which the views are drawn without
-replacement, as a probe of a scene does.
+(sigma 0.5); `finite`: a population of 40 + 40 views, from which the views are drawn without
+replacement, like the probe of a scene.
 """
 
 import sys
@@ -33,7 +34,7 @@ LOG_SIGMA = 0.5
 
 
 def noise(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Deviations [n, P] of mean zero and mean squared length P."""
+    """Return deviations [n, P] with mean zero and mean squared length P."""
     normal = rng.normal(size=shape)
     if kind == "student3":
         return np.asarray(rng.standard_t(3, size=shape) / np.sqrt(3.0))
@@ -56,7 +57,7 @@ def coverage(
     repetitions: int,
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """Share of repetitions in which the intervals of (within, between, ratio) hold the truth."""
+    """Return the shares of repetitions whose (within, between, ratio) intervals are correct."""
     rng = np.random.default_rng(seed)
     common = 3.0 * rng.normal(size=dimension)
     gap = rng.normal(size=dimension)
@@ -93,12 +94,12 @@ def _population_truths(populations: list[NDArray[np.float64]]) -> tuple[float, f
 
 
 def cases(kinds: Sequence[str]) -> Iterable[tuple[str, int, tuple[int, int], float]]:
-    """The rows of the table."""
+    """Return the rows of the table."""
     return product(kinds or KINDS, DIMENSIONS, SIZES, RATIOS)
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     repetitions = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     print(f"share of {repetitions} repetitions whose 95 % interval holds the truth, in %")
     print(f"{'noise':<10}{'P':>5}{'views':>9}{'ratio':>7}{'within':>9}{'between':>9}{'ratio':>7}")

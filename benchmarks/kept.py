@@ -1,11 +1,11 @@
-"""The tables of a sweep, packed into one small file to be kept, and back.
+"""Packs the tables of a sweep into one small file, and unpacks it again.
 
     python benchmarks/kept.py pack runs/sweeps/GRID benchmarks/results/GRID.tar.xz
     python benchmarks/kept.py unpack benchmarks/results/GRID.tar.xz runs/sweeps/GRID
 
-Configurations, summaries, evaluations and held-out views of finished runs are kept, models and
-pictures are not. `crossgrad compare` reads what was unpacked, and `crossgrad sweep` goes on with
-what is missing: on another machine, too. The same sweep gives the same file.
+The file contains configurations, summaries, evaluations and held-out views of finished runs, but no
+models and pictures. `crossgrad compare` reads the unpacked runs, and `crossgrad sweep` continues
+with the missing runs, also on another machine. The same sweep always gives the same file.
 """
 
 import argparse
@@ -20,13 +20,13 @@ from typing import TypeAlias
 from crossgrad_core.commands import UserError, read_rows, summary_of, write_atomically
 from crossgrad_core.system.text_files import csv_bytes
 
-#: The table of a sweep: which run is what.
+#: The table of a sweep, which assigns each run to a configuration.
 TABLE = "runs.csv"
-#: The rows of that table, the first one its header.
+#: The rows of that table, the first row being its header.
 Rows: TypeAlias = Sequence[Sequence[str]]
 
-#: Files of a run that are kept; those of the second line are of the observer `diagnostics`, the
-#: last ones of views elsewhere (distances.py).
+#: Files of a run that are packed. The second line is written by the observer `diagnostics`, and
+#: the last line by distances.py.
 FILES = (
     *("config.yaml", "summary.json", "metrics.csv", "per_view.csv", "scene.json"),
     *("diagnostics.csv", "cameras.csv", "groupings.csv"),
@@ -35,18 +35,18 @@ FILES = (
 
 
 def pack(sweep: Path, archive: Path) -> int:
-    """Packs the finished runs of a sweep.
+    """Pack the finished runs of a sweep.
 
     Args:
-        sweep: Its folder.
-        archive: The file that is written, or replaced.
+        sweep: Folder of the sweep.
+        archive: The file to write or replace.
 
     Returns:
-        How many runs it holds.
+        The number of packed runs.
 
     Raises:
-        UserError: The folder is no sweep, none of its runs has finished, or one has no row in the
-            table of the sweep.
+        UserError: The folder is not a sweep, no run has finished, or a run has no row in the table
+            of the sweep.
     """
     runs = [each for each in sorted((sweep / "runs").glob("*")) if _is_finished(each)]
     if not runs or not (sweep / TABLE).is_file():
@@ -68,7 +68,7 @@ def pack(sweep: Path, archive: Path) -> int:
 
 
 def _check_labelled(sweep: Path, runs: Iterable[str]) -> None:
-    """Refuses runs without a row: what they are would be lost with the folder."""
+    """Refuse runs without a row, because their configuration would be lost with the folder."""
     known = {row[0] for row in _table(sweep) if row}
     if without := [run for run in runs if run not in known]:
         raise UserError(
@@ -90,7 +90,7 @@ def _is_finished(run: Path) -> bool:
 
 def _kept(sweep: Path, runs: list[Path]) -> Iterator[Path]:
     yield sweep / TABLE
-    # File by file, so that what is alike in all runs lies close together: a third of the size.
+    # Group files by name: similar files next to each other compress to a third of the size.
     for name in FILES:
         yield from (path for run in runs for path in sorted(run.glob(name)))
 
@@ -103,13 +103,13 @@ def _without_owner(entry: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 def unpack(archive: Path, sweep: Path) -> int:
-    """Adds the runs of a file to the folder of a sweep; runs that are there stay as they are.
+    """Add the packed runs to the folder of a sweep. Existing runs are not changed.
 
-    Rows of their table that the sweep's does not have are added below its own, those of runs that
-    were there before included.
+    Rows that the table of the sweep does not contain are appended, including rows of runs that
+    exist already.
 
     Returns:
-        How many runs were added.
+        The number of added runs.
 
     Raises:
         UserError: The two tables of runs have different columns.
@@ -127,13 +127,13 @@ def unpack(archive: Path, sweep: Path) -> int:
 
 
 def _rows_of(file: tarfile.TarFile) -> Rows:
-    """The table of the runs in a file; empty where it has none."""
+    """Return the table of the runs in a file, or no rows if it has no table."""
     content = file.extractfile(TABLE) if TABLE in file.getnames() else None
     return [] if content is None else list(csv.reader(io.TextIOWrapper(content, "utf-8")))
 
 
 def _merged(sweep: Path, rows: Rows, runs: Container[str]) -> Rows | None:
-    """The table of a sweep with the rows of these runs; None where it stays as it is."""
+    """Return the table of a sweep with the rows of these runs, or None if it does not change."""
     own = _table(sweep) if (sweep / TABLE).exists() else []
     if not own or not rows:
         return rows or None
@@ -154,7 +154,7 @@ def _run_of(entry: tarfile.TarInfo) -> str:
 
 
 def main() -> None:
-    """Packs or unpacks."""
+    """Pack or unpack."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=("pack", "unpack"))
     parser.add_argument("source", type=Path)

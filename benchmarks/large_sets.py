@@ -1,18 +1,18 @@
-"""Training on thousands of large photos against training with all photos in memory.
+"""Training on thousands of large photos, compared with training with all photos in memory.
 
     python benchmarks/large_sets.py [--photos 2000] [--max-size 1600] [--passes 2] [--block 25]
         [--distorted] [--warm] [--folder DIR]
 
-The bundled scene is made into one of many photos: its 28 photos enlarged tenfold to 4000 x 2980
-pixels, with grain, saved as JPEG and linked under as many names as are asked for; cameras are
-repeated with them. Every name is a photo of its own to crossgrad, in memory and on disk. Two
-processes take the same steps (`--sampler epoch`, one view, no density control) in turns of
-`--block` steps, one stopped while the other works: one on all photos, one on the 28 of them alone,
-which are in its memory before it begins. Both count wall time, decoding included.
+The scene is made from the bundled scene: its 28 photos are enlarged tenfold to 4000 x 2980 pixels,
+with grain, saved as JPEG and linked under the requested number of names. Cameras are repeated with
+them. crossgrad treats every name as a separate photo, in memory and on disk. Two processes take the
+same steps (`--sampler epoch`, one view, no density control) in turns of `--block` steps. One
+process is stopped while the other works. One trains on all photos. The other trains on only the 28
+photos, which are in its memory before it begins. Both measure wall time, including decoding.
 
-Prints the seconds to the first step, seconds per step in each pass over the photos, their ratio to
-those of the other process in the same turns, and resident memory. `--distorted` gives the camera a
-lens; `--warm` begins with the photos on disk from an earlier run of the same `--folder`.
+Prints the seconds to the first step, the seconds per step in each pass over the photos, their ratio
+to the other process in the same turns, and resident memory. `--distorted` uses a camera with lens
+distortion. `--warm` starts with the photos that an earlier run of the same `--folder` left on disk.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from _machine import code, facts
 
-#: How much larger the photos are than the bundled ones.
+#: Enlargement of the bundled photos.
 SCALE = 10
 #: Standard deviation of the grain, grey levels, and quality of the JPEG files: about 4 MB each.
 GRAIN, QUALITY = 4.0, 92
@@ -38,7 +38,7 @@ BUNDLED = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
 
 
 def make_scene(folder: Path, photos: int, *, distorted: bool) -> None:
-    """Writes a COLMAP scene of so many photos."""
+    """Write a COLMAP scene with this number of photos."""
     import pycolmap
     from PIL import Image
 
@@ -78,7 +78,7 @@ def make_scene(folder: Path, photos: int, *, distorted: bool) -> None:
 
 
 def serve(scene: Path, max_size: int, cache_mib: int) -> None:
-    """Takes as many steps as each line of stdin asks for; answers with what they cost, as JSON."""
+    """Read numbers of steps from stdin, take the steps, and print their cost as JSON."""
     begun = monotonic()
     from crossgrad_core.run.load_run import set_up
     from crossgrad_core.run.settings import parsed
@@ -119,7 +119,7 @@ def _answer(**figures: float) -> None:
 
 
 def _resident(what: str) -> float:
-    """MiB of this process, as Linux counts them."""
+    """Return memory of this process in MiB, from Linux's /proc."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(what):
             return int(line.split()[1]) / 1024
@@ -127,7 +127,7 @@ def _resident(what: str) -> float:
 
 
 class Trainer:
-    """A process that trains when it is told to, and is stopped in between."""
+    """A process that trains on request, and is stopped in between."""
 
     def __init__(self, scene: Path, max_size: int, cache_mib: int, store: Path) -> None:
         command = [sys.executable, __file__, "--serve", str(scene), str(max_size), str(cache_mib)]
@@ -139,7 +139,7 @@ class Trainer:
         self._process.send_signal(signal.SIGSTOP)
 
     def steps(self, count: int) -> dict[str, float]:
-        """Lets it take so many steps; what they cost."""
+        """Let the process take `count` steps, and return their cost."""
         assert self._process.stdin is not None
         self._process.send_signal(signal.SIGCONT)
         self._process.stdin.write(f"{count}\n")
@@ -149,7 +149,7 @@ class Trainer:
         return answer
 
     def end(self) -> None:
-        """Ends the process."""
+        """End the process."""
         self._process.kill()
         self._process.wait()
 
@@ -160,7 +160,7 @@ class Trainer:
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """A row for each pass over the photos."""
+    """Return a row for each pass over the photos."""
     few, many = folder / "few", folder / "many"
     for scene, photos in ((few, 28), (many, arguments.photos)):
         if not scene.exists():
@@ -191,7 +191,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> list[dict[str, Any]]
 def row_of(
     number: int, turns: list[tuple[int, dict[str, float], dict[str, float]]]
 ) -> dict[str, Any]:
-    """Sums and medians over the turns of one pass."""
+    """Return sums and medians over the turns of one pass."""
     steps = sum(count for count, _, _ in turns)
     ours, theirs = (sum(turn[who]["seconds"] for turn in turns) for who in (1, 2))
     third = max(1, len(turns) // 3)
@@ -210,7 +210,7 @@ def row_of(
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photos", type=int, default=2000)
     parser.add_argument("--max-size", type=int, default=1600, help="0: as they are")

@@ -1,8 +1,8 @@
-"""Draws docs/layers.svg: the packages of the code by layer, and who imports whom.
+"""Draws docs/layers.svg: the packages of the code by layer, and their imports.
 
     python benchmarks/layers.py [--png FILE]
 
-Read from the sources. An arrow is left out if a longer path connects the same two packages.
+The imports are read from the sources. An arrow is omitted if a longer path has the same ends.
 """
 
 import argparse
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 11.0, 9.0
 
 
 def package_of(module: str) -> str | None:
-    """Return the package of one of our modules; None for other modules."""
+    """Return the package of one of our modules, or None for other modules."""
     package, _, rest = f"{module}.__init__".partition(".")
     if package == CORE:
         return rest.split(".")[0]
@@ -29,7 +29,7 @@ def package_of(module: str) -> str | None:
 
 
 def files() -> dict[Path, str]:
-    """File -> its package."""
+    """Return file -> its package."""
     found = {}
     for path in sorted((ROOT / CORE).rglob("*.py")):
         found[path] = path.relative_to(ROOT / CORE).with_suffix("").parts[0]
@@ -39,7 +39,7 @@ def files() -> dict[Path, str]:
 
 
 def packages() -> dict[str, set[str]]:
-    """Package -> the packages that it imports."""
+    """Return package -> the packages that it imports."""
     found = files()
     graph: dict[str, set[str]] = {package: set() for package in found.values()}
     for path, package in found.items():
@@ -53,7 +53,7 @@ def packages() -> dict[str, set[str]]:
 
 
 def direct(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """The graph without arrows that a longer way makes superfluous."""
+    """Return the graph without arrows that a longer path makes redundant."""
     reached: dict[str, set[str]] = {}
 
     def all_from(package: str) -> set[str]:
@@ -68,7 +68,7 @@ def direct(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
 
 
 def layers(graph: Mapping[str, set[str]]) -> dict[str, int]:
-    """Package -> its layer: one above the highest that it imports."""
+    """Return package -> its layer, one above the highest layer that it imports."""
     found: dict[str, int] = {}
 
     def layer(package: str) -> int:
@@ -82,7 +82,7 @@ def layers(graph: Mapping[str, set[str]]) -> dict[str, int]:
 
 
 def draw(path: Path) -> None:
-    """Writes the picture; `path` says by its suffix in which format."""
+    """Write the picture. The suffix of `path` gives the format."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -95,7 +95,7 @@ def draw(path: Path) -> None:
     for level in range(max(layer.values()) + 1):
         here = sorted(package for package in graph if layer[package] == level)
         for number, package in enumerate(here):
-            # Rows are shifted against each other, so that arrows pass between the boxes.
+            # Shift rows against each other, so that arrows pass between the boxes.
             shift = 0.25 * (level % 2 * 2 - 1)
             places[package] = (WIDTH * (number + 1) / (len(here) + 1) + shift, float(level))
     figure, axes = plt.subplots(figsize=(WIDTH, HEIGHT))

@@ -2,7 +2,7 @@
 
     python benchmarks/loss.py [--width W] [--height H] [--reps N] [--threads N] [--masked]
 
-Peak memory is that of the whole process, first after the fused runs, then after torch's.
+Peak memory is measured for the whole process, after the fused runs and again after torch's runs.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from crossgrad_plugins.losses.photometric.reference import l1_ssim_loss
 
 
 def timed(loss: Callable[[Tensor], Tensor], image: Tensor, reps: int) -> list[float]:
-    """Seconds of `reps` forward and backward passes, after one that compiles and warms up."""
+    """Return the seconds of `reps` forward and backward passes, after one warm-up pass."""
     seconds = []
     for _ in range(reps + 1):
         leaf = image.clone().requires_grad_()
@@ -32,7 +32,7 @@ def timed(loss: Callable[[Tensor], Tensor], image: Tensor, reps: int) -> list[fl
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--width", type=int, default=648)
     parser.add_argument("--height", type=int, default=420)

@@ -1,13 +1,13 @@
-"""Makes the case file on which rasterizers are timed and checked.
+"""Makes the case file that is used to time and check rasterizers.
 
     python benchmarks/make_case.py CASE.npz --garden test_garden.npz
     python benchmarks/make_case.py CASE.npz
 
-With --garden it is the case of docs/benchmarks.md: positions, colours and the first camera of a
-photo set of a garden, as gsplat ships them for its tests (file assets/test_garden.npz of the public
-repository nerfstudio-project/gsplat, Apache-2.0; from Mip-NeRF 360), with random sizes, rotations
-and opacities. Without it, positions and colours are made up: a case of the same kind and size for
-which nothing needs to be fetched; its figures are others.
+With --garden, the result is the case of docs/benchmarks.md. It uses positions, colours and the
+first camera of a photo set of a garden, which gsplat ships for its tests (file
+assets/test_garden.npz of the public repository nerfstudio-project/gsplat, Apache-2.0; from
+Mip-NeRF 360), with random sizes, rotations and opacities. Without --garden, positions and colours
+are random. This case is of the same kind and size and needs no download, but its figures differ.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from torch.nn.functional import normalize
 
 Arrays = dict[str, NDArray[np.generic]]
 
-#: Gaussians of the garden within [-2, 2] on every axis.
+#: Number of Gaussians of the garden within [-2, 2] on every axis.
 GAUSSIANS = 111_785
 WIDTH, HEIGHT, FOCAL = 648, 420, 481.0
 LEAST_SCALE, LARGEST_SCALE = 1e-4, 0.02
@@ -28,7 +28,7 @@ SEED = 42
 
 
 def garden(path: Path) -> Arrays:
-    """Points, colours and the first camera of gsplat's test data, cut to [-2, 2] on each axis."""
+    """Return points, colours and first camera of gsplat's test data, within [-2, 2] per axis."""
     with np.load(path) as archive:
         means = archive["means3d"].astype(np.float32)
         inside = (np.abs(means) <= 2.0).all(axis=1)
@@ -43,7 +43,7 @@ def garden(path: Path) -> Arrays:
 
 
 def made_up(gaussians: int) -> Arrays:
-    """A table on a lawn: two thirds of the points on a plane, a third in a ball, seen obliquely."""
+    """Return a table on a lawn: 2/3 of the points on a plane, 1/3 in a ball, seen obliquely."""
     rng = np.random.default_rng(SEED)
     ball = gaussians // 3
     lawn = np.column_stack([rng.uniform(-2, 2, (gaussians - ball, 2)), np.zeros(gaussians - ball)])
@@ -61,7 +61,7 @@ def made_up(gaussians: int) -> Arrays:
 
 
 def oblique_camera() -> NDArray[np.float32]:
-    """[4, 4] world to camera: from 2.6 units away, 35 degrees above the plane, to the middle."""
+    """Return the pose [4, 4], world to camera: 2.6 units away, 35 degrees above the plane."""
     angle = np.deg2rad(35.0)
     down, forward = np.sin(angle), np.cos(angle)
     pose = np.eye(4, dtype=np.float32)
@@ -71,7 +71,7 @@ def oblique_camera() -> NDArray[np.float32]:
 
 
 def with_attributes(arrays: Arrays) -> Arrays:
-    """The case with random sizes, rotations, opacities and gradient of the image."""
+    """Return the case with random sizes, rotations, opacities and image gradient."""
     count = len(arrays["means"])
     shape = (int(arrays["height"]), int(arrays["width"]), 3)
     torch.manual_seed(SEED)
@@ -85,7 +85,7 @@ def with_attributes(arrays: Arrays) -> Arrays:
 
 
 def main() -> None:
-    """Reads the command line and writes the case."""
+    """Read the command line and write the case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("case", type=Path, help="the file to write")
     parser.add_argument("--garden", type=Path, help="test_garden.npz of gsplat")

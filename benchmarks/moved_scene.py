@@ -1,9 +1,10 @@
-"""A COLMAP scene moved to coordinates of maps: how far its frame and its PSNR are from in place.
+"""A COLMAP scene moved to map coordinates: the differences of its frame and its PSNR.
 
     python benchmarks/moved_scene.py SCENE --steps 600 --max-size 100
 
-The scene is trained where it is, moved, and where it is from first positions that are one unit in
-the last place of float32 aside, at random; the moved run should lie within the spread of these.
+The scene is trained in place and moved. It is also trained in place from initial positions that
+differ at random by one unit in the last place of float32. The PSNR of the moved run should be
+within the spread of these runs.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from crossgrad_core.training.start import first_state
 
 
 def moved(scene: Path, offset: tuple[float, ...], to: Path) -> Path:
-    """The scene with `offset` added to every position, beside links to its photos."""
+    """Write the scene with `offset` added to every position, and link its photos."""
     guard_pycolmap()
     import pycolmap
 
@@ -41,7 +42,7 @@ def moved(scene: Path, offset: tuple[float, ...], to: Path) -> Path:
 
 
 def psnr(config: RunConfig, scene: Scene, seed: int | None = None) -> float:
-    """Of the held-out views after a run; from positions a bit aside, where a seed is given."""
+    """Return the held-out PSNR after a run. With a seed, initial positions are perturbed."""
     setup = assemble(config, scene, "colmap")
     state = first_state(setup)
     if seed is not None:
@@ -57,7 +58,7 @@ def psnr(config: RunConfig, scene: Scene, seed: int | None = None) -> float:
 
 
 def main() -> None:
-    """Prints one JSON line for each run, and one for the whole."""
+    """Print one JSON line for each run, and one summary line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--steps", type=int, default=600)
@@ -70,7 +71,7 @@ def main() -> None:
     settings = {"steps": given.steps, "threads": 1, "data": reading}
     with tempfile.TemporaryDirectory() as folder:
         scenes = {}
-        # Both are written anew, since that may change the order of the points.
+        # Write both scenes, because writing may change the order of the points.
         for name, offset in (("in place", (0.0, 0.0, 0.0)), ("moved", given.offset)):
             path = moved(given.scene, offset, Path(folder) / name)
             scenes[name] = read_scene(RunConfig(scene=path, **settings), path)[0]

@@ -1,16 +1,17 @@
-"""Cost of the operators beside plain additions of the same gradients.
+"""Cost of the operators, compared with plain additions of the same gradients.
 
 One JSON line per operator:
 
     python benchmarks/operators.py [OPERATOR ...] [--parameters N] [--repeats N]
 
-For K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of a vanilla backbone,
-`ratio` is (time of the aggregation - time of the additions) / time of the additions, where the
-additions are `torch.add(g1, g2, out=)` and its like for the other views, measured in turn with the
-aggregation. The aggregation writes its results over the gradients of one view, which are restored
-between repeats. `accumulated_ratio` is the same for operators that need no separate gradients, with
-the views handed over one by one, as in training. `arithmetic_us` is the operator's own arithmetic
-for six blocks. Times are the least of the repeats; a machine that does other work shows in `load`.
+The gradients are K = 2 and K = 4 views of `--parameters` float32 numbers in the six blocks of a
+vanilla backbone. `ratio` is (time of the aggregation - time of the additions) / time of the
+additions. The additions are `torch.add(g1, g2, out=)`, repeated for each further view, and
+alternate with the aggregation. The aggregation overwrites the gradients of one view, which are
+restored between repeats. `accumulated_ratio` is the same ratio for operators that need no separate
+gradients, with the views added one by one, as in training. `arithmetic_us` is the operator's own
+arithmetic for six blocks. Times are minima over the repeats. `load` shows other work on the
+machine.
 """
 
 import argparse
@@ -50,7 +51,7 @@ ADDITIONS = "torch.add"
 
 
 def main() -> None:
-    """Prints one line per operator, and one for the additions themselves."""
+    """Print one line per operator."""
     arguments = _arguments()
     configure_threads()
     names = arguments.operators or list(entries("operators"))
@@ -99,7 +100,7 @@ def _measured(
 def _work(
     operator: Operator, gradients: list[dict[str, Tensor]], out: dict[str, Tensor]
 ) -> dict[str, Callable[[], object]]:
-    """What is timed, by the name of its figure."""
+    """Return the functions that are timed, by the name of their figure."""
     work: dict[str, Callable[[], object]] = {
         "ratio": lambda: operator.aggregate(_context(_apart(gradients)), EMPTY_STATE),
         ADDITIONS: lambda: _add(gradients, out),
@@ -141,7 +142,7 @@ def _least(
     repeats: int,
     prepare: Callable[[], object] = lambda: None,
 ) -> dict[str, float]:
-    """Least seconds of each piece of work, in turn, after one call to warm up."""
+    """Return the minimum seconds of each function, called alternately after one warm-up call."""
     least = dict.fromkeys(work, float("inf"))
     for repeat in range(repeats + 1):
         for name, run in work.items():
@@ -182,7 +183,7 @@ def _context(gradients: SeparateGradients) -> AggregateContext:
 
 
 def _arithmetic(operator: Operator, views: int) -> float | None:
-    """Microseconds of `transform` for six blocks; None for operators that work on elements."""
+    """Return microseconds of `transform` for six blocks, or None for operators on elements."""
     if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))

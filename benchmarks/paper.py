@@ -1,13 +1,13 @@
-"""The paper's tables and claims on our scenes: tuning, runs, and the page that says what came out.
+"""The paper's tables and claims on our scenes: tuning, runs, and the page with the results.
 
     python benchmarks/paper.py run [--only GRID,...] [--scenes DIR] [--workers N]
-    python benchmarks/paper.py page        # only writes the page, from the runs that there are
+    python benchmarks/paper.py page        # only write the page, from existing runs
     python benchmarks/paper.py estimate    # core hours of each grid
 
-`run` says how long it takes, tunes the learning rates, carries out the grids of
-benchmarks/grids/paper and writes docs/results/paper.md. It can be stopped and started at any time:
-what has finished is not repeated. Tables of finished runs are kept in benchmarks/results/paper,
-from where the next call takes them, on another machine, too.
+`run` prints the expected time, tunes the learning rates, runs the grids of benchmarks/grids/paper
+and writes docs/results/paper.md. It can be stopped and started at any time, and finished runs are
+not repeated. Tables of finished runs are packed in benchmarks/results/paper. The next call uses
+them, also on another machine.
 """
 
 import argparse
@@ -40,11 +40,11 @@ ROOT = Path(__file__).parents[1]
 #: Tuned arm -> scene -> factor of the learning rates.
 Factors: TypeAlias = Mapping[str, Mapping[str, float]]
 CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
-#: CPU seconds of a view of 400 px (0.059 city_hybrid, 0.049 city_unimodal, 0.046 boruszyn_kap,
-#: 0.040 ochota_kap_hybrid) and of a run besides its views: libraries, scene, evaluation, results.
-#: One run of 1,200 views each, two views per step, one core of an AMD EPYC that other work shared.
+#: CPU seconds of a view at 400 px, and of a run in addition to its views (libraries, scene,
+#: evaluation, results). Measured with one run of 1,200 views per scene, two views per step, on one
+#: shared core of an AMD EPYC.
 VIEW, BESIDES = 0.049, 12.0
-#: The cost of a view beside vanilla's (docs/benchmarks.md, Cost of backbones).
+#: Cost of a view relative to vanilla (docs/benchmarks.md, Cost of backbones).
 COSTS = {
     "scaffold": 1.5,
     "octree": 1.6,
@@ -53,17 +53,17 @@ COSTS = {
     "pixel": 1.1,
     "distance": 1.35,
 }
-#: Seconds that the probes of a run take.
+#: Seconds of the probes of a run.
 PROBES = 25.0
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where things are.
+    """The folders and files of the benchmark.
 
     Attributes:
-        out: Sweeps and the grids that they are run from.
-        kept: Packed tables of finished runs.
+        out: Folder of the sweeps and of the grids from which they are run.
+        kept: Folder of packed tables of finished runs.
         page: The page.
     """
 
@@ -72,25 +72,25 @@ class Place:
     page: Path
 
     def sweep(self, grid: str) -> Path:
-        """The folder of a grid's sweep."""
+        """Return the folder of a grid's sweep."""
         return self.out / grid
 
     def grid(self, grid: str) -> Path:
-        """The grid as it is run, with scenes and rates filled in."""
+        """Return the path of the grid as it is run, with scenes and rates filled in."""
         return self.out / "grids" / f"{grid}.yaml"
 
     @property
     def tuned(self) -> Path:
-        """The grid with the best rates, as `crossgrad sweep --best` writes it."""
+        """The grid with the best rates, as written by `crossgrad sweep --best`."""
         return self.out / "grids" / "tuned.yaml"
 
     def archive(self, grid: str) -> Path:
-        """The packed tables of a grid."""
+        """Return the path of a grid's packed tables."""
         return self.kept / f"{grid}.tar.xz"
 
 
 class Paper:
-    """All grids, on the scenes that the user has.
+    """All grids, on the user's scenes.
 
     Args:
         given: The options of the command line.
@@ -102,7 +102,7 @@ class Paper:
         self.plan: Plan = read_plan()
 
     def check(self) -> None:
-        """Refuses grids that there are not."""
+        """Refuse grids that do not exist."""
         if unknown := [name for name in self.given.only or () if name not in self.plan.grids]:
             raise UserError(
                 "there is no such grid",
@@ -114,12 +114,12 @@ class Paper:
 
     @property
     def names(self) -> list[str]:
-        """The measured grids that the user wants, in their order."""
+        """The measured grids that the user requested, in order."""
         only = self.given.only
         return [name for name in self.plan.grids if not only or name in only]
 
     def source(self, name: str) -> Grid:
-        """A grid of the repository, on the user's scenes."""
+        """Return a grid of the repository, on the user's scenes."""
         grid = read_grid(GRIDS / f"{name}.yaml")
         folder = self.given.scenes
         wanted = self.given.scene or [folder / scene_name(each) for each in grid.scenes]
@@ -128,7 +128,7 @@ class Paper:
         return grid.model_copy(update={"seeds": tuple(seeds)}) if seeds else grid
 
     def grids(self) -> dict[str, Grid]:
-        """Every measured grid: as it was run last, or else as the repository has it."""
+        """Return every measured grid, as last run, or else as stored in the repository."""
         found = {
             name: read_grid(path) if path.is_file() else self.source(name)
             for name in self.plan.grids
@@ -141,7 +141,7 @@ class Paper:
         return found
 
     def results(self) -> Results:
-        """What all grids came to so far."""
+        """Return the results of all grids so far."""
         return self._read(self.grids())
 
     def _read(self, grids: Mapping[str, Grid]) -> Results:
@@ -151,13 +151,13 @@ class Paper:
     # The steps of `run`.
 
     def unpack(self) -> None:
-        """Takes finished runs from the packed tables."""
+        """Add finished runs from the packed tables."""
         for name in (self.plan.tuning, *self.plan.grids):
             if self.place.archive(name).is_file():
                 unpack(self.place.archive(name), self.place.sweep(name))
 
     def run(self) -> int:
-        """Tunes, runs what is not finished, and writes the page; answers the exit code."""
+        """Tune, run unfinished runs, and write the page. Return the exit code."""
         self.unpack()
         self.tell()
         worst = self._swept(self.plan.tuning, _as_mapping(self.source(self.plan.tuning)))
@@ -176,7 +176,7 @@ class Paper:
         return worst
 
     def _swept(self, name: str, content: Mapping[str, Any]) -> int:
-        """Runs a grid and packs what finished."""
+        """Run a grid, pack its finished runs, and return the exit code."""
         path = self.place.grid(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
@@ -193,7 +193,7 @@ class Paper:
         return code
 
     def _factors(self) -> Factors:
-        """The best factors of the learning rates."""
+        """Return the best factors of the learning rates."""
         self.place.tuned.unlink(missing_ok=True)
         tuning = self.place.grid(self.plan.tuning)
         command = ["sweep", str(tuning), "--out", str(self.place.sweep(self.plan.tuning))]
@@ -211,7 +211,7 @@ class Paper:
         }
 
     def _content(self, name: str, factors: Factors) -> dict[str, Any] | None:
-        """A grid with rates; None for one that has to wait for the others."""
+        """Return a grid with rates, or None if it has to wait for other grids."""
         grid = self.source(name)
         if name == self.plan.best_of.grid:
             best = self._best(self.results(), self.grids())
@@ -227,7 +227,7 @@ class Paper:
         return _as_mapping(with_rates(grid, rates, factors))
 
     def _best(self, results: Results, grids: Mapping[str, Grid]) -> list[Arm]:
-        """The best of the candidates; none before all their runs have ended."""
+        """Return the best candidates, or none until all their runs have ended."""
         candidates = self.plan.best_of.candidates
         if any(results.missing([name])[1] for name in candidates):
             return []
@@ -238,7 +238,7 @@ class Paper:
         return [arms[name] for name in order]
 
     def write_page(self) -> None:
-        """Writes the page from what there is."""
+        """Write the page from the existing results."""
         results, grids = self.results(), self.grids()
         extra = [arm.name for arm in grids[self.plan.best_of.grid].arms]
         text = page(read_claims(), results, read_tables(), extra)
@@ -250,7 +250,7 @@ class Paper:
                   f"{folders[0]}", file=sys.stderr)  # fmt: skip
 
     def tell(self) -> None:
-        """Prints how many core hours each grid takes, and what is left."""
+        """Print the core hours of each grid, and the remaining core hours."""
         results, total = self.results(), 0.0
         tuning = {self.plan.tuning: self.source(self.plan.tuning)}
         for name, grid in {**tuning, **{n: self.source(n) for n in self.names}}.items():
@@ -263,7 +263,7 @@ class Paper:
         print(f"left: about {hours:.1f} core hours, {hours / cores:.1f} h on {cores} cores")
 
     def _cost(self, name: str, grid: Grid, results: Results) -> tuple[int, float, float]:
-        """Runs of a grid, their seconds, and seconds of those that are left."""
+        """Return the number of a grid's runs, their seconds, and the remaining seconds."""
         cells = len(grid.scenes) * len(grid.seeds)
         count = BEST if name == self.plan.best_of.grid else 1
         runs, seconds, left = 0, 0.0, 0.0
@@ -282,20 +282,20 @@ class Paper:
 
 
 def own_rate(name: str, plan: Plan, factors: Mapping[str, object]) -> str:
-    """The tuned arm whose factors an arm takes."""
+    """Return the tuned arm whose factors an arm uses."""
     return name if name in factors else plan.rates.get(name, plan.rates["default"])
 
 
 def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
-    """The grid with the factors of tuned arms, by scene.
+    """Return the grid with the factors of tuned arms, by scene.
 
     Args:
         grid: A grid.
-        rates: Its arms -> the tuned arms whose factors they take.
+        rates: Arm of the grid -> the tuned arm whose factors it uses.
         factors: Tuned arm -> scene -> factor.
 
     Raises:
-        UserError: A scene was not tuned on.
+        UserError: A scene was not used for tuning.
     """
     arms = []
     for arm in grid.arms:
@@ -315,7 +315,7 @@ def with_rates(grid: Grid, rates: Mapping[str, str], factors: Factors) -> Grid:
 
 
 def with_methods(grid: Grid, methods: Sequence[Arm]) -> Grid:
-    """The grid with each arm once for each method, `BACKBONE, METHOD`."""
+    """Return the grid with each arm repeated for each method, named `BACKBONE, METHOD`."""
     arms = [
         Arm(
             name=f"{backbone.name}, {method.name}",
@@ -332,7 +332,7 @@ def _without_probes(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rate_of(arm: Arm, methods: Sequence[Arm], plan: Plan) -> str:
-    """The tuned arm whose factors a method on another backbone takes."""
+    """Return the tuned arm whose factors a method on another backbone uses."""
     backbone, _, name = arm.name.partition(", ")
     method = next(each for each in methods if each.name == name)
     if (like := plan.best_of.scaffold_like.get(backbone)) is not None:
@@ -343,7 +343,7 @@ def rate_of(arm: Arm, methods: Sequence[Arm], plan: Plan) -> str:
 
 
 def run_seconds(settings: Mapping[str, Any]) -> float:
-    """About how many core seconds a run of these settings takes."""
+    """Return the approximate core seconds of a run with these settings."""
     backbone = COSTS.get(str(settings.get("backbone")), 1.0)
     train = settings.get("seconds") or backbone * VIEW * float(settings["max_views"])
     return float(train) + BESIDES + (PROBES if "observers" in settings else 0.0)
@@ -356,18 +356,18 @@ def _as_mapping(grid: Grid) -> dict[str, Any]:
 def _packed(sweep: Path, archive: Path) -> None:
     try:
         pack(sweep, archive)
-    except UserError as error:  # No run has finished: what failed is on the screen.
+    except UserError as error:  # No run has finished, and failures are already printed.
         print(error.what, file=sys.stderr)
 
 
 def _call(arguments: Sequence[str]) -> int:
-    """A command of crossgrad in a process of its own, which hears of Ctrl-C, too."""
+    """Run a crossgrad command in its own process, which also receives Ctrl-C."""
     process = subprocess.Popen([*CROSSGRAD, *arguments])
     while True:
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            continue  # It stops its runs with checkpoints, and then ends.
+            continue  # The process stops its runs with checkpoints, and then ends.
         return exit_code(-code) if code < 0 else code
 
 
@@ -392,7 +392,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Runs, writes the page, or estimates; answers the exit code."""
+    """Run, write the page, or estimate. Return the exit code."""
     given = _parser().parse_args()
     paper = Paper(given)
     try:

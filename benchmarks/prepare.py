@@ -1,12 +1,12 @@
-"""How long `crossgrad prepare` takes, how many photos it registers, and how well, in a table.
+"""Duration of `crossgrad prepare`, number of registered photos, and accuracy, in a table.
 
     python benchmarks/prepare.py PHOTOS SCENE [--truth MODEL ...] [-- OPTION ...]
 
-Each truth is a folder with a COLMAP model of the same photos, by name; several have to be in one
-frame. The prepared cameras are brought into that frame by the similarity that most of them agree
-with (RANSAC, then least squares over those that agree), and what is left is compared with the
-diagonal of the box around all true cameras. Options behind `--` go to `crossgrad prepare`. A scene
-that is ready is evaluated again, without times.
+Each truth is a folder with a COLMAP model of the same photos, matched by name. Several truths must
+be in one frame. The prepared cameras are aligned to this frame by the similarity with which most of
+them agree (RANSAC, then least squares over the agreeing cameras). The remaining error is divided by
+the diagonal of the box around all true cameras. Options after `--` are passed to `crossgrad
+prepare`. A finished scene is only evaluated, without times.
 """
 
 import argparse
@@ -23,16 +23,16 @@ import pycolmap
 from _machine import code, facts
 from numpy.typing import NDArray
 
-#: Share of the scene's size within which a camera counts as found.
+#: A camera is found if its error is within this share of the scene's size.
 CLOSE = 0.005
-#: Share of the scene's size within which cameras agree with a similarity.
+#: A camera agrees with a similarity if its error is within this share of the scene's size.
 AGREES = 0.01
 
 Poses = Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
 def poses_of(folders: Sequence[Path]) -> Poses:
-    """Name -> [3, 3] rotation of world to camera, [3] centre, of all models."""
+    """Return name -> [3, 3] rotation of world to camera, [3] centre, for all models."""
     found = {}
     for folder in folders:
         for image in pycolmap.Reconstruction(folder).images.values():
@@ -42,7 +42,7 @@ def poses_of(folders: Sequence[Path]) -> Poses:
 
 
 def errors_of(found: Poses, truth: Poses) -> tuple[dict[str, tuple[float, float]], float]:
-    """Name -> distance from the truth as a share of the scene's size, and degrees; the size."""
+    """Return name -> error as a share of the scene's size, and degrees; and the scene's size."""
     names = sorted(found.keys() & truth.keys())
     here = np.array([found[name][1] for name in names])
     there = np.array([truth[name][1] for name in names])
@@ -62,12 +62,12 @@ def errors_of(found: Poses, truth: Poses) -> tuple[dict[str, tuple[float, float]
 
 
 def _angle(rotation: NDArray[np.float64]) -> float:
-    """Degrees."""
+    """Return the angle of a rotation in degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
 
 
 def prepare(photos: Path, scene: Path, options: Sequence[str]) -> tuple[float, float, float]:
-    """Wall seconds, CPU seconds and largest memory in GiB of the command."""
+    """Run the command, and return wall seconds, CPU seconds and peak memory in GiB."""
     command = [sys.executable, "-m", "crossgrad_core", "prepare", str(photos), str(scene), *options]
     begun = perf_counter()
     subprocess.run(command, check=True)
@@ -76,7 +76,7 @@ def prepare(photos: Path, scene: Path, options: Sequence[str]) -> tuple[float, f
 
 
 def rows(scene: Path, truth: Poses) -> list[str]:
-    """A line for each folder and one for all: photos, registered, errors."""
+    """Return a line for each folder and a line for all: photos, registered photos, errors."""
     report = json.loads((scene / "report.json").read_text())
     errors, size = errors_of(poses_of([scene / "sparse" / "0"]), truth) if truth else ({}, 0.0)
     lines = []
@@ -96,12 +96,12 @@ def rows(scene: Path, truth: Poses) -> list[str]:
 
 
 def main() -> None:
-    """Prepares a scene where it is not ready, and prints the table."""
+    """Prepare a scene if it is not finished, and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--truth", type=Path, action="append", default=[])
-    # By hand: argparse leaves nothing behind an option to a list of positional arguments.
+    # Split by hand, because argparse cannot pass options after a list of positional arguments.
     words = [*sys.argv[1:], "--"]
     ours = words.index("--")
     given = parser.parse_args(words[:ours])

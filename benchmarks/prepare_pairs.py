@@ -1,11 +1,12 @@
-"""Which of the pairs that `crossgrad prepare` verified are right, and what the right ones allow.
+"""Correct and wrong pairs among the verified pairs of `crossgrad prepare`.
 
     python benchmarks/prepare_pairs.py PHOTOS SCENE --truth MODEL [--truth MODEL ...] [--map]
 
-For each two folders: the pairs with verified matches, by the number of these, and how many of them
-are wrong: fewer than half of their matches lie within four pixels of the epipolar lines of the true
-poses. With `--map` cameras are found once more with the right pairs alone, at COLMAP's thresholds
-and at half of them: what no better choice of pairs could go beyond.
+For each two folders, the table shows the number of pairs with verified matches, by the number of
+matches, and the number of wrong pairs. A pair is wrong if fewer than half of its matches are within
+four pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only
+the correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any
+selection of pairs.
 """
 
 import argparse
@@ -23,11 +24,11 @@ from _machine import code, facts
 from numpy.typing import NDArray
 from prepare import CLOSE, Poses, errors_of, poses_of
 
-#: Least matches of each column of the table.
+#: Least number of matches for each column of the table.
 BOUNDS = (15, 20, 30, 60, 100)
-#: Pixels, and the share of a pair's matches.
+#: Pixels to the epipolar line, and least share of matches within this distance.
 NEAR, RIGHT = 4.0, 0.5
-#: Points that a pose needs, and their share among those that are tried: COLMAP's, and half of it.
+#: Number of points for a pose, and their share of the tried points: COLMAP's, and half of it.
 THRESHOLDS = ((30, 0.25), (15, 0.125))
 
 Matrix = NDArray[np.float64]
@@ -38,10 +39,10 @@ class Pair:
     """A pair with verified matches.
 
     Attributes:
-        numbers: Of the two photos in the database.
-        names: Of the two photos.
-        matches: Verified ones.
-        right: Whether most of them agree with the true poses.
+        numbers: Numbers of the two photos in the database.
+        names: Names of the two photos.
+        matches: Number of verified matches.
+        right: True if most of them agree with the true poses.
     """
 
     numbers: tuple[int, int]
@@ -51,12 +52,12 @@ class Pair:
 
     @property
     def folders(self) -> str:
-        """The two folders, in the order of their names."""
+        """The two folders, sorted by name."""
         return " - ".join(sorted(name.rpartition("/")[0] for name in self.names))
 
 
 def intrinsics_of(folders: list[Path]) -> dict[str, Matrix]:
-    """Name -> [3, 3] K of all models."""
+    """Return name -> [3, 3] K for all models."""
     models = [pycolmap.Reconstruction(folder) for folder in folders]
     return {
         image.name: model.camera(image.camera_id).calibration_matrix()
@@ -66,7 +67,7 @@ def intrinsics_of(folders: list[Path]) -> dict[str, Matrix]:
 
 
 def judged(path: Path, truth: Poses, intrinsics: dict[str, Matrix]) -> Iterator[Pair]:
-    """The verified pairs of a database whose two photos have true poses."""
+    """Yield the verified pairs of a database whose two photos have true poses."""
     database = pycolmap.Database.open(path)
     names = {image.image_id: image.name for image in database.read_all_images()}
     for pair, found in zip(*database.read_two_view_geometries(), strict=True):
@@ -88,12 +89,12 @@ def judged(path: Path, truth: Poses, intrinsics: dict[str, Matrix]) -> Iterator[
 
 
 def homogeneous(pixels: NDArray[np.float32]) -> Matrix:
-    """[N, 3] pixels with a 1 behind them."""
+    """Return pixels [N, 3] in homogeneous coordinates."""
     return np.column_stack([np.asarray(pixels, np.float64), np.ones(len(pixels))])
 
 
 def fundamental(truth: Poses, intrinsics: dict[str, Matrix], first: str, second: str) -> Matrix:
-    """[3, 3] matrix whose product with a pixel of the first photo is its line in the second."""
+    """Return the fundamental matrix [3, 3], from a pixel in `first` to its line in `second`."""
     turn = truth[second][0] @ truth[first][0].T
     x, y, z = truth[second][0] @ (truth[first][1] - truth[second][1])
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -102,7 +103,7 @@ def fundamental(truth: Poses, intrinsics: dict[str, Matrix], first: str, second:
 
 
 def table(pairs: list[Pair]) -> Iterator[str]:
-    """Rows of folders, columns of matches: pairs, and how many of them are wrong."""
+    """Yield a table by folders and number of matches: pairs, and how many of them are wrong."""
     titles = [f"{low} to {high - 1}" for low, high in itertools.pairwise(BOUNDS)]
     titles.append(f"{BOUNDS[-1]} and more")
     yield "| folders | " + " | ".join(titles) + " |"
@@ -120,7 +121,7 @@ def table(pairs: list[Pair]) -> Iterator[str]:
 
 
 def mapped(photos: Path, source: Path, wrong: list[Pair], truth: Poses) -> Iterator[str]:
-    """What the right pairs come to, at each of the thresholds."""
+    """Yield the mapping results with only the correct pairs, for each of the thresholds."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "database.db"
         shutil.copy(source, path)
@@ -150,7 +151,7 @@ def mapped(photos: Path, source: Path, wrong: list[Pair], truth: Poses) -> Itera
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("scene", type=Path)

@@ -1,11 +1,12 @@
-"""Times a rasterizer forward and backward to all parameters on a fixed case; prints one JSON line.
+"""Times a rasterizer forward and backward to all parameters on a fixed case, as one JSON line.
 
     NUMBA_NUM_THREADS=1 python benchmarks/rasterizer.py CASE.npz [--rasterizer numba] [--reps 30]
 
-A case holds `means`, `quats`, `scales`, `opacities`, `colors`, a camera (`viewmat`, `K`, `width`,
-`height`) and `v_image`, the gradient of the loss by the image. Times are seconds of wall clock,
-median and least over the repetitions, after one untimed repetition that compiles the kernels
-(its time is `first`). `--save` writes the image and the gradients of sum(image * v_image).
+A case contains `means`, `quats`, `scales`, `opacities`, `colors`, a camera (`viewmat`, `K`,
+`width`, `height`) and `v_image`, the gradient of the loss with respect to the image. Times are
+seconds of wall time, as median and minimum over the repetitions. One untimed repetition before them
+compiles the kernels (its time is `first`). `--save` writes the image and the gradients of
+sum(image * v_image).
 """
 
 import argparse
@@ -30,7 +31,7 @@ INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def main() -> None:
-    """Reads the command line, measures, prints."""
+    """Read the command line, measure, and print the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("case", type=Path)
     parser.add_argument("--rasterizer", default="numba")
@@ -40,7 +41,7 @@ def main() -> None:
     parser.add_argument("--reps", type=int, default=30)
     parser.add_argument("--save", type=Path)
     arguments = parser.parse_args()
-    # As a run does: the same threads for torch, and freed arrays are kept for the next step.
+    # As in a run: the same threads for torch, and freed arrays are kept for the next step.
     configure_threads()
     with np.load(arguments.case) as archive:
         case = dict(archive)
@@ -74,7 +75,7 @@ def main() -> None:
 def draw(
     rasterizer: Rasterizer, tensors: dict[str, Tensor], case: dict[str, Any]
 ) -> tuple[float, float, Render]:
-    """Renders and differentiates once; returns both durations in seconds and the result."""
+    """Render and differentiate once. Return both durations in seconds and the result."""
     for tensor in tensors.values():
         tensor.grad = None
     v_image = torch.from_numpy(case["v_image"])
@@ -94,7 +95,7 @@ def draw(
 
 
 def camera_of(case: dict[str, Any]) -> Camera:
-    """The camera of a case."""
+    """Return the camera of a case."""
     k = case["K"].astype(np.float64)
     pose = torch.from_numpy(case["viewmat"].astype(np.float64))
     size = int(case["width"]), int(case["height"])
@@ -102,7 +103,7 @@ def camera_of(case: dict[str, Any]) -> Camera:
 
 
 def summary(name: str, seconds: list[float]) -> dict[str, float]:
-    """Median and least of some durations, seconds."""
+    """Return median and minimum of durations in seconds."""
     return {
         name: round(statistics.median(seconds), 5),
         f"{name}_min": round(min(seconds), 5),
@@ -110,7 +111,7 @@ def summary(name: str, seconds: list[float]) -> dict[str, float]:
 
 
 def save(path: Path, result: Render, tensors: dict[str, Tensor]) -> None:
-    """Writes image, alpha and the gradients of the inputs to an npz file."""
+    """Write image, alpha and the gradients of the inputs to an npz file."""
     arrays = {"image": result.image.detach().numpy(), "alpha": result.alpha.detach().numpy()}
     for name, tensor in tensors.items():
         if tensor.grad is None:

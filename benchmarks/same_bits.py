@@ -1,17 +1,17 @@
-"""Whether two versions of crossgrad train to the same bits.
+"""Test for bit-identical training with two versions of crossgrad.
 
     python benchmarks/same_bits.py OLD_PYTHON NEW_PYTHON [--only TEXT] [--out DIR]
         [--for-new OPTIONS]
 
 OLD_PYTHON and NEW_PYTHON are the interpreters of two environments on this machine, each with one
-version installed. Every backbone with each of its densifiers, and every operator, sampler and
-grouping at least once, trains the bundled scene for 60 steps with density control from step 20 on,
-is stopped at step 30 and resumed. Tensors, moments, plugin states, random streams, the PLY and
-metrics.csv without its clocks must be equal; the state of slots that only the new version has is
-left out. Exit status 1 where anything differs.
+version installed. The cases are every backbone with each densifier, and every operator, sampler and
+grouping at least once. Each case trains the bundled scene for 60 steps with density control from
+step 20 on, is stopped at step 30 and resumed. Tensors, moments, plugin states, random streams, the
+PLY and metrics.csv without its clocks must be equal. The state of slots that only the new version
+has is ignored. The exit status is 1 if there is a difference.
 
-Where a difference is meant, the commit that makes it says why. Where a default changed, `--for-new
-"--schedule-unit steps"` gives the new version the options that keep what the old one does.
+If a difference is intended, the commit that makes it explains it. If a default changed, `--for-new
+"--schedule-unit steps"` gives the new version options that keep the old behaviour.
 """
 
 import argparse
@@ -26,16 +26,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: Options of every run: three edits, a reset and an evaluation before and after the stop.
+#: Options of every run: three edits, a reset, and evaluations before and after the stop.
 USUAL = (
     *("--steps", "60", "--max-size", "100", "--threads", "1", "--quiet"),
     *("--set", "densify_from=20", "--set", "densify_every=10", "--set", "densify_until=55"),
     *("--set", "reset_every=30", "--set", "eval_every=20", "--stop-after", "30"),
 )
-#: Columns of metrics.csv that no two runs share.
+#: Columns of metrics.csv that differ between any two runs.
 CLOCKS = {"train_seconds", "cpu_seconds", "peak_memory_mib"}
 
-#: Runs in the environment under test: command lines come as JSON, exit codes go back as JSON.
+#: Program in the tested environment: command lines arrive as JSON, exit codes return as JSON.
 CHILD = """
 import contextlib, io, json, sys
 from crossgrad_core.cli.main import main
@@ -85,7 +85,7 @@ class Environment:
         )
 
     def run(self, *arguments: str) -> tuple[int, str]:
-        """Exit code and output of a command line."""
+        """Return exit code and output of a command line."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(json.dumps(arguments) + "\n")
@@ -94,7 +94,7 @@ class Environment:
         return code, said
 
     def names(self, *slots: str) -> dict[str, list[str]]:
-        """The installed components of some slots."""
+        """Return the installed components of some slots."""
         found: dict[str, list[str]] = json.loads(
             subprocess.check_output([self.python, "-P", "-c", NAMES, *slots], text=True)
         )
@@ -102,7 +102,7 @@ class Environment:
 
 
 def cases(names: dict[str, list[str]]) -> Iterator[Case]:
-    """Every backbone x densifier; every operator, sampler and grouping."""
+    """Yield every backbone x densifier, and every operator, sampler and grouping."""
     for backbone in names["backbones"]:
         for densifier in names["densifiers"]:
             options = ("--backbone", backbone, "--densifier", densifier)
@@ -117,7 +117,7 @@ def cases(names: dict[str, list[str]]) -> Iterator[Case]:
 
 
 def trained(environment: Environment, case: Case, folder: Path) -> tuple[int, str]:
-    """Trains a case into `folder`, stopped and resumed; the exit code and the last output."""
+    """Train a case into `folder`, stopped and resumed. Return exit code and last output."""
     arguments = ("run", "--out", str(folder), *case.options, *environment.options, *USUAL)
     code, said = environment.run(*arguments)
     if code != 0:
@@ -126,7 +126,7 @@ def trained(environment: Environment, case: Case, folder: Path) -> tuple[int, st
 
 
 def differences(old: Path, new: Path) -> list[str]:
-    """What two run folders do not share."""
+    """Return the differences between two run folders."""
     first, second = _checkpoint(old), _checkpoint(new)
     found = []
     if (first / "tensors.safetensors").read_bytes() != (
@@ -165,7 +165,7 @@ def _columns(old: Path, new: Path) -> list[str]:
 
 
 def verdict(case: Case, environments: list[Environment], out: Path) -> tuple[bool, str]:
-    """Whether both versions agree on a case, and what there is to say about it."""
+    """Return whether both versions agree on a case, and a description."""
     folders = [out / side / case.name.replace(" ", "-") for side in ("old", "new")]
     ends = [trained(*pair) for pair in zip(environments, [case] * 2, folders, strict=True)]
     codes = [code for code, _ in ends]
@@ -182,7 +182,7 @@ def verdict(case: Case, environments: list[Environment], out: Path) -> tuple[boo
 
 
 def main() -> None:
-    """Compares the two environments case by case."""
+    """Compare the two environments case by case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("old", help="interpreter with the old version")
     parser.add_argument("new", help="interpreter with the new version")

@@ -1,20 +1,20 @@
-"""Step time and peak memory against Gaussians, image size, K and threads; a table and a figure.
+"""Step time and peak memory by number of Gaussians, image size, K and threads: table and figure.
 
     python benchmarks/scale.py [--full] [--only TEXT] [--reps N] [--out DIR]
 
-A synthetic scene in memory: cameras in its middle look in some directions, and in front of each
-lies a cloud of Gaussians that it sees; all others lie where no camera looks. A `fixed` cell has one
-direction, so that each step sees the same Gaussians; a `turning` cell has ten, with a tenth of all
-Gaussians in each, so that each Gaussian is out of view for ten steps on average and what was put
-off for it is caught up with. Steps are those of a run in the midst of density control, between two
-edits, with SH degree 3.
+The scene is synthetic and in memory. Cameras in its middle look in some directions. In front of
+each camera is a cloud of Gaussians that it sees. All other Gaussians are outside of all views. A
+`fixed` cell has one direction, so that each step sees the same Gaussians. A `turning` cell has ten
+directions, with a tenth of all Gaussians in each. There, each Gaussian is out of view for ten steps
+on average, and its deferred updates are flushed later. Steps are steps during density control,
+between two edits, with SH degree 3.
 
-Seconds are of the CPU: the cells of a group take turns step by step in one process, and ratios are
-medians over pairs with the group's first cell. Memory is the largest resident set of a process of
-its own, with the copy that a run can go back to. The bound is what memory traffic alone would take,
-at the bandwidth of a copy on this machine: every number that a step cannot do without, once.
+Times are CPU seconds. The cells of a group take alternate steps in one process, and ratios are
+medians over pairs with the group's first cell. Memory is the largest resident set of a separate
+process, including the copy for rollback. The bound is the time of the memory traffic alone, at the
+bandwidth of a copy on this machine: every number that a step needs is moved once.
 
-With `--out` it writes scale.json and scale.svg.
+With `--out`, the program writes scale.json and scale.svg.
 """
 
 import argparse
@@ -40,31 +40,31 @@ if TYPE_CHECKING:
     from crossgrad_core.training.setup import Setup
     from crossgrad_core.training.state import TrainState
 
-#: A step of the published schedule with SH degree 3, statistics gathered, and no edit near.
+#: A step of the published schedule with SH degree 3 and gathered statistics, far from an edit.
 STEP = 5_010
-#: ... and one that edits.
+#: A step that edits.
 EDIT = 5_100
-#: Steps that compile, decode photos and fill memory before any is measured.
+#: Steps that compile, decode photos and fill memory before the measurement.
 WARM_UP = 3
-#: Photos of each direction.
+#: Number of photos in each direction.
 PHOTOS = 4
-#: Bytes of a Gaussian of degree 3 that a step reads or writes: of the geometry, which culling needs
-#: (11 parameters and their moments, both ways), and of one that is drawn (59, and its gradients).
+#: Bytes that a step moves for a Gaussian of degree 3: for an unseen Gaussian (11 geometry
+#: parameters and their moments, read and written) and for a drawn one (59 parameters, gradients).
 UNSEEN, SEEN = 11 * 6 * 4, 59 * 8 * 4
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One measured case.
+    """A measured case.
 
     Attributes:
-        gaussians: All of them.
-        visible: Those in front of each camera.
-        pixels: Of a photo, millions.
+        gaussians: Number of all Gaussians.
+        visible: Number of Gaussians in front of each camera.
+        pixels: Megapixels of a photo.
         views: K.
         operator: Name of the operator.
-        directions: That cameras look in.
-        threads: Of the process.
+        directions: Number of directions in which cameras look.
+        threads: Threads of the process.
     """
 
     gaussians: int
@@ -86,7 +86,7 @@ class Cell:
 
     @property
     def bytes(self) -> int:
-        """What a step must move, at least."""
+        """Least number of bytes that a step must move."""
         drawn = min(self.gaussians, self.visible * min(self.views, self.directions))
         return UNSEEN * (self.gaussians - drawn) + SEEN * drawn
 
@@ -97,8 +97,8 @@ class Noise:
 
     Attributes:
         seed: Seed of the pixels.
-        width: Pixels.
-        height: Pixels.
+        width: Width in pixels.
+        height: Height in pixels.
     """
 
     seed: int
@@ -106,17 +106,17 @@ class Noise:
     height: int
 
     def image(self) -> Tensor:
-        """[H, W, 3] uint8."""
+        """Return the pixels [H, W, 3] uint8."""
         rng = np.random.default_rng(self.seed)
         return torch.from_numpy(rng.integers(0, 256, (self.height, self.width, 3), np.uint8))
 
     def mask(self) -> Tensor | None:
-        """None: every pixel counts."""
+        """Return None: every pixel counts."""
         return None
 
 
 def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
-    """Title and cells, which are compared with the first of their group."""
+    """Yield title and cells of each group. Cells are compared with the first of their group."""
     base = Cell(20_000, 20_000)
     yield "unseen", [base, replace(base, gaussians=200_000)]
     yield "turning", [base, replace(base, gaussians=200_000, directions=10)]
@@ -131,7 +131,7 @@ def groups(*, full: bool) -> Iterator[tuple[str, list[Cell]]]:
 
 
 def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
-    """Cells whose memory is measured, and whether the last step edits the set of Gaussians."""
+    """Yield cells for memory, and True if the last step edits the set of Gaussians."""
     count = 1_000_000 if full else 200_000
     pair = Cell(count, count, views=2, operator="pcgrad")
     for cell in (pair, replace(pair, visible=count // 10)):
@@ -140,7 +140,7 @@ def memory_cells(*, full: bool) -> Iterator[tuple[Cell, bool]]:
 
 
 def scene_of(cell: Cell) -> "Scene":
-    """The scene of a cell."""
+    """Return the scene of a cell."""
     from crossgrad_core.contract.scene import Scene, Similarity
 
     width = round((cell.pixels * 1e6 * 4 / 3) ** 0.5)
@@ -160,13 +160,13 @@ def scene_of(cell: Cell) -> "Scene":
 
 
 def _view(direction: int, number: int, size: tuple[int, int]) -> "View":
-    """Photo `number` of a direction: a little beside the others."""
+    """Return photo `number` of a direction, slightly shifted from the other photos."""
     from crossgrad_core.contract.scene import Camera, View
 
     pose = np.eye(4)
     pose[:3, :3] = _turn(2 * np.pi * direction / 10).T
     pose[:3, 3] = -pose[:3, :3] @ (0.01 * np.array([number, 0.5 * number, 0.0]))
-    # 30 degrees across, so that ten directions do not overlap.
+    # The field of view is 30 degrees, so that ten directions do not overlap.
     focal = 0.5 * size[0] / np.tan(np.deg2rad(15))
     calibration = (focal, focal, size[0] / 2, size[1] / 2)
     camera = Camera(*size, *calibration, torch.from_numpy(pose))
@@ -176,13 +176,13 @@ def _view(direction: int, number: int, size: tuple[int, int]) -> "View":
 
 
 def _turn(angle: float) -> np.ndarray:
-    """[3, 3] camera to world: x right, y down, z forward, turned about y."""
+    """Return a camera-to-world rotation [3, 3] about y, for x right, y down, z forward."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def _points(cell: Cell) -> np.ndarray:
-    """[N, 3] the clouds of all directions and then what no camera sees, in random order."""
+    """Return points [N, 3] in random order: all directions' clouds, then unseen points."""
     rng = np.random.default_rng(0)
     tan = np.tan(np.deg2rad(14))
     depth = rng.uniform(1.0, 2.0, cell.gaussians)
@@ -190,7 +190,7 @@ def _points(cell: Cell) -> np.ndarray:
     local = np.column_stack([flat, depth])
     direction = np.arange(cell.gaussians) // cell.visible
     angles = 2 * np.pi * direction / 10
-    # One direction is looked at; the rest lies behind it, and is seen where there are ten.
+    # With one direction, the other clouds are behind it. With ten directions, all are seen.
     if cell.directions == 1:
         angles = np.where(direction > 0, np.pi, 0.0)
     c, s = np.cos(angles), np.sin(angles)
@@ -201,7 +201,7 @@ def _points(cell: Cell) -> np.ndarray:
 
 
 def setup_of(cell: Cell, **options: object) -> "Setup":
-    """The run of a cell, with further options."""
+    """Return the setup of a cell, with further options."""
     from crossgrad_core.commands import assemble, configured
 
     config = configured(
@@ -226,10 +226,10 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
 
 
 class Run:
-    """A run in the midst of its steps.
+    """A run during density control.
 
     Args:
-        cell: What is run.
+        cell: The case.
         options: Further options of the run.
     """
 
@@ -243,7 +243,7 @@ class Run:
         self.keeper = RollbackGuard(self.state)
 
     def step(self) -> tuple[float, float]:
-        """Takes a step; seconds of the CPU and of the clock."""
+        """Take a step, and return its CPU seconds and wall seconds."""
         from crossgrad_core.training.loop import timed_step
 
         cpu, wall = process_time(), perf_counter()
@@ -252,7 +252,7 @@ class Run:
 
 
 def timed(title: str, cells: list[Cell], reps: int) -> Iterator[dict[str, Any]]:
-    """Medians of the cells of a group, which take turns."""
+    """Yield the medians of the cells of a group, which take alternate steps."""
     configure_threads(max(cell.threads for cell in cells))
     runs = [Run(cell) for cell in cells]
     seconds: list[list[tuple[float, float]]] = [[] for _ in runs]
@@ -276,7 +276,7 @@ def timed(title: str, cells: list[Cell], reps: int) -> Iterator[dict[str, Any]]:
 
 
 def bandwidth() -> float:
-    """Bytes per second of CPU time that a copy reads and writes."""
+    """Return the bytes per second of CPU time that a copy reads and writes."""
     source = np.ones(1 << 24)
     target = np.zeros_like(source)
     times = []
@@ -288,7 +288,7 @@ def bandwidth() -> float:
 
 
 def remembered(cell: Cell, *, edit: bool) -> None:
-    """Prints the peak memory of a few steps; run in a process of its own."""
+    """Print the peak memory of a few steps. It is called in a separate process."""
     configure_threads(cell.threads)
     run = Run(cell)
     for _ in range(2):
@@ -302,7 +302,7 @@ def remembered(cell: Cell, *, edit: bool) -> None:
 
 
 def memory(cell: Cell, *, edit: bool) -> dict[str, Any]:
-    """The peak memory of a cell."""
+    """Return the peak memory of a cell."""
     task = json.dumps({"cell": asdict(cell), "edit": edit})
     command = [sys.executable, __file__, "--task", task]
     found: dict[str, Any] = json.loads(subprocess.check_output(command, text=True))
@@ -310,7 +310,7 @@ def memory(cell: Cell, *, edit: bool) -> dict[str, Any]:
 
 
 def draw(lines: list[dict[str, Any]], path: Path) -> None:
-    """Step time and its bound against the number of Gaussians, and against pixels."""
+    """Plot step time and its bound by number of Gaussians, and by pixels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -330,7 +330,7 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--full", action="store_true", help="the whole table: half an hour")
     parser.add_argument("--only", default="", help="only groups with this in their title")
@@ -360,7 +360,7 @@ def main() -> None:
 
 
 def show(lines: list[dict[str, Any]]) -> None:
-    """Prints one line for each cell."""
+    """Print one line for each cell."""
     for line in lines:
         if "peak_mib" in line:
             print(f"{line['name']}, {line['kind']}: {line['peak_mib']:,.0f} MiB", flush=True)

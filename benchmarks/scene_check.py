@@ -1,14 +1,15 @@
-"""A seeded search over scenes that contradict themselves, and over right ones.
+"""A seeded search over scenes that contradict themselves, and over correct scenes.
 
     python benchmarks/scene_check.py TOWN TOWN TOWN SCENE SCENE [--wrong 240] [--right 400]
         [--trained 60] [--out FILE]
 
-The towns are those of benchmarks/towns.py, 24 photos of either kind. Each wrong scene has a random
-kind and strength, number of photos and points, crop, fx over fy, and tracks or none. Some of them
-are trained for 150 steps on photos of 100 pixels, as is the right scene that each was made from:
-`fall` is the difference of the held-out PSNR, mean by kind and strength. `found` counts the scenes
-that were reported with the right cause, or with the right photos. Right scenes have random photos
-and points, gains, noise, JPEG and frames; none of them should get a warning.
+The towns are made by benchmarks/towns.py, with 24 photos of either kind. Each wrong scene has a
+random kind and strength of error, number of photos and points, crop, ratio of fx to fy, and tracks
+or none. Some wrong scenes are trained for 150 steps on photos of 100 pixels. The correct scene from
+which each was made is trained in the same way. `fall` is the difference of the held-out PSNR, as
+mean by kind and strength. `found` counts the scenes that were reported with the correct cause or
+with the correct photos. Correct scenes have random photos and points, gains, noise, JPEG quality
+and frames. None of them should get a warning.
 """
 
 import argparse
@@ -38,7 +39,7 @@ from crossgrad_core.run.export import renderer
 from crossgrad_core.scene.self_check.evidence import pixels_of
 from crossgrad_core.scene.self_check.verdict import Verdict, verdict_of
 
-#: A fall of the held-out PSNR that has to be reported, dB.
+#: A fall of the held-out PSNR that must be reported, in dB.
 FALL = 3.0
 
 
@@ -48,14 +49,14 @@ class Outcome:
 
     Attributes:
         seed: Its seed.
-        base: The scene it was made from.
-        kind: How it was made wrong; "right" if it was not.
-        strength: How strongly.
-        photos: Its photos.
-        tracks: Whether its points have tracks.
-        reported: What was reported.
-        found: Whether the right cause or photos were reported; of a right scene, nothing.
-        fall: What the held-out PSNR falls by, dB; None if it was not trained.
+        base: The scene from which it was made.
+        kind: Kind of error, or "right" for a correct scene.
+        strength: Strength of the error.
+        photos: Number of photos.
+        tracks: True if its points have tracks.
+        reported: The reported text.
+        found: True if the correct cause or photos, or for a correct scene nothing, were reported.
+        fall: Fall of the held-out PSNR in dB, or None if it was not trained.
         seconds: CPU seconds of the check.
     """
 
@@ -73,13 +74,13 @@ class Outcome:
 
 @cache
 def base(path: Path, size: int) -> Model:
-    """A right scene in small photos."""
+    """Return a correct scene with small photos."""
     config = configured({"scene": path, "threads": 1, "data": {"max_size": size}})
     return Model.of(read_scene(config, path)[0])
 
 
 def trained_psnr(scene: Scene, path: Path, steps: int) -> float:
-    """The held-out PSNR after a short training; 0 if training refuses the scene."""
+    """Return the held-out PSNR after a short training, or 0 if training refuses the scene."""
     try:
         return _psnr(scene, path, steps)
     except UserError:
@@ -105,14 +106,14 @@ def _psnr(scene: Scene, path: Path, steps: int) -> float:
 
 
 def text_of(verdict: Verdict) -> str:
-    """What was reported, in a line."""
+    """Return the reported causes in one line."""
     if verdict.all_wrong is not None:
         return verdict.all_wrong.what
     return "; ".join(f"{list(cause.views)}: {cause.what}" for cause in verdict.some_wrong)
 
 
 def is_found(wrong: Wrong, verdict: Verdict) -> bool:
-    """Whether the right cause, or about the right photos, were reported."""
+    """Return whether the correct cause, or about the correct photos, were reported."""
     causes = [each.what for each in (verdict.all_wrong, *verdict.some_wrong) if each is not None]
     named = {view for cause in verdict.some_wrong for view in cause.views}
     if not wrong.views:
@@ -123,7 +124,7 @@ def is_found(wrong: Wrong, verdict: Verdict) -> bool:
 
 
 def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
-    """A scene that contradicts itself; trained if there are steps."""
+    """Return the outcome of a scene that contradicts itself. It is trained if steps are given."""
     rng = np.random.default_rng(seed)
     right = varied(base(path, size), rng)
     kind = list(KINDS)[seed % len(KINDS)]
@@ -150,7 +151,7 @@ def wrong_scene(path: Path, seed: int, size: int, steps: int | None) -> Outcome:
 
 
 def right_scene(path: Path, seed: int, size: int) -> Outcome:
-    """A right scene."""
+    """Return the outcome of a correct scene."""
     rng = np.random.default_rng(seed)
     model = harmless(varied(base(path, size), rng), rng)
     scene = model.scene()
@@ -163,7 +164,7 @@ def right_scene(path: Path, seed: int, size: int) -> Outcome:
 
 
 def table(outcomes: list[Outcome]) -> Iterator[str]:
-    """The table of sensitivity by kind and strength, and what holds of all scenes."""
+    """Yield the table of sensitivity by kind and strength, and a summary of all scenes."""
     cells: dict[tuple[str, str, bool], list[Outcome]] = defaultdict(list)
     for each in outcomes:
         if each.kind != "right":
@@ -193,7 +194,7 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Searches, and prints the table."""
+    """Run the search, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--wrong", type=int, default=240)

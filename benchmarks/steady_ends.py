@@ -1,10 +1,10 @@
-"""How much the test PSNR still jumps at the end of runs: a table of runs that were trained before.
+"""A table of the jitter of the test PSNR at the end of runs, for finished runs.
 
     crossgrad sweep benchmarks/grids/steady_ends.yaml --scene SCENE
     python benchmarks/steady_ends.py runs/sweeps/steady_ends
 
-Of each run the evaluations in the last tenth are taken, a straight line is fitted to their PSNR,
-and what is left is its jitter. Imports no torch.
+For each run, a straight line is fitted to the PSNR of the evaluations in the last tenth. The
+jitter is the deviation from this line. Imports no torch.
 """
 
 import argparse
@@ -17,15 +17,15 @@ import numpy as np
 
 from crossgrad_core.run.results.reading import RunResults, find_runs, read_run
 
-#: Fewer evaluations in the last tenth say nothing about jitter.
+#: Least number of evaluations in the last tenth for a measurement of jitter.
 FEWEST = 10
 LAST = 0.1
 
 
 def jitter(steps: Sequence[float], values: Sequence[float]) -> float:
-    """Standard deviation of values around their straight line over the steps, same units.
+    """Return the standard deviation of values around their straight line over the steps.
 
-    Two degrees of freedom are the line's.
+    The line uses two degrees of freedom. The result has the unit of the values.
     """
     x, y = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
     rest = y - np.polyval(np.polyfit(x - x.mean(), y, 1), x - x.mean())
@@ -33,7 +33,7 @@ def jitter(steps: Sequence[float], values: Sequence[float]) -> float:
 
 
 def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
-    """Steps and PSNR of the evaluations in the last tenth of a run."""
+    """Return steps and PSNR of the evaluations in the last tenth of a run."""
     total = max(float(row["step"] or 0) for row in run.rows)
     rows = [row for row in run.rows if float(row["step"] or 0) > (1.0 - LAST) * total]
     known = [(row["step"], row["psnr"]) for row in rows]
@@ -42,7 +42,7 @@ def last_tenth(run: RunResults) -> tuple[list[float], list[float]]:
 
 
 def arm(run: RunResults) -> tuple[str, str, str, str]:
-    """Scene, growth, and what is done at the end of a run."""
+    """Return scene, growth, and the rules at the end of a run."""
     rules = dict(run.config.get("rules") or {})
     tail, average = (rules.get(name) or {} for name in ("lr-tail", "weight-averaging"))
     fades, averages = (float(each.get("share", 0.0)) for each in (tail, average))
@@ -52,7 +52,7 @@ def arm(run: RunResults) -> tuple[str, str, str, str]:
 
 
 def main() -> None:
-    """Prints a line per scene and arm."""
+    """Print a line per scene and arm."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folders", nargs="+", type=Path)
     found = defaultdict(list)

@@ -1,17 +1,18 @@
 """Median seconds of one whole training step on a fixed case, as one JSON line.
 
-A step is, as in a run: decode with SH degree 3, render, loss against a random photo, backward pass,
-one step of Adam, that of the positions along the axes of their Gaussians, that of the colours by
-rows: of those drawn, which are brought up to date first.
-Each timed step follows one of another view, turned by `--turn`, so that some rows are behind. On
-two threads the colours' step of Adam goes on beside the next step, whose `render` has what is left;
-not with `--sh-every`, where steps of two kinds follow each other.
+A step has the same parts as in a run: decode with SH degree 3, render, loss against a random photo,
+backward pass, and one Adam step. The Adam step of positions is along the axes of their Gaussians.
+The Adam step of colours uses sparse rows: it updates the drawn rows, after their deferred updates
+are flushed. Each timed step follows a step with another view, rotated by `--turn`, so that some
+rows have deferred updates. With two threads, the Adam step of colours overlaps the next step, whose
+`render` includes the rest of it. This does not happen with `--sh-every`, where two kinds of steps
+alternate.
 
     python benchmarks/step.py CASE.npz [--reps N] [--threads N] [--max-alpha A] [--turn DEGREES]
         [--sh-every N]
 
-With `--sh-every N` the bands above the first learn in one of N steps, and figures are means over N
-steps: of the medians of steps of either kind.
+With `--sh-every N`, the bands above the first are updated in one of N steps. Figures are then means
+over N steps, from the medians of both kinds of steps.
 """
 
 import argparse
@@ -46,7 +47,7 @@ STEP = 5000
 
 
 def parameters_of(case: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    """The case as vanilla parameters; higher bands small and random."""
+    """Return the case as vanilla parameters, with small random higher bands."""
     count = case["means"].shape[0]
     opacities = torch.from_numpy(case["opacities"]).clamp(1e-4, 1 - 1e-4)
     rest = torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (count, 15, 3))).float()
@@ -62,7 +63,7 @@ def parameters_of(case: dict[str, np.ndarray]) -> dict[str, Tensor]:
 
 
 def camera_of(case: dict[str, np.ndarray], degrees: float) -> Camera:
-    """The case's camera, turned about its own vertical axis."""
+    """Return the case's camera, rotated about its own vertical axis."""
     k = case["K"].astype(np.float64)
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     turn = np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
@@ -72,7 +73,7 @@ def camera_of(case: dict[str, np.ndarray], degrees: float) -> Camera:
 
 
 class Trainer:
-    """Parameters and the state of their optimizer."""
+    """Parameters and the state of their optimizer, for single training steps."""
 
     def __init__(self, case: dict[str, np.ndarray], max_alpha: float) -> None:
         self.parameters = parameters_of(case)
@@ -80,13 +81,13 @@ class Trainer:
         self.rasterizer = NumbaRasterizer(max_alpha=max_alpha, near=0.01)
         self.phase = Phase(STEP, training=True, schedule=Schedule.for_run(30_000))
         self.state, self.late = AdamState(), Late()
-        #: Whether nothing of a step is left to the next one.
+        #: True if every step is completed before the next step.
         self.apart = False
-        # Rates of zero keep the case the same from repetition to repetition at the same cost.
+        # With rates of zero, the case stays the same in all repetitions, at the same cost.
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
     def step(self, camera: Camera, photo: Tensor, *, rests: bool) -> Iterator[str]:
-        """Takes a step; yields the name of each of its parts when it is done."""
+        """Take a step, and yield the name of each of its parts when the part is finished."""
         resting = {name for b in self.backbone.trained_blocks() if b.rests for name in b.tensors}
         tensors = {
             name: tensor.detach() if rests and name in resting else tensor
@@ -129,7 +130,7 @@ class Trainer:
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", type=Path)
     parser.add_argument("--reps", type=int, default=15)
@@ -148,15 +149,15 @@ def main() -> None:
     photo = torch.from_numpy(np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8))
     every = arguments.sh_every
     parts = ("render", "loss", "backward", "adam")
-    # Steps in which all bands learn, and those in which the higher ones rest.
+    # Steps that update all bands, and steps that skip the higher bands.
     marks: list[dict[str, list[float]]] = [{name: [] for name in parts} for _ in range(2)]
     for repetition in range(2 * (arguments.reps + 2) * min(every, 2)):
-        # One that rests follows one of the other view that learns, whose rows are behind.
+        # A step that skips bands follows a step with the other view that updates them.
         rests = every > 1 and repetition % 4 == 3
         start = perf_counter()
         for name in trainer.step(views[repetition % 2], photo, rests=rests):
             end = perf_counter()
-            # The first ones compile and warm up.
+            # The first steps compile and warm up.
             if repetition >= 4 * min(every, 2) and repetition % 2:
                 marks[rests][name].append(end - start)
             start = perf_counter()

@@ -1,11 +1,11 @@
-"""Throughput of a sweep with workers, beside the same runs one after another.
+"""Throughput of a sweep with several workers, compared with the same runs in sequence.
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
-Times three sweeps of the same runs: one after another with one thread, one after another with as
-many threads as there are workers, and all workers with one thread each; and beside them what the
-machine itself reaches: as many `crossgrad run` at once, started by hand, against one. The figures
-mean something only on a machine that does nothing else.
+Times three sweeps of the same runs: in sequence with one thread, in sequence with as many threads
+as there are workers, and with all workers, each with one thread. For comparison, it also times as
+many simultaneous `crossgrad run` processes, started by hand, and a single one. The figures are only
+meaningful on a machine without other work.
 """
 
 import argparse
@@ -25,14 +25,14 @@ CROSSGRAD = [sys.executable, "-m", "crossgrad_core"]
 
 
 def call(command: list[str]) -> None:
-    """Runs a command; where it fails, ends with what it said."""
+    """Run a command. If it fails, exit with its output."""
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
 
 
 def swept(grid: Path, out: Path, workers: int, threads: int) -> float:
-    """Seconds from the start of the first run of a sweep to the end of the last one."""
+    """Return the seconds from the start of a sweep's first run to the end of its last run."""
     command = [*CROSSGRAD, "sweep", str(grid), "--out", str(out)]
     command += ["--workers", str(workers), "--threads", str(threads)]
     call(command)
@@ -41,7 +41,7 @@ def swept(grid: Path, out: Path, workers: int, threads: int) -> float:
 
 
 def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
-    """Seconds of so many runs that are started at once, each with one thread."""
+    """Return the seconds of `count` runs that are started at once, each with one thread."""
     start = time.monotonic()
     runs = [subprocess.Popen(
         [*CROSSGRAD, "run", str(arguments.scene), "--steps", str(arguments.steps), "--threads", "1",
@@ -56,7 +56,7 @@ def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
 
 
 def measured(arguments: argparse.Namespace, folder: Path) -> None:
-    """Times everything in a folder and prints the ratios."""
+    """Time all variants in a folder and print the ratios."""
     grid = folder / "grid.yaml"
     settings = {"steps": arguments.steps, "max_size": arguments.max_size}
     seeds = list(range(arguments.runs))
@@ -67,7 +67,7 @@ def measured(arguments: argparse.Namespace, folder: Path) -> None:
         encoding="utf-8",
     )
     workers = arguments.workers
-    for threads in (1, workers):  # Kernels are compiled before any clock runs.
+    for threads in (1, workers):  # Compile the kernels before any measurement.
         command = [*CROSSGRAD, "run", str(arguments.scene), "--steps", "20", "-q"]
         command += ["--threads", str(threads), "--out", str(folder / f"warm-{threads}")]
         call(command)
@@ -85,7 +85,7 @@ def measured(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def main() -> None:
-    """Reads the options and measures."""
+    """Read the options and measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     bundled = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
     parser.add_argument("scene", type=Path, nargs="?", default=bundled)

@@ -1,25 +1,25 @@
-r"""The end of runs of so many seconds, by the code of several commits, in turns on one core.
+r"""Final quality of runs with a time limit, for the code of several commits, run alternately.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 \
         --code old=VENV_OLD/bin/crossgrad --code "new=VENV/bin/crossgrad --split every" \
         --seconds 5 10 20 30:10 70:23.3 140:46.7 --seeds 1 2 3 4 5 6
     python benchmarks/time_to_quality.py table OUT
 
-`30:10` gives the first code 30 and the second one 10 seconds; `--steps` instead of `--seconds` ends
-runs after so many steps, on a machine that others use, too. Files of both are drawn on the views
-that the last code held out, which the first one has to hold out, too. Runs have 400 px, or as many
-as `--max-size` says (0: as by default), and a thread for each core that is named (Linux). Those of
-a pair follow one another there; finished ones are not repeated. Figures are of the exported PLY on
-black: drawn by `crossgrad eval --ply` and, where `--max-size` is not 0, by `viewer.py`.
-`table OUT --figure NAME` compares another figure of the held-out views, such as `ssim`, as
-summary.json has it.
+`30:10` gives the first code 30 seconds and the second code 10 seconds. On a machine with other
+users, `--steps` instead of `--seconds` ends runs after a number of steps. The PLY files of both
+codes are drawn on the held-out views of the last code, which the first code must also hold out.
+Photos have 400 px, or the size given by `--max-size` (0: the default size). A run uses one thread
+for each named core (Linux). The runs of a pair follow each other on these cores. Finished runs are
+not repeated. Figures are measured on the exported PLY on black, drawn by `crossgrad eval --ply`
+and, if `--max-size` is not 0, by `viewer.py`. `table OUT --figure NAME` compares another figure of
+the held-out views in summary.json, such as `ssim`.
 
     python benchmarks/time_to_quality.py run OUT --scene SCENE [--scene SCENE ...] --core 0 1 \
         --code long=VENV/bin/crossgrad --code new=VENV/bin/crossgrad --max-size 0 --seconds 600:60
     python benchmarks/time_to_quality.py share OUT
 
-compares short runs with long ones of the same code: of what the long one gains over a picture of
-the training photos' mean colour, in dB, how much the short one has.
+compares short runs with long runs of the same code. The share is the gain of the short run divided
+by the gain of the long run, in dB above a picture of the training photos' mean colour.
 """
 
 import argparse
@@ -51,7 +51,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Code:
-    """A commit: a name, its `crossgrad`, and options of `crossgrad run`."""
+    """A commit: its name, its `crossgrad` program, and options of `crossgrad run`."""
 
     name: str
     program: str
@@ -59,13 +59,13 @@ class Code:
 
     @classmethod
     def of(cls, text: str) -> "Code":
-        """From `NAME=CROSSGRAD [OPTIONS]`."""
+        """Return the code from a text `NAME=CROSSGRAD [OPTIONS]`."""
         name, _, words = text.partition("=")
         program, *options = shlex.split(words)
         return cls(name, program, tuple(options))
 
     def train(self, scene: Path, folder: Path, threads: int, size: int, *length: str) -> None:
-        """Trains into a folder, which must not exist."""
+        """Train into a folder, which must not exist."""
         command = [self.program, "run", str(scene), "--out", str(folder)]
         command += ["--threads", str(threads), *(["--max-size", str(size)] if size else [])]
         command += [*length, *self.options]
@@ -73,15 +73,15 @@ class Code:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Runs what is missing."""
+    """Run missing cases."""
     os.sched_setaffinity(0, given.core)
     kind = len(given.core), given.max_size
     codes = [Code.of(text) for text in given.code]
     for code in codes:
-        # Compiles the kernels of all that a run needs, so that no timed run does.
+        # Compile all kernels that a run needs before any timed run.
         warm = given.out / f"warm-up-{code.name}-{given.core[0]}"
         if not warm.exists():
-            # A clock that options name is refused without seconds.
+            # The option --clock is refused without seconds.
             timed = any(option.partition("=")[0] == "--clock" for option in code.options)
             length = ("--seconds", "60") if timed else ("--steps", "700")
             code.train(given.scene[0], warm, *kind, *length)
@@ -101,19 +101,19 @@ def run(given: argparse.Namespace) -> None:
                 code.train(scene, folders[code], *kind, option, length, "--seed", str(seed))
         for code, folder in folders.items():
             row = {"code": code.name, "scene": scene.name, "lengths": lengths, "seed": seed}
-            # By the slow renderer only where photos are small.
+            # The slow renderer is only used for small photos.
             row |= _figures(folder, folders[codes[-1]], independent=given.max_size > 0)
             (folder / "row.json").write_text(json.dumps(row))
 
 
 def _finished(folder: Path) -> bool:
-    """Whether a run has come to its end, and not to another one."""
+    """Return whether a run has finished regularly."""
     path = folder / "summary.json"
     return path.exists() and json.loads(path.read_text())["status"] == "finished"
 
 
 def _held_out(folder: Path) -> set[str]:
-    """Names of the views that a run was evaluated on."""
+    """Return the names of the views on which a run was evaluated."""
     with (folder / "per_view.csv").open(newline="") as file:
         return {row["name"] for row in csv.DictReader(file)}
 
@@ -126,7 +126,7 @@ def _cases(given: argparse.Namespace) -> Iterator[tuple[int, Path, str]]:
 
 
 def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
-    """What a run came to, its file drawn on the held-out views of another run."""
+    """Return the figures of a run, with its PLY drawn on the held-out views of another run."""
     if _held_out(folder) != _held_out(judge):
         raise SystemExit(
             f"{folder} and {judge} do not hold out the same views: give both a --split"
@@ -150,7 +150,7 @@ def _figures(folder: Path, judge: Path, *, independent: bool) -> Row:
 
 
 def _mean_colour(scene: Scene) -> float:
-    """PSNR of the training photos' mean colour on the held-out views, mean."""
+    """Return the mean PSNR of the training photos' mean colour on the held-out views."""
     photos = [view.photo.image().double() / 255 for view in scene.train_views]
     mean = torch.stack([photo.mean((0, 1)) for photo in photos]).mean(0)
     errors = [
@@ -160,7 +160,7 @@ def _mean_colour(scene: Scene) -> float:
 
 
 def table(given: argparse.Namespace) -> None:
-    """Prints means and standard deviations, and what each code gains over `old`."""
+    """Print means and standard deviations, and the gain of each code over `old`."""
     by_case: dict[tuple[str, str], dict[str, dict[int, Row]]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
@@ -175,7 +175,7 @@ def table(given: argparse.Namespace) -> None:
     old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
         if "old" in codes:
-            # A code that ran alone is held against the first ones that ran as long as `old` did.
+            # A code that ran alone is compared with the first runs of the same length as `old`.
             old[scene, lengths] = codes["old"]
             first, _, unit = lengths.partition(" ")
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])
@@ -185,7 +185,7 @@ def table(given: argparse.Namespace) -> None:
 
 
 def _told(folder: Path, figure: str) -> float:
-    """A figure of a run, over all held-out views."""
+    """Return a figure of a run, over all held-out views."""
     return float(json.loads((folder / "summary.json").read_text())["overall"][figure])
 
 
@@ -195,7 +195,7 @@ def _print_gains(
     old: Mapping[tuple[str, str], dict[int, Row]],
     figure: str | None,
 ) -> None:
-    """Prints what a code gains over `old`: by scene, and over the scenes of the same lengths."""
+    """Print the gains of a code over `old`: by scene, and pooled over scenes of equal lengths."""
     gains: dict[str, dict[str, list[float]]] = defaultdict(dict)
     margin, digits = (0.005, 4) if figure == "ssim" else (0.1, 2)
     for (scene, lengths), codes in cases:
@@ -231,7 +231,7 @@ def _gain(each: Estimate, digits: int) -> Iterator[str]:
 
 
 def share(given: argparse.Namespace) -> None:
-    """Prints how much of what the code `long` gains over the mean colour the code `new` has."""
+    """Print the share of the gain of `long` over the mean colour that `new` reaches."""
     by_case: dict[tuple[str, str, int], dict[str, Row]] = defaultdict(dict)
     for path in sorted(given.out.glob("*/row.json")):
         row = json.loads(path.read_text())
@@ -252,7 +252,7 @@ def share(given: argparse.Namespace) -> None:
 
 
 def _first(lengths: str) -> float:
-    """How long the first code ran."""
+    """Return the length of the first code's runs."""
     return float(lengths.partition(" ")[0].split(":")[0])
 
 
@@ -269,7 +269,7 @@ def _cells(own: list[Row]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Runs or prints."""
+    """Run missing cases or print a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(required=True)
     runs = commands.add_parser("run", help="run what is missing")

@@ -1,13 +1,13 @@
-"""Towns photographed from a drone and from their streets: COLMAP scenes with exact poses.
+"""Towns photographed from a drone and from their streets, as COLMAP scenes with exact poses.
 
     python benchmarks/towns.py --seed 1 --out FOLDER [--aerial 64] [--street 64]
 
-Boxes and trees along a grid of roads (_town_photos.py), another town for each seed: its streets,
-heights, patterns, sun, and how the drone flies (in rings looking in, in lines looking down, or
-anywhere obliquely, 60 to 115 m above ground; photos of the street are taken 2 m above it). Points
-come from the depths of the training photos, with a deviation of 2 cm; each has up to two further
-observations of its own kind of photos and one of the other. Every eighth photo of either kind is
-left out of them, as `crossgrad run --split every` holds it out.
+A town consists of boxes and trees along a grid of roads (_town_photos.py). Each seed gives other
+streets, heights, patterns, sun and drone flights. The drone flies in rings looking in, in lines
+looking down, or anywhere looking obliquely, 60 to 115 m above ground. Street photos are taken 2 m
+above ground. Points come from the depths of the training photos, with a deviation of 2 cm. Each
+point has up to two further observations in its own kind of photos, and one in the other kind. Every
+eighth photo of either kind gives no points, as `crossgrad run --split every` holds it out.
 """
 
 import argparse
@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-#: Rays of a pixel in either direction.
+#: Rays of a pixel in each direction.
 RAYS: Final = 2
 POINTS: Final = 40_000
-#: Half of the angle that a photo shows across, degrees.
+#: Half of the horizontal field of view, in degrees.
 HALF_ANGLE: Final = {"aerial": 25, "street": 35}
 Integers: TypeAlias = NDArray[np.int64]
-#: Blocks and roads in either direction from the middle.
+#: Number of blocks and roads in each direction from the middle.
 REACH: Final = 2
-#: Photos of a kind from one that is held out to the next.
+#: One photo of a kind in this number of photos is held out.
 EVERY: Final = 8
 
 
@@ -39,11 +39,11 @@ class Town:
     """Boxes and trees along a grid of roads, and the sun.
 
     Attributes:
-        pitch: Metres from road to road.
-        road: Width of a road.
+        pitch: Distance between roads in metres.
+        road: Width of a road in metres.
         boxes: [B, 10], as in _town_photos.py.
-        trees: [T, 5], as there.
-        sun: Unit vector towards it.
+        trees: [T, 5], as in _town_photos.py.
+        sun: Unit vector towards the sun.
     """
 
     pitch: float
@@ -53,7 +53,7 @@ class Town:
     sun: Vector
 
     def holds(self, point: Array) -> bool:
-        """Whether a point lies in or beside a thing."""
+        """Return whether a point is inside or close to an object."""
         for box in self.boxes:
             x, y = point[:2] - box[:2]
             across, along = box[6] * x + box[7] * y, box[6] * y - box[7] * x
@@ -66,14 +66,14 @@ class Town:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photo that is taken.
+    """A photo with its camera.
 
     Attributes:
-        kind: Its folder.
-        number: Which of its kind.
+        kind: Folder of the photo.
+        number: Index among the photos of its kind.
         eye: [3] the camera's centre.
-        axes: [3, 3] its axes to the right, down and ahead.
-        width: Pixels across; the height is 5/8 of it.
+        axes: [3, 3] camera axes to the right, down and ahead.
+        width: Width in pixels. The height is 5/8 of the width.
     """
 
     kind: str
@@ -84,7 +84,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """Its file among the photos."""
+        """The file name below the folder of photos."""
         return f"{self.kind}/{self.number:04d}.jpg"
 
     @property
@@ -98,7 +98,7 @@ class View:
         return self.width / 2 / math.tan(math.radians(HALF_ANGLE[self.kind]))
 
     def project(self, points: Array) -> Array:
-        """[N, 3] points in pixels, and their depth."""
+        """Return points [N, 3] as pixels and depth."""
         local = (points - self.eye) @ self.axes.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = local[:, :2] / local[:, 2:] * self.focal + np.array(self.size) / 2
@@ -106,7 +106,7 @@ class View:
 
 
 def _houses(rng: np.random.Generator, x: float, y: float, half: float) -> list[list[float]]:
-    """Boxes of one block around (x, y)."""
+    """Return the boxes of one block around (x, y)."""
     rows, boxes = int(rng.integers(2, 4)), []
     side = 2 * half / rows
     for place in range(rows * rows):
@@ -127,7 +127,7 @@ def _houses(rng: np.random.Generator, x: float, y: float, half: float) -> list[l
 
 
 def _beside_roads(rng: np.random.Generator, count: int, pitch: float, off: float) -> list[Vector]:
-    """Places beside roads, `off` metres from their middles, and whether the road goes along y."""
+    """Return places `off` metres from the middles of roads, and 1 if the road is along y."""
     places = []
     for _ in range(count):
         line = rng.integers(-1, 2) * pitch + rng.choice([-1, 1]) * off
@@ -137,7 +137,7 @@ def _beside_roads(rng: np.random.Generator, count: int, pitch: float, off: float
 
 
 def build(rng: np.random.Generator) -> Town:
-    """Draws a town."""
+    """Draw a random town."""
     pitch, road = rng.uniform(38, 55), rng.uniform(7, 11)
     boxes: list[list[float]] = []
     trees: list[list[float]] = []
@@ -165,7 +165,7 @@ def build(rng: np.random.Generator) -> Town:
 
 
 def _looking(eye: Array, at: Array) -> Array:
-    """Axes of a camera at `eye` that looks at a point, its right level."""
+    """Return the axes of a camera at `eye` that looks at a point, with a level horizon."""
     ahead = (at - eye) / np.linalg.norm(at - eye)
     up = np.array([0.0, 0.0, 1.0] if abs(ahead[2]) < 0.999 else [0.0, 1.0, 0.0])
     right = np.cross(ahead, up)
@@ -174,10 +174,10 @@ def _looking(eye: Array, at: Array) -> Array:
 
 
 def fly(rng: np.random.Generator, town: Town, count: int, width: int) -> list[View]:
-    """Photos of the drone."""
+    """Return the photos of the drone."""
     way = rng.integers(0, 3)
     low, high = sorted(rng.uniform(60, 115, 2))
-    # One more than a square has, so that those held out do not stand in a row.
+    # One more than the square root, so that held-out photos are not in one column.
     views, rows = [], math.isqrt(count) + 1
     for i in range(count):
         z, share = rng.uniform(low, high), i / count
@@ -202,7 +202,7 @@ def _vector(row: Array) -> Vector:
 
 
 def walk(rng: np.random.Generator, town: Town, count: int, width: int) -> list[View]:
-    """Photos of the street, along it or aslant, none with a thing closer than 4 m in the middle."""
+    """Return street photos along or across the road, with nothing closer than 4 m in the middle."""
     views: list[View] = []
     while len(views) < count:
         line = rng.integers(-1, 2) * town.pitch + rng.uniform(-0.4, 0.4) * town.road
@@ -220,7 +220,7 @@ def walk(rng: np.random.Generator, town: Town, count: int, width: int) -> list[V
 
 
 def take_photos(folder: Path, seed: int, town: Town, views: list[View]) -> list[Array]:
-    """Writes the photos; their depths [H, W], 0 in the sky."""
+    """Write the photos, and return their depths [H, W], 0 for the sky."""
     depths = []
     things = town.boxes, town.trees, town.sun, np.array([1000 * seed, town.pitch, town.road])
     for view in views:
@@ -235,7 +235,7 @@ def take_photos(folder: Path, seed: int, town: Town, views: list[View]) -> list[
 
 
 def _sampled(rng: np.random.Generator, view: View, depth: Array, count: int) -> Array:
-    """[count, 3] points in a photo."""
+    """Return random visible points [count, 3] of a photo."""
     rows, columns = np.nonzero(depth)
     some = rng.choice(len(rows), min(count, len(rows)), replace=False)
     z = depth[rows[some], columns[some]]
@@ -246,7 +246,7 @@ def _sampled(rng: np.random.Generator, view: View, depth: Array, count: int) -> 
 
 
 def _sees(view: View, depth: Array, points: Array) -> NDArray[np.bool_]:
-    """[N] whether points lie in a photo and nothing stands before them."""
+    """Return for each point [N] whether a photo shows it without occlusion."""
     (u, v, z), (width, height) = view.project(points).T, view.size
     inside = (z > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     column = np.where(inside, u, 0).astype(int)
@@ -261,7 +261,7 @@ def _tracks(
     points: Array,
     source: Integers,
 ) -> list[list[int]]:
-    """For each point the photos that it is observed in, that it was taken from first."""
+    """Return for each point its photos, starting with the photo from which it was taken."""
     sees = np.array([_sees(v, d, points) for v, d in zip(views, depths, strict=True)])
     kinds = np.array([view.kind for view in views])
     tracks = []
@@ -277,7 +277,7 @@ def _tracks(
 def write_model(
     folder: Path, rng: np.random.Generator, views: list[View], depths: list[Array]
 ) -> int:
-    """Writes cameras, poses and points; how many points there are."""
+    """Write cameras, poses and points, and return the number of points."""
     trained = [n for n, view in enumerate(views) if view.number % EVERY]
     each = POINTS // len(trained) + 1
     samples = [_sampled(rng, views[n], depths[n], each) for n in trained]
@@ -305,7 +305,7 @@ def write_model(
 
 
 def _colours(folder: Path, view: View, points: Array) -> NDArray[np.uint8]:
-    """[N, 3] the colours of points in a photo."""
+    """Return the colours [N, 3] of points in a photo."""
     column, row = np.floor(view.project(points)[:, :2]).astype(int).T
     with Image.open(folder / "images" / view.name) as photo:
         pixels = np.asarray(photo, np.uint8)
@@ -317,7 +317,7 @@ def _colours(folder: Path, view: View, points: Array) -> NDArray[np.uint8]:
 def _write(
     model: Path, views: list[View], observations: dict[str, list[str]], points: list[str]
 ) -> None:
-    """Writes the three text files of a COLMAP model."""
+    """Write the three text files of a COLMAP model."""
     model.mkdir(parents=True, exist_ok=True)
     kinds = {view.kind: view for view in views}
     cameras = []
@@ -336,7 +336,7 @@ def _write(
 
 
 def main() -> None:
-    """Writes a scene, and says what is in it."""
+    """Write a scene, and print a summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True)

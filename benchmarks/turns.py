@@ -1,15 +1,15 @@
-"""The training step of `step.py` by two checkouts in turn, or on two threads and in two processes.
+"""The step of `step.py` in two checkouts by turns, or with two threads and in two processes.
 
     python benchmarks/turns.py CASE.npz --beside CHECKOUT [--threads N] [--rounds N]
     python benchmarks/turns.py CASE.npz [--rounds N]
 
-Shared machines change their speed within seconds, so that two runs one after the other compare
-hours and not commits. Here both sides are there all the time and only one of them steps: with
-`--beside` this checkout and an older one, which has an environment from `make install`; without,
-one process of two threads against two processes of one thread each, at the same time on a core of
-their own. One JSON line: medians of the seconds, and median and quartiles of the quotients by
-rounds: this checkout's seconds over the other's; the steps per second of two threads over those
-of two processes.
+Shared machines change their speed within seconds, so two successive runs compare times of day and
+not commits. Here both sides exist all the time, and only one of them takes a step at a time. With
+`--beside`, the sides are this checkout and an older checkout with an environment from `make
+install`. Without it, the sides are one process with two threads, and two simultaneous processes
+with one thread each on their own cores. The output is one JSON line: medians of the seconds, and
+median and quartiles of the quotients by round. The quotient is this checkout's seconds over the
+other checkout's seconds, or the step rate of two threads over the step rate of two processes.
 """
 
 import argparse
@@ -25,18 +25,18 @@ from typing import Any
 from _machine import code, facts
 
 HERE = Path(__file__).parents[1]
-#: Steps that are taken before the first one that counts.
+#: Number of steps before the measurement.
 WARM_UP = 4
 
 
 class Worker:
-    """A process that takes a step of a checkout whenever it is asked to.
+    """A process that takes a step of a checkout on request.
 
     Args:
-        checkout: Its folder.
+        checkout: Folder of the checkout.
         case: The case.
-        threads: Of the step.
-        core: Where it runs; None: anywhere.
+        threads: Threads of the step.
+        core: Core on which it runs, or None for any core.
     """
 
     def __init__(self, checkout: Path, case: Path, threads: int, core: int | None = None) -> None:
@@ -56,26 +56,26 @@ class Worker:
         self.seconds()
 
     def ask(self) -> None:
-        """Asks for a step; returns at once."""
+        """Request a step, and return at once."""
         print(file=self._process.stdin, flush=True)
 
     def seconds(self) -> float:
-        """Waits for the step that was asked for; how long it took."""
+        """Wait for the requested step, and return its seconds."""
         return float(self._process.stdout.readline())  # type: ignore[union-attr]
 
     def step(self) -> float:
-        """A step, waited for."""
+        """Take a step, wait for it, and return its seconds."""
         self.ask()
         return self.seconds()
 
     def end(self) -> None:
-        """Ends the process."""
+        """End the process."""
         self._process.kill()
         self._process.wait()
 
 
 def work(checkout: Path, case: Path, threads: int) -> None:
-    """Takes a step for each line of the standard input and prints its seconds."""
+    """Take a step for each line of the standard input, and print its seconds."""
     sys.path[0] = str(checkout / "benchmarks")
     import numpy as np
     import step as steps
@@ -102,7 +102,7 @@ def work(checkout: Path, case: Path, threads: int) -> None:
 
 
 class Plain:
-    """The step of commits up to e216204, whose benchmark has all of it in one function."""
+    """The step of commits up to e216204, whose benchmark consists of one function."""
 
     def __init__(self, steps: Any, case: dict[str, Any]) -> None:  # noqa: ANN401 - another checkout's
         self.steps, self.parameters = steps, steps.parameters_of(case)
@@ -113,7 +113,7 @@ class Plain:
         self.rates = dict.fromkeys(self.parameters, 0.0)
 
     def step(self, camera: Any, photo: Any, *, rests: bool) -> list[str]:  # noqa: ANN401 - as above
-        """Takes a step."""
+        """Take a step."""
         gaussians = self.backbone.decode(self.parameters, camera, self.phase)
         image = self.rasterizer.render(gaussians, camera, self.steps.torch.zeros(3)).image
         self.steps.photometric_loss(image, photo).backward()
@@ -125,12 +125,12 @@ class Plain:
 
 
 def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]:
-    """This checkout's steps and the other one's, one at a time."""
+    """Return figures of alternating steps of this checkout and the other checkout."""
     core = 0 if threads == 1 else None
     workers = [Worker(HERE, case, threads, core), Worker(other, case, threads, core)]
     seconds: list[list[float]] = [[], []]
     for turn in range(WARM_UP + rounds):
-        # Each is the first one in every other round.
+        # The sides alternate in being first.
         for side in (0, 1) if turn % 2 else (1, 0):
             took = workers[side].step()
             if turn >= WARM_UP:
@@ -147,7 +147,7 @@ def beside(case: Path, other: Path, threads: int, rounds: int) -> dict[str, Any]
 
 
 def two_ways(case: Path, rounds: int) -> dict[str, Any]:
-    """Two threads of a process, and two processes at the same time, in turn."""
+    """Return figures of two threads in one process and of two simultaneous processes."""
     both = Worker(HERE, case, 2)
     apart = [Worker(HERE, case, 1, core) for core in (0, 1)]
     together, alone = [], []
@@ -178,7 +178,7 @@ def _spread(quotients: list[float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Runs the benchmark."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", type=Path)
     parser.add_argument("--beside", type=Path, metavar="CHECKOUT")

@@ -1,13 +1,13 @@
-"""The worth of the second view of a step: the tables of docs/results/two-views.md.
+"""The value of the second view of a step: the tables of docs/results/two-views.md.
 
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml
     crossgrad sweep benchmarks/grids/two_views_tuning.yaml --best benchmarks/grids/two_views.yaml
     crossgrad sweep benchmarks/grids/two_views.yaml
     python benchmarks/two_views.py runs/sweeps/two-views-best > tables.md
 
-Each arm is there twice, at its own best factor of the learning rates on each scene and at the
-published rates. Differences are paired by scene and seed; verdicts are those of
-`crossgrad compare`, corrected over each table. Imports no torch.
+Each arm occurs twice: at its own best factor of the learning rates on each scene, and at the
+published rates. Differences are paired by scene and seed. Verdicts are computed as in
+`crossgrad compare` and corrected over each table. Imports no torch.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from crossgrad_plugins.compare.narrative import needed_text, verdict_text
 from crossgrad_plugins.compare.statistics import Verdict
 
 ONE, TWO = "one view", "two views"
-#: What is held equal -> two arms, the one with two views first.
+#: What is equal in a comparison -> two arms, the arm with two views first.
 PAIRS = {
     "seconds": (f"{TWO}, equal seconds", f"{ONE}, equal seconds"),
     "views, events and count": (
@@ -43,12 +43,12 @@ PAIRS = {
         f"{ONE}, equal views, statistics of an extra render",
     ),
 }
-#: How the two grids of rates are told apart: the title and what the names of arms end with.
+#: Title of each grid of rates -> ending of its arms' names.
 RATES = {"each at its best rates": ", best", "at the published rates": ""}
 
 
 def differences(runs: Runs, ending: str) -> Iterator[str]:
-    """The table of differences: rows by what is held equal and by regime."""
+    """Yield the table of differences, by what is equal and by regime."""
     scenes = runs.scenes
     yield from head("two views minus one, at equal ...", "regime", *scenes, "pooled", "verdict")
     wanted = [
@@ -64,7 +64,7 @@ def differences(runs: Runs, ending: str) -> Iterator[str]:
 
 
 def pooled(found: Contrast) -> str:
-    """The pooled difference with its interval and its verdict, as two cells."""
+    """Return the pooled difference with its interval, and its verdict, as two cells."""
     verdict = verdict_text(found)
     if found.verdict is Verdict.INCONCLUSIVE:
         verdict += f": {needed_text(found)}"
@@ -72,7 +72,7 @@ def pooled(found: Contrast) -> str:
 
 
 def main() -> None:
-    """Prints the tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sweeps", type=Path, nargs="+")
     given = parser.parse_args()

@@ -1,7 +1,7 @@
-"""A PLY as a viewer draws it, written down once more: numpy, float64, one Gaussian after the other.
+"""An independent PLY renderer for checks: numpy, float64, one Gaussian after the other.
 
-Reads the file and draws it by the published rules with no line of crossgrad's, so that what a run
-says of its file can be checked from outside.
+It reads the file and draws it by the published rules without code of crossgrad, so that the figures
+of a run for its file can be checked independently.
 
     python benchmarks/viewer.py RUN [--ply FILE]      # PSNR of the held-out photos, on black
 """
@@ -18,13 +18,13 @@ import crossgrad_core as cg
 
 Array = NDArray[np.float64]
 
-#: Rules of 3DGS: least alpha, its cap, transmittance at which a pixel ends, dilation in px^2, near
-#: plane (camera units), and the margin of the clamp of the Jacobian.
+#: Rules of 3DGS: least alpha, greatest alpha, transmittance at which a pixel ends, dilation in
+#: px^2, near plane (camera units), and the margin for clamping the Jacobian.
 LEAST, CAP, STOP, DILATION, NEAR, MARGIN = 1 / 255, 0.99, 1e-4, 0.3, 1e-3, 1.3
 
 
 def read(path: Path) -> dict[str, Array]:
-    """The columns of the vertices of a binary PLY of floats."""
+    """Return the vertex columns of a binary PLY of floats."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii").splitlines()]
     names = [words[2] for words in lines if words[0] == "property"]
@@ -34,7 +34,7 @@ def read(path: Path) -> dict[str, Array]:
 
 
 def harmonics(d: Array, bands: int) -> Array:
-    """[N, bands] real spherical harmonics of unit directions [N, 3], signs as in 3DGS."""
+    """Return real spherical harmonics [N, bands] of unit directions [N, 3], signs as in 3DGS."""
     x, y, z = d.T
     xx, yy, zz = x * x, y * y, z * z
     found = [
@@ -59,7 +59,7 @@ def harmonics(d: Array, bands: int) -> Array:
 
 
 def rotations(quats: Array) -> Array:
-    """[N, 3, 3] of quaternions wxyz [N, 4] of any norm."""
+    """Return rotations [N, 3, 3] of quaternions wxyz [N, 4] of any norm."""
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -71,7 +71,7 @@ def rotations(quats: Array) -> Array:
 
 @dataclass(frozen=True)
 class Projection:
-    """N Gaussians seen by a camera; `pose` [4, 4] goes to camera axes times any number > 0."""
+    """N Gaussians seen by a camera. `pose` [4, 4] maps to camera axes times any number > 0."""
 
     ply: dict[str, Array]
     pose: Array
@@ -80,17 +80,17 @@ class Projection:
 
     @cached_property
     def means(self) -> Array:
-        """[N, 3] in the coordinates of the file."""
+        """[N, 3] means in the coordinates of the file."""
         return np.stack([self.ply[name] for name in "xyz"], 1)
 
     @cached_property
     def local(self) -> Array:
-        """[N, 3] in camera axes."""
+        """[N, 3] means in camera axes."""
         return self.means @ self.pose[:3, :3].T + self.pose[:3, 3]
 
     @cached_property
     def axes(self) -> Array:
-        """[N, 3, 3] principal axes as columns, of the lengths of the standard deviations."""
+        """[N, 3, 3] principal axes as columns, scaled by the standard deviations."""
         zoom = np.cbrt(np.linalg.det(self.pose[:3, :3]))
         sides = np.exp(np.stack([self.ply[f"scale_{i}"] for i in range(3)], 1)) * zoom
         quats = np.stack([self.ply[f"rot_{i}"] for i in range(4)], 1)
@@ -98,12 +98,12 @@ class Projection:
 
     @cached_property
     def opacities(self) -> Array:
-        """[N]."""
+        """[N] opacities."""
         return 1 / (1 + np.exp(-self.ply["opacity"]))
 
     @cached_property
     def colors(self) -> Array:
-        """[N, 3]."""
+        """[N, 3] colours."""
         away = self.means + np.linalg.solve(self.pose[:3, :3], self.pose[:3, 3])
         bands = 1 + sum(name.startswith("f_rest_") for name in self.ply) // 3
         basis = harmonics(away / np.linalg.norm(away, axis=1, keepdims=True), bands)
@@ -117,14 +117,14 @@ class Projection:
 
     @cached_property
     def reach(self) -> tuple[Array, Array]:
-        """[2] and [2], the least and the largest x / z and y / z of the Jacobian."""
+        """[2] and [2], the least and the greatest x / z and y / z for the Jacobian."""
         focal, center = np.diag(self.k)[:2], self.k[:2, 2]
         low, high = -center / focal, (np.array(self.size) - center) / focal
         margin = (MARGIN - 1) / 2 * (high - low)
         return low - margin, high + margin
 
     def footprint(self, i: int) -> tuple[Array, Array]:
-        """[2] centre in pixels and [2, 2] dilated covariance of Gaussian i."""
+        """Return centre [2] in pixels and dilated covariance [2, 2] of Gaussian i."""
         x, y, z = self.local[i]
         fx, fy = self.k[0, 0], self.k[1, 1]
         tx, ty = np.clip([x / z, y / z], *self.reach)
@@ -135,7 +135,7 @@ class Projection:
 
 
 def draw(seen: Projection) -> Array:
-    """[H, W, 3] over black."""
+    """Return the image [H, W, 3] over black."""
     width, height = seen.size
     image, through = np.zeros((height, width, 3)), np.ones((height, width))
     ended = np.zeros((height, width), bool)
@@ -164,7 +164,7 @@ def draw(seen: Projection) -> Array:
 
 
 def psnr(run: "cg.Run", ply: Path) -> float:
-    """Mean PSNR of the held-out photos of a run's scene, of a file in the scene's coordinates."""
+    """Return the mean PSNR of a PLY in scene coordinates on a run's held-out photos."""
     columns, scene = read(ply), run.scene
     to_local = np.diag([scene.similarity.scale] * 3 + [1.0])
     to_local[:3, 3] = -scene.similarity.offset * scene.similarity.scale
@@ -180,7 +180,7 @@ def psnr(run: "cg.Run", ply: Path) -> float:
 
 
 def main() -> None:
-    """Prints the PSNR."""
+    """Print the PSNR."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--ply", type=Path)

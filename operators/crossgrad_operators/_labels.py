@@ -1,4 +1,4 @@
-"""Operators that need to know which group each view comes from."""
+"""Checks for operators that need to know the group of each view."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -7,10 +7,10 @@ from crossgrad_core.plugin import OperatorContext, Selection, UserError
 
 
 def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
-    """The labels of the views.
+    """Return the labels of the views.
 
     Raises:
-        UserError: The views have none.
+        UserError: The views have no labels.
     """
     if context.labels is None:
         raise UserError(
@@ -25,13 +25,13 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
 def label_objections(
     selection: Selection, needed: Mapping[str, str] = MappingProxyType({})
 ) -> list[str]:
-    """Reasons why views will not carry labels, or not those that options of the operator name."""
+    """Return reasons why views will have no labels, or lack labels that the options name."""
     name, sampler = selection.names["operator"], selection.names["sampler"]
     grouping = selection.grouping
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists learns its labels from the scene and declares none.
+        # A grouping by folders or lists reads its labels from the scene and declares none.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:

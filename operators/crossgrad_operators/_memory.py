@@ -1,4 +1,4 @@
-"""Numbers that an operator remembers for each Gramian between steps."""
+"""Numbers that an operator stores between steps for each Gramian."""
 
 from collections.abc import Iterator
 from itertools import groupby
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import OperatorContext, PluginState
 
-#: More Gramians than this are those of primitives.
+#: With more Gramians than this, the Gramians belong to single primitives.
 _BLOCKS = 64
 
 
 def recall(
     state: PluginState, context: OperatorContext, key: str, shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """[B, *shape] what was remembered under `key`; zeros at first and where the shape changed."""
+    """Return [B, *shape] stored under `key`, or zeros at first and after a change of shape."""
     if _by_block(context):
         return _known(state.tensors.get(key), (len(context.blocks), *shape))
     parts = []
@@ -29,7 +29,7 @@ def recall(
 def remember(
     state: PluginState, context: OperatorContext, key: str, values: NDArray[np.float64]
 ) -> PluginState:
-    """The state with `values` [B, ...] under `key`; rows of primitives move with the primitives."""
+    """Return the state with `values` [B, ...] under `key`. Rows follow their primitives."""
     tensors, rows_of = dict(state.tensors), dict(state.per_primitive)
     if _by_block(context):
         tensors[key] = torch.from_numpy(values)
@@ -43,7 +43,7 @@ def remember(
 
 
 def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A copy of what was kept, or zeros."""
+    """Return a copy of the stored values, or zeros if they are missing."""
     if kept is None or tuple(kept.shape) != shape:
         return np.zeros(shape)
     known: NDArray[np.float64] = kept.cpu().numpy().astype(np.float64)
@@ -51,12 +51,12 @@ def _known(kept: torch.Tensor | None, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _by_block(context: OperatorContext) -> bool:
-    """Whether each Gramian has a block to itself: few of them, and no name twice."""
+    """Return whether each Gramian has its own block: few Gramians, and no name twice."""
     blocks = context.blocks
     return len(blocks) <= _BLOCKS and len(set(blocks)) == len(blocks)
 
 
 def _runs(context: OperatorContext) -> Iterator[tuple[str, int]]:
-    """Names of blocks with the number of their Gramians: above 1 they are rows of primitives."""
+    """Yield each block's name and number of Gramians. Above 1, each Gramian is of a primitive."""
     for name, run in groupby(context.blocks):
         yield name, sum(1 for _ in run)

@@ -1,4 +1,4 @@
-"""Operators made of operators: by name, in configurations, and with their states side by side."""
+"""Operators that contain operators: built from names or configurations, with nested states."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -23,7 +23,7 @@ STATE_SEPARATOR = "/"
 
 
 def operator_of(value: object) -> MatrixOperator:
-    """An operator from itself, from its name, or from `{name: ..., option: ...}`."""
+    """Return an operator, given itself, its name, or `{name: ..., option: ...}`."""
     if isinstance(value, Operator):
         return _checked(value)
     if isinstance(value, str):
@@ -47,24 +47,24 @@ def _checked(operator: Operator) -> MatrixOperator:
     return operator
 
 
-#: A field that holds an operator and is written as its name with its options.
+#: A field that holds an operator. It is serialized as the operator's name and options.
 OperatorField: TypeAlias = Annotated[
     MatrixOperator, BeforeValidator(operator_of), PlainSerializer(plain_component)
 ]
 
 
 def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
-    """Whether the Gramians make a difference to any of these operators."""
+    """Return whether any of these operators depends on the Gramians."""
     return any(isinstance(each, GramianOperator) and each.reads_gramians() for each in operators)
 
 
 def first_grouping(operators: Iterable[MatrixOperator]) -> str | None:
-    """The grouping that the first of them needs that needs one."""
+    """Return the grouping of the first operator that needs a grouping, or None."""
     return next(filter(None, (each.resolved_grouping for each in operators)), None)
 
 
 def inner_state(state: PluginState, key: str) -> PluginState:
-    """The part of a state that belongs to the inner operator of that key."""
+    """Return the part of a state that belongs to the inner operator with this key."""
     start = key + STATE_SEPARATOR
     return PluginState(
         values=_inner(state.values, start),
@@ -74,7 +74,7 @@ def inner_state(state: PluginState, key: str) -> PluginState:
 
 
 def outer_state(states: Mapping[str, PluginState]) -> PluginState:
-    """One state from those of all inner operators, by key."""
+    """Return one state that contains the states of all inner operators, by key."""
     return PluginState(
         values=_outer({key: state.values for key, state in states.items()}),
         tensors=_outer({key: state.tensors for key, state in states.items()}),
@@ -83,7 +83,7 @@ def outer_state(states: Mapping[str, PluginState]) -> PluginState:
 
 
 def inner_objections(selection: Selection, operator: Operator) -> list[str]:
-    """What an inner operator objects to in a selection."""
+    """Return the objections of an inner operator to a selection."""
     name = component_name(operator)
     seen = replace(selection, operator=operator, names={**selection.names, "operator": name})
     own = getattr(operator, "crossgrad_validate_selection", None)
@@ -91,7 +91,7 @@ def inner_objections(selection: Selection, operator: Operator) -> list[str]:
 
 
 def inner_idle(selection: Selection, option: str, operators: Iterable[Operator]) -> dict[str, str]:
-    """The option that holds inner operators, where one of these has options that do nothing."""
+    """Return a message for the option with inner operators, if their options have no effect."""
     found = [
         f"{component_name(operator)}.{name}: {why}"
         for operator in operators

@@ -1,4 +1,4 @@
-"""Weights worked out with as many digits as the gradients ask for."""
+"""Weights that are computed in 16 or 32 digits, as the gradients require."""
 
 from collections.abc import Callable
 from typing import Final, Literal, Protocol
@@ -22,17 +22,19 @@ def refine(
     context: OperatorContext,
     exact: Callable[[Floats, Floats, Flags], Floats],
 ) -> Floats:
-    """Weights of which the doubtful ones are worked out anew, with twice the digits.
+    """Recompute ill-conditioned weights with 32 digits.
 
     Args:
         weights: [B, K] or rows [B, K, K], changed in place.
-        ill_conditioned: [B].
+        ill_conditioned: [B] True for weights to recompute.
         gramians: [B, K, K].
-        context: Tells which views are present, and what rounding took from the Gramians; where
-            that is not known, the weights stay as they are.
-        exact: From the doubtful Gramians, their remainders and presence [n, K] to their weights.
+        context: Gives the views that are present, and the rounding residuals of the Gramians. If
+            the residuals are unknown, the weights are not changed.
+        exact: Function from ill-conditioned Gramians, their residuals and presence [n, K] to
+            their weights.
 
     Returns:
+        `weights`.
         `weights`.
     """
     if context.rounding_residuals is not None and ill_conditioned.any():
@@ -44,7 +46,7 @@ def refine(
 
 
 class CautiousKernel(Protocol):
-    """A kernel that is told from which relative error on a weight of 16 digits is doubtful."""
+    """A kernel with an argument for the relative error above which 16 digits are not enough."""
 
     def __call__(
         self,
@@ -58,7 +60,7 @@ class CautiousKernel(Protocol):
 
 
 def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Weights of 16 digits, and of 32 where the kernel finds these doubtful."""
+    """Return weights of 16 digits, or of 32 digits if the kernel finds them ill-conditioned."""
     nothing = np.zeros_like(gramians)
     weights, ill_conditioned = kernel(gramians, nothing, context.present, context.unit, None)
 
@@ -69,7 +71,7 @@ def doubted(kernel: CautiousKernel, gramians: Floats, context: OperatorContext) 
 
 
 class Kernel(Protocol):
-    """A kernel: Gramians, remainders, presence, True for 32 digits -> weights, which to doubt."""
+    """A kernel: Gramians, residuals, presence, True for 32 digits -> weights, ill-conditioned."""
 
     def __call__(
         self,
@@ -82,10 +84,10 @@ class Kernel(Protocol):
 
 
 def extended_precision(kernel: Kernel, gramians: Floats, context: OperatorContext) -> Floats:
-    """Weights with as many digits as the gradients ask for.
+    """Return weights with as many digits as the gradients require.
 
-    That is 32 for gradients finer than float32, if their Gramians are known that well; else 16, and
-    32 where the kernel finds these doubtful.
+    Gradients finer than float32 get 32 digits if the residuals of their Gramians are known. Other
+    gradients get 16 digits, and 32 digits if the kernel finds their weights ill-conditioned.
     """
     if context.unit < FLOAT32 and context.rounding_residuals is not None:
         return kernel(gramians, context.rounding_residuals(), context.present, True)[0]

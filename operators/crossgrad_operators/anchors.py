@@ -20,10 +20,10 @@ from crossgrad_operators.projection import project, slot_order
 
 
 class Anchors(GramianOperator):
-    """`symmetric` between a nearest and a farthest view, `sum` between any others.
+    """`symmetric` between a nearest and a farthest view, and `sum` between other views.
 
-    Meant for the sampler `anchors-30`: the nearest and the farthest 30 % of the cameras are
-    anchors, the middle contributes plain photometric gradients.
+    Use it with the sampler `anchors-30`: the nearest and the farthest 30 % of the cameras are
+    anchors. The cameras in between contribute plain photometric gradients.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -50,5 +50,5 @@ class Anchors(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Refuses samplers whose views carry no labels."""
+        """Refuse samplers whose views have no labels."""
         return label_objections(selection, {"near": self.near, "far": self.far})

@@ -11,11 +11,11 @@ from crossgrad_operators._weights import doubted
 
 
 class Aligned(Weighting):
-    """All singular values of the gradient matrix are brought down to its smallest one.
+    """Reduction of all singular values of the gradient matrix to its smallest singular value.
 
     G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
-    K eps l_max. Where an eigenvalue falls below that, u jumps: the direction is left out and l_min
-    is the next one.
+    K eps l_max. If an eigenvalue falls below this limit, u jumps: the eigenvalue's direction is
+    omitted, and l_min becomes the next larger eigenvalue.
 
     Source: Senushkin et al. 2023, "Independent component alignment".
     """
@@ -34,9 +34,9 @@ class Aligned(Weighting):
 class IMTLG(Weighting):
     """The combination with equal projections on all unit gradients, weights adding up to 1.
 
-    G v = (|g_k|), w = v / sum v. For two views w = (|g_2|, |g_1|) / (|g_1| + |g_2|): the bisector.
-    Where G is singular, v is the shortest least-squares solution; where the v add up to zero, or
-    nothing but rounding noise is left, the result is zero.
+    G v = (|g_k|), w = v / sum v. For two views, w = (|g_2|, |g_1|) / (|g_1| + |g_2|): the bisector.
+    If G is singular, v is the shortest least-squares solution. If the sum of the v is zero, or if
+    the result is only rounding noise, the result is zero.
 
     Source: Liu et al. 2021, "Towards impartial multi-task learning".
     """
@@ -55,9 +55,10 @@ class IMTLG(Weighting):
 class Nash(Weighting):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
-    Closed form for two views, damped Newton above (decrement 1e-13). |u| would always be sqrt(K);
-    it is multiplied by the geometric mean of the norms, so that u scales with the gradients and a
-    single view stays as it is. Zero where the gradients oppose each other exactly.
+    Two views use a closed form. More views use damped Newton steps (decrement 1e-13). |u| would
+    always be sqrt(K). It is multiplied by the geometric mean of the norms, so that u scales with
+    the gradients and a single view is unchanged. The result is zero if the gradients are exactly
+    opposite.
 
     Source: Navon et al. 2022, "Multi-task learning as a bargaining game".
     """

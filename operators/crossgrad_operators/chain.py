@@ -1,4 +1,4 @@
-"""Operators one after the other: `a+b` on the command line."""
+"""Operators in sequence: `a+b` on the command line."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -29,15 +29,16 @@ from crossgrad_operators._nested import (
     reads_gramians,
 )
 
-#: Rows of a product that are shorter than this share of their terms are rounding noise.
+#: A row of a product is rounding noise if it is shorter than this share of its terms.
 _NOISE = 1e-14
 
 
 class Chain(GramianOperator):
-    """Each link works on what the one before made of the gradients; the last rows are added.
+    """A sequence of operators, each of which transforms the result of the operator before it.
 
-    The chain's matrix is the product of its links' matrices; each link sees M Gram M^T, so that no
-    link touches anything of parameter size. Without links it is `sum`.
+    The chain's matrix is the product of the matrices of its links, and the resulting rows are
+    added. Each link receives M Gram M^T, so no link computes on arrays of parameter size. Without
+    links, the chain equals `sum`.
     """
 
     links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
@@ -96,14 +97,14 @@ class Chain(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """What any link objects to."""
+        """Return the objections of all links."""
         return [reason for link in self.links for reason in inner_objections(selection, link)]
 
 
 def _noise(
     seen: NDArray[np.float64], product: NDArray[np.float64], gramians: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """[B, R] rows of M G that are zero, or what rounding left of terms that cancel."""
+    """Return the rows [B, R] of M G that are zero, or rounding noise of terms that cancel."""
     norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2))
     terms = np.abs(product) @ norms[:, :, None]
     empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2
@@ -116,7 +117,7 @@ def _remainders(
     context: OperatorContext,
     seen: NDArray[np.float64],
 ) -> Callable[[], NDArray[np.float64]] | None:
-    """What rounding took from M Gram M^T, for links that ask for it."""
+    """Return a function for the rounding residuals of M Gram M^T, or None if they are unknown."""
     whole = context.rounding_residuals
     if whole is None:
         return None

@@ -17,13 +17,14 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """Projects a pair only where it conflicts now and has probably been conflicting for a while.
+    """Projection of a pair only if it conflicts now and has probably conflicted for some time.
 
-    Mean mu and variance v of the block's cosine are exponential averages (bias-corrected) with
-    n_eff = (1 + beta) / (1 - beta) effective samples, and
+    The mean mu and the variance v of the block's cosine are exponential averages (bias-corrected)
+    with n_eff = (1 + beta) / (1 - beta) effective samples.
     P(conflict) = Phi(-mu / sqrt(v / n_eff + 1e-12)).
-    `symmetric` where m < 0 and P >= tau, else `sum`. The first `warmup` updates of a pair never
-    project; pairs with a zero gradient or without a common element (m = 0) are not counted.
+    The operator is `symmetric` if m < 0 and P >= tau, else `sum`. The first `warmup` updates of a
+    pair never project. Pairs with a zero gradient or without a common element (m = 0) are not
+    counted.
     """
 
     identity_at_one: ClassVar[bool] = True

@@ -15,8 +15,9 @@ from crossgrad_operators._weights import Flags, Floats, extended_precision
 class MGDA(Weighting):
     """The shortest convex combination of the gradients: min |sum w_k g_k|, w on the simplex.
 
-    Closed form for two views, Lawson and Hanson's active sets above, with 32 digits for gradients
-    in float64. |u| is at most the shortest gradient's length; zero where a convex combination is.
+    Two views use a closed form. More views use the active sets of Lawson and Hanson. Gradients in
+    float64 use 32 digits. |u| is at most the length of the shortest gradient. The result is zero
+    if a convex combination of the gradients is zero.
 
     Source: Désidéri 2012; Sener and Koltun 2018.
     """
@@ -33,12 +34,12 @@ class MGDA(Weighting):
 
 
 class CAGrad(Weighting):
-    """The direction near the mean that serves the worst-off view best.
+    """The direction near the mean that maximizes the smallest gain over all views.
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
-    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Closed form for two views; above, the
-    nearest point to g_0 of the polyhedron in which all views reach a level, by active sets, with 32
-    digits for gradients in float64. A single view is left as it is.
+    where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Two views use a closed form. For more
+    views, d is the point nearest to g_0 in the polyhedron in which all views reach a level. It is
+    found by active sets, with 32 digits for gradients in float64. A single view is not changed.
 
     Source: Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning".
     """

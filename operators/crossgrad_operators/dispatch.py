@@ -38,7 +38,7 @@ _OPACITY = frozenset({"opacity", "opacities"})
 
 
 class Rule(BaseModel):
-    """One block, or all blocks of a kind, and their operator."""
+    """A block, or a kind of blocks, and its operator."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,10 +57,10 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 
 
 class Dispatch(GramianOperator):
-    """Each block goes to the operator of its own rule, else of its kind's, else of the variant.
+    """A different operator for each block: from its rule, its kind's rule, or the variant.
 
-    Variants of the paper: `geometry-confgate` gates the geometry and adds the
-    appearance; `geometry-projection` projects the geometry and gates the appearance.
+    Variants of the paper: `geometry-confgate` gates the geometry and adds the appearance.
+    `geometry-projection` projects the geometry and gates the appearance.
     """
 
     variant: Literal["geometry-confgate", "geometry-projection"] = Field(
@@ -118,7 +118,7 @@ class Dispatch(GramianOperator):
         return {**idle, **inner_idle(selection, "rules", [rule.operator for rule in self.rules])}
 
     def _given(self, selection: Selection) -> list[tuple[str, BlockKind]]:
-        """Name and kind of what a Gramian covers."""
+        """Return name and kind of the blocks that each Gramian covers."""
         blocks = [(block.name, block.kind) for block in selection.backbone.trained_blocks()]
         if self.granularity != "kind":
             return blocks
@@ -141,7 +141,7 @@ class Dispatch(GramianOperator):
             part = np.flatnonzero(served == key)
             inner, of_part = inner_state(state, key), _part(context, part)
             found, states[key] = transformed(operators[key], gramians[part], of_part, inner, rng)
-            # Rows are added in the end, so that fewer or more of them make no difference here.
+            # Rows are added at the end, so their number does not matter here.
             if found.shape[1] != gramians.shape[1]:
                 found = _in_first_row(found, gramians.shape[1])
             matrices[part] = found
@@ -149,7 +149,7 @@ class Dispatch(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """What any of the operators objects to, and rules for blocks that do not exist."""
+        """Return the objections of all operators, and rules for blocks that do not exist."""
         reasons = [
             reason
             for operator in self._operators().values()
@@ -167,7 +167,7 @@ class Dispatch(GramianOperator):
         return reasons
 
     def _operators(self) -> dict[str, MatrixOperator]:
-        """Key of a rule -> operator."""
+        """Return the operators by the key of their rule."""
         variants: dict[str, dict[str, MatrixOperator]] = {
             "geometry-confgate": {"geometry": ConfGate(), "appearance": Sum()},
             "geometry-projection": {"geometry": Symmetric(), "appearance": ConfGate()},
@@ -177,7 +177,7 @@ class Dispatch(GramianOperator):
         return chosen | {rule.block: rule.operator for rule in self.rules}
 
     def _served(self, context: OperatorContext) -> NDArray[np.str_]:
-        """[B] key of the rule that serves each Gramian."""
+        """Return the key [B] of the rule for each Gramian."""
         ruled = {rule.block for rule in self.rules}
         kind_of = {
             name: self._key(name, kind, ruled)

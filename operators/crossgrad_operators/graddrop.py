@@ -11,11 +11,11 @@ from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, P
 
 
 class GradDrop(Operator):
-    """In every element either the positive or the negative gradients are kept, at random.
+    """A random choice, in every element, between its positive and its negative gradients.
 
-    With p the sum of the positive and n that of the negative magnitudes, the positive ones are kept
-    with probability p / (p + n), else the negative ones; one uniform number per element serves all
-    views. The expectation is `sum`.
+    p is the sum of the positive magnitudes and n the sum of the negative magnitudes. The positive
+    gradients are kept with probability p / (p + n), else the negative gradients. All views share
+    one uniform random number per element. The expected result is `sum`.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -46,7 +46,7 @@ class GradDrop(Operator):
 
 
 def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
-    """The sum of the positive or of the negative elements in each place."""
+    """Return the sum of either the positive or the negative elements, chosen in each place."""
     first = views[0]
     dtype = torch.promote_types(first.dtype, torch.float32)
     positive = torch.zeros_like(first, dtype=dtype)
@@ -55,6 +55,6 @@ def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
         positive += gradient.clamp(min=0)
         negative -= gradient.clamp(max=0)
     draws = torch.rand(first.shape, generator=generator, dtype=dtype, device=first.device)
-    # 1 / (1 + n / p) is p / (p + n) without an overflow of p + n; 0 / 0 keeps the zero.
+    # 1 / (1 + n / p) equals p / (p + n) without overflow of p + n. For 0 / 0 the result is zero.
     keep = draws < 1 / (1 + negative / positive)
     return torch.where(keep, positive, -negative).to(first.dtype)

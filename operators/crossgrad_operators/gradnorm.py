@@ -22,17 +22,18 @@ from crossgrad_core.plugin import (
 from crossgrad_operators._labels import label_objections, labels_of
 from crossgrad_operators._memory import recall, remember
 
-#: Group -> count, start and average of its losses, and the same by octave where not at full size.
+#: Group -> count, start and average of its losses. Scales below full size are stored by octave.
 _Losses = dict[str, dict[str, Any]]
 
 
 class GradNorm(GramianOperator):
-    """Weights that let gradient norms follow the relative losses: u = sum w_s g_s over groups s.
+    """Weights with which gradient norms follow relative losses: u = sum w_s g_s over groups s.
 
-    G_s = w_s |g_s| should meet mean(G) (l_s / mean l)^alpha, where l_s is the group's average loss
-    over its loss at the start. log w_s takes a step of fixed size towards that, and the weights of
-    the groups with a gradient are scaled to add up to their number. One weight per block and group;
-    the views of a group share it. Losses at different octaves of scale are followed apart.
+    The target for G_s = w_s |g_s| is mean(G) (l_s / mean l)^alpha, where l_s is the group's average
+    loss divided by its initial loss. log w_s takes a step of fixed size towards the target. The
+    weights of groups with a gradient are then scaled so that their sum equals their number. There
+    is one weight per block and group, which all views of the group share. Losses are tracked
+    separately for each octave of scale.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -74,13 +75,13 @@ class GradNorm(GramianOperator):
 
     @hookimpl
     def crossgrad_validate_selection(self, selection: Selection) -> list[str]:
-        """Refuses samplers whose views carry no labels."""
+        """Refuse samplers whose views have no labels."""
         return label_objections(selection)
 
     def _followed(
         self, losses: _Losses, labels: tuple[str, ...], context: OperatorContext
     ) -> _Losses:
-        """The losses of all groups so far, with those of this step."""
+        """Return the losses of all groups, updated with the losses of this step."""
         followed = deepcopy(losses)
         scales = context.scales or (1.0,) * len(labels)
         for label, loss, scale in zip(labels, context.losses.tolist(), scales, strict=True):
@@ -92,7 +93,7 @@ class GradNorm(GramianOperator):
         return followed
 
     def _rates(self, losses: _Losses) -> NDArray[np.float64]:
-        """[S] relative losses l_s; 1 until every group has a loss at the start."""
+        """Return the relative losses l_s [S], or 1 until every group has an initial loss."""
         newest = [_at(group, group.get("octave", 0), 0.0) for group in losses.values()]
         known = all(s["count"] >= self.baseline and s["start"] > 0 for s in newest)
         if not known:
@@ -105,7 +106,7 @@ def _fresh(loss: float) -> dict[str, Any]:
 
 
 def _at(group: dict[str, Any], level: int, loss: float) -> dict[str, Any]:
-    """A group's losses at one octave of scale, which becomes its newest; full size is the group."""
+    """Return a group's losses at an octave, now its newest. Full size is stored in the group."""
     if level == 0:
         group.pop("octave", None)
         return group

@@ -14,11 +14,11 @@ from crossgrad_operators.projection import random_order
 
 
 class GradVac(GramianOperator):
-    """Each gradient is turned towards its partners until their usual cosine is met; u is the sum.
+    """A sum of gradients, each rotated towards its partners up to their usual cosine.
 
     For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of
-    g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, kept within
-    +-0.999. The targets start at 0, where the rule is PCGrad's; i and j are slots, not cameras.
+    g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999.
+    The targets start at 0, which gives PCGrad's rule. i and j are slots, not cameras.
     """
 
     identity_at_one: ClassVar[bool] = True

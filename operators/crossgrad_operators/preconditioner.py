@@ -7,16 +7,17 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState, diagonals
 
-#: Bounds of r / r_ref: a camera at the centroid must not lose all weight.
+#: Bounds of r / r_ref, so that a camera at the centroid keeps some weight.
 _BOUNDS = (1e-2, 1e2)
 
 
 class Preconditioner(MatrixOperator):
-    """g_k is multiplied by (r_k / r_ref)^d; then the gradients are added.
+    """Multiplication of each g_k by (r_k / r_ref)^d before the gradients are added.
 
-    r_k is the distance of the camera from the mean training camera, r_ref the median of these, and
-    their ratio is kept within [1e-2, 1e2]. The exponent depends on the kind of the block. Gradients
-    of far views grow, those of near views shrink. No Gramian is looked at.
+    r_k is the distance of the camera from the mean training camera, and r_ref is the median of
+    these distances. The ratio is clipped to [1e-2, 1e2]. The exponent depends on the kind of the
+    block. Gradients of far views become longer, and gradients of near views shorter. No Gramian is
+    used.
     """
 
     geometry: float = Field(2.0, description="exponent d for means, scales and rotations")

@@ -1,4 +1,4 @@
-"""Operators of pairwise projection: each gradient loses what conflicts with the others."""
+"""Operators of pairwise projection: each gradient loses components that conflict with others."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,16 +10,16 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 
-#: Gradients whose unit roundoff is below this have Gramians that are no closer than they are.
+#: For a unit roundoff of the gradients below this, float64 Gramians are not finer than gradients.
 NARROW = 1e-12
 
 
 class Symmetric(GramianOperator):
-    """Where two gradients conflict, each loses its component along the other; then they are added.
+    """A sum of gradients after conflicting pairs lose their components along each other.
 
     g_1' = g_1 - (m / |g_2|^2) g_2 and g_2' = g_2 - (m / |g_1|^2) g_1 for m = g_1.g_2 < 0 (paper,
-    equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views every
-    ordered pair is treated in the order of the slots, always with the original partner.
+    equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views,
+    every ordered pair is projected in the order of the slots, always with the original partner.
 
     The primary operator of CrossGrad-GS (arXiv 2605.00052).
     """
@@ -38,11 +38,11 @@ class Symmetric(GramianOperator):
 
 
 class PCGrad(GramianOperator):
-    """Each gradient loses its components against conflicting partners, in random order.
+    """A sum of gradients that lose their components against conflicting partners in random order.
 
     For each i: v = g_i; for j != i in random order: if v.g_j < 0, v -= (v.g_j / |g_j|^2) g_j, with
-    the original g_j; u is the sum of the v. One order per step serves all blocks; with two views
-    there is nothing to draw.
+    the original g_j; u is the sum of all v. All blocks share one order per step. With two views,
+    nothing is drawn.
 
     Source: Yu et al. 2020, "Gradient surgery for multi-task learning", algorithm 1.
     """
@@ -62,10 +62,10 @@ class PCGrad(GramianOperator):
 
 
 class Soft(GramianOperator):
-    """Where cos(g_i, g_j) < -threshold, `strength` times the component along g_j is taken away.
+    """Removal of `strength` times the component along g_j if cos(g_i, g_j) < -threshold.
 
-    v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 are `symmetric`, strength 0 is
-    `sum`; the rule jumps at a threshold above 0. Pairs in the order of the slots.
+    v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 equal `symmetric`, and strength
+    0 equals `sum`. With a threshold above 0 the rule has a jump. Pairs are in the order of slots.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -101,12 +101,12 @@ class Soft(GramianOperator):
 
 
 def slot_order(views: int) -> NDArray[np.int64]:
-    """[K, K] partners of each view in the order of their slots."""
+    """Return the partners [K, K] of each view in the order of their slots."""
     return np.tile(np.arange(views), (views, 1))
 
 
 def random_order(views: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """[K, K] partners of each view in random order; nothing is drawn where there is one partner."""
+    """Return the partners [K, K] of each view in random order. With one partner, draw nothing."""
     order = slot_order(views)
     return order if views <= 2 else rng.permuted(order, axis=1)  # noqa: PLR2004
 
@@ -120,23 +120,23 @@ def project(
     threshold: float = 0.0,
     strength: float = 1.0,
 ) -> NDArray[np.float64]:
-    """[B, K, K] matrices that project each gradient against the others where they conflict.
+    """Return the matrices [B, K, K] that project each gradient against conflicting gradients.
 
     Args:
         gramians: [B, K, K].
-        context: Tells which views are present.
-        order: [K, K] for each view the order of its partners.
-        gates: [B, K, K] which pairs may be projected; all by default.
-        threshold: Only cosines below minus this count as a conflict.
-        strength: The share of the conflicting component that is taken away.
+        context: Gives the views that are present.
+        order: [K, K] order of the partners of each view.
+        gates: [B, K, K] True for pairs that may be projected. By default all.
+        threshold: Only cosines below minus this value are conflicts.
+        strength: Share of the conflicting component that is removed.
     """
     from crossgrad_operators.numba_kernels.projection import projected
 
     if gates is None:
         gates = np.ones(gramians.shape, np.bool_)
     rule = (float(threshold), float(strength))
-    # Two views take one step each, whose errors are those of the cosine. More of them add up, to
-    # nothing that float32 gradients would show.
+    # With two views, each gradient takes one step with the error of the cosine. With more views the
+    # errors add up, but float32 gradients are too coarse to show them.
     many = gramians.shape[1] > 2  # noqa: PLR2004
     if context.unit < NARROW and many and context.rounding_residuals is not None:
         rest = context.rounding_residuals()

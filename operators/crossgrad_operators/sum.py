@@ -16,9 +16,9 @@ from crossgrad_core.plugin import (
 
 
 class Sum(MatrixOperator):
-    """u = sum of g_k: what one backward pass through the summed losses gives.
+    """u = sum of g_k, equal to one backward pass through the sum of the losses.
 
-    Needs no Gramian and no separate gradients; both ways lead to the same bits.
+    No Gramian and no separate gradients are needed. Separate gradients give the same bits.
     """
 
     separate: ClassVar[bool] = False
@@ -44,10 +44,10 @@ class Sum(MatrixOperator):
 
 
 def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
-    """The sum of the views' gradients over `divisor`, without Gramians.
+    """Return the sum of the views' gradients divided by `divisor`, without Gramians.
 
-    Counts blocks in which some view's gradient is exactly zero or absent (`zero`) or was left out
-    because it is not finite (`dropped`).
+    The counts are numbers of blocks: `zero` if the gradient of a view is exactly zero or absent,
+    `dropped` if the gradient of a view was left out because it is not finite.
     """
     gradients = context.gradients
     finite, present = gradients.finite(), gradients.present()
@@ -59,9 +59,9 @@ def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
 
 
 class Mean(MatrixOperator):
-    """u = (1/K) sum of g_k; K counts all views of the step, also those without a gradient.
+    """u = (1/K) sum of g_k, where K counts all views of the step, also views without a gradient.
 
-    Under Adam the same as `sum` up to the optimizer's eps. Needs no separate gradients.
+    Under Adam it equals `sum` up to the optimizer's eps. No separate gradients are needed.
     """
 
     separate: ClassVar[bool] = False

@@ -19,7 +19,7 @@ from crossgrad_core.plugin import (
 _Value: TypeAlias = bool | int | float | str
 
 
-#: Weightings whose weights depend on no Gramian.
+#: Weightings that do not depend on the Gramian.
 _FIXED = frozenset({"Constant", "Mean", "Random", "Sum"})
 
 
@@ -30,9 +30,9 @@ def _pairs(value: object) -> object:
 class TorchJD(GramianOperator):
     """w = Weighting(G / trace G), for the weighting classes of torchjd.aggregation.
 
-    G is divided by its trace because TorchJD compares it with absolute thresholds; views without a
-    gradient are left out of it. Weightings that remember earlier steps are refused: what they
-    remember could not be resumed.
+    G is divided by its trace because TorchJD compares it with absolute thresholds. Views without a
+    gradient are left out of G. Weightings that store earlier steps are refused, because their
+    memory could not be resumed.
     """
 
     weighting: str = Field(
@@ -58,7 +58,7 @@ class TorchJD(GramianOperator):
 
         weights = np.zeros(gramians.shape[:2])
         rule = self._built()
-        # TorchJD draws from the global generator, which must come out of here unchanged.
+        # TorchJD draws from the global generator, which must be restored afterwards.
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             torch.manual_seed(int(rng.integers(2**63)))
             for block, present in enumerate(context.present):

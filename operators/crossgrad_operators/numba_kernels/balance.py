@@ -1,7 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
 
-Each kernel works with 16 or 32 digits, and says for which blocks rounding of the Gramian itself may
-show in a result of 16.
+Each kernel computes with 16 or 32 digits. It also returns the blocks for which rounding of the
+Gramian may be visible in a result of 16 digits.
 """
 
 import math
@@ -41,15 +41,15 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: Newton steps of Nash-MTL at most; about ten are usual.
+#: Greatest number of Newton steps of Nash-MTL. About ten are usual.
 STEPS = 200
-#: Newton decrement at which they end.
+#: Newton decrement at which the steps end.
 DECREMENT = 1e-13
 #: Newton decrement below which whole steps converge quadratically.
 CLOSE = 0.25
-#: A beta beyond which a bargain has no end: 7e5 sqrt(K) is already zero by `CANCELLED`.
+#: A beta above this means that the bargain diverges: 7e5 sqrt(K) is already zero by `CANCELLED`.
 ENDLESS = 3e7
-#: Newton steps at most that follow with 32 digits; two are enough unless kappa is above 1e5.
+#: Greatest number of final Newton steps with 32 digits. Two are enough up to a kappa of 1e5.
 POLISHING = 20
 
 
@@ -57,7 +57,7 @@ POLISHING = 20
 def _of_present(
     gramian: Floats, remainder: Floats, present: Flags, exact: Exact
 ) -> tuple[Indices, Pairs, Pairs]:
-    """The places [n] of the views that are present, and their norms [n] and cosines [n, n]."""
+    """Return the indices [n] of present views, their norms [n] and their cosines [n, n]."""
     views = present.size
     norms, cosines = np.zeros((views, 2)), np.zeros((views, views, 2))
     count = directions(gramian, remainder, present, norms, cosines, exact)
@@ -69,9 +69,10 @@ def _of_present(
 
 @strict_device
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
-    """D C D [n, n] with D the norms over the longest one.
+    """Return D C D [n, n], where D contains the norms divided by the largest norm.
 
-    It has the rank of C, which its own eigenvalues would not show at large norm ratios.
+    The matrix has the rank of C. At large norm ratios, the eigenvalues of the matrix itself would
+    not show this rank.
     """
     n = len(norms)
     longest, _ = longest_of(norms)
@@ -87,7 +88,7 @@ def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
 
 @strict_device
 def _add(out: Pairs, factor: Pair, vector: Pairs, exact: Exact) -> None:
-    """Adds a vector times a factor."""
+    """Add a vector times a factor to `out`."""
     for k in range(len(out)):
         put(out, k, plus(at(out, k), product(factor, at(vector, k), exact), exact))
 
@@ -102,10 +103,10 @@ def _add_solution(
     v: Pairs,
     exact: Exact,
 ) -> None:
-    """Adds x_i (x_i.r) / l_i of the chosen eigenvectors x_i and eigenvalues l_i.
+    """Add x_i (x_i.r) / l_i for the chosen eigenvectors x_i and eigenvalues l_i to `v`.
 
-    An eigenvector whose terms cancel, up to a share `least`, contributes nothing: it is at right
-    angles to r but for rounding noise.
+    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`: then it is
+    orthogonal to r except for rounding noise.
     """
     for i in chosen:
         inner = products(vectors[:, i], right, 0, len(v), exact)
@@ -118,10 +119,10 @@ def _add_solution(
 
 @strict_part
 def _equal_projections(norms: Pairs, cosines: Pairs, v: Pairs, exact: Exact) -> float:
-    """Solves G v = (|g_k|); the shortest least-squares solution where G is singular.
+    """Solve G v = (|g_k|), by the shortest least-squares solution if G is singular.
 
     Returns:
-        The smallest eigenvalue of the cosines over the largest one.
+        The ratio of the smallest to the largest eigenvalue of the cosines.
     """
     n = len(norms)
     matrix, vectors = cosines.copy(), np.empty((n, n, 2))
@@ -150,17 +151,17 @@ def _equal_projections(norms: Pairs, cosines: Pairs, v: Pairs, exact: Exact) -> 
 def imtl_g(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Weights that add up to 1 and give u equal projections on all unit gradients.
+    """Return weights with sum 1 that give u equal projections on all unit gradients.
 
     Args:
         gramians: [B, K, K].
-        rounding_residuals: [B, K, K] what rounding took from them; not looked at for 16 digits.
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians, unused for 16 digits.
         present: [B, K].
-        unit: Relative error from which a result of 16 digits is doubtful.
+        unit: Relative error above which a result of 16 digits is ill-conditioned.
         exact: True for 32 digits, None for 16.
 
     Returns:
-        [B, K] weights and [B] whether they are doubtful.
+        [B, K] weights and [B] True for ill-conditioned weights.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -182,7 +183,7 @@ def imtl_g(
 def _same_shares(
     norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
 ) -> bool:
-    """Fills the weights of more than two views; returns whether they are doubtful."""
+    """Fill in the weights of more than two views, and return whether they are ill-conditioned."""
     n = places.size
     longest, _ = longest_of(norms)
     scaled, v, x = np.empty((n, 2)), np.zeros((n, 2)), np.empty((n, 2))
@@ -195,7 +196,7 @@ def _same_shares(
         sizes += abs(v[i, 0])
         largest = max(largest, abs(v[i, 0]))
         put(x, i, product(at(v, i), at(scaled, i), exact))
-    # The v, or the gradients times v, may add up to no more than their rounding noise.
+    # The sum of the v, or of v times gradients, may be only rounding noise.
     if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
         for i in range(n):
             weights[places[i]] = quotient(at(v, i), total, exact)[0]
@@ -204,7 +205,7 @@ def _same_shares(
 
 @strict_device
 def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) -> float:
-    """Newton's step of the bargain in units of beta, and its decrement."""
+    """Fill in Newton's step of the bargain, in units of beta, and return its decrement."""
     n = beta.size
     slope = np.empty(n)
     for i in range(n):
@@ -222,12 +223,12 @@ def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) ->
 
 @strict_kernel
 def bargain(cosines: Floats, beta: Floats) -> bool:
-    """Solves C beta = 1 / beta for beta > 0 by damped Newton; False where there is no such beta.
+    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps. Return False if it diverges.
 
-    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so that steps of
-    1 / (1 + decrement) converge from anywhere. In units of beta the Hessian is 1 + B C B, so that
-    no damped step takes a whole beta. Where a sum of directions without a negative weight vanishes,
-    beta grows without end.
+    The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of
+    1 / (1 + decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so no
+    damped step removes a whole beta. If a sum of directions with non-negative weights is zero, beta
+    grows without end.
 
     Args:
         cosines: [n, n].
@@ -245,7 +246,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
             beta[i] *= 1.0 + damping * step[i]
         if beta.max() > ENDLESS:
             return False
-        # After a whole step the decrement squares itself, until rounding stops it.
+        # After a full step the decrement is squared, until rounding stops the convergence.
         if decrement <= DECREMENT or decrement > 0.5 * last:
             return True
         last = decrement if decrement <= CLOSE else np.inf
@@ -254,7 +255,7 @@ def bargain(cosines: Floats, beta: Floats) -> bool:
 
 @strict_part
 def _polish(cosines: Pairs, beta: Floats) -> None:
-    """Newton steps of the bargain with slopes of 32 digits, until beta has 16 right ones."""
+    """Apply Newton steps with slopes of 32 digits until 16 digits of beta are correct."""
     n = beta.size
     matrix, slope, step, pairs = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros((n, 2))
     last = np.inf
@@ -276,7 +277,7 @@ def _polish(cosines: Pairs, beta: Floats) -> None:
 
 @strict_part
 def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
-    """Fills beta [n]; False where it has no end."""
+    """Fill in beta [n]. Return False if it grows without end."""
     n = beta.size
     beta[:] = 1.0
     if n == 2:
@@ -294,7 +295,7 @@ def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
 
 @strict_kernel
 def geometric_mean(values: Floats) -> float:
-    """The n-th root of a product, with the exponents apart so that it neither fades nor loses."""
+    """Return the n-th root of a product, without underflow, overflow or loss of digits."""
     mantissa, exponent = 1.0, 0
     for value in values:
         part, power = math.frexp(value)
@@ -302,7 +303,7 @@ def geometric_mean(values: Floats) -> float:
         exponent += power
     n = values.size
     whole = exponent // n
-    # The rest of the exponent, from 0 to n - 1, goes under the root.
+    # The remaining exponent, from 0 to n - 1, stays under the root.
     return math.ldexp(math.ldexp(mantissa, exponent - whole * n) ** (1.0 / n), whole)
 
 
@@ -310,9 +311,9 @@ def geometric_mean(values: Floats) -> float:
 def nash(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Weights alpha with G alpha = 1 / alpha, times the geometric mean of the norms.
+    """Return weights alpha with G alpha = 1 / alpha, times the geometric mean of the norms.
 
-    The arguments and the answer are as in `imtl_g`.
+    Arguments and results are as in `imtl_g`.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -338,9 +339,9 @@ def nash(
 def aligned(
     gramians: Floats, rounding_residuals: Floats, present: Flags, unit: float, exact: Exact
 ) -> Solved:
-    """Weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and G = V L V^T.
+    """Return the weights sqrt(l_min) V L^-1/2 V^T p with p = 1/K and G = V L V^T.
 
-    The arguments and the answer are as in `imtl_g`.
+    Arguments and results are as in `imtl_g`.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
@@ -349,7 +350,7 @@ def aligned(
         n = places.size
         if n == 0:
             continue
-        # Eigenvalues of D C D have the relative errors of those of C.
+        # Eigenvalues of D C D have the same relative errors as the eigenvalues of C.
         pivot = smallest_pivot(cosines[:, :, 0].copy(), n)
         ill_conditioned[b] = n > 1 and CAUTION * n * EPSILON > unit * pivot
         matrix, vectors = _graded(norms, cosines, exact), np.empty((n, n, 2))
@@ -363,7 +364,7 @@ def aligned(
         ones[:, 0] = 1.0
         for i in kept:
             inner = products(vectors[:, i], ones, 0, n, exact)
-            # An eigenvector at right angles to p contributes nothing, not its rounding noise.
+            # Skip eigenvectors orthogonal to p, which would contribute only rounding noise.
             if abs(inner[0]) > OPPOSITE:
                 ratio = quotient(at(matrix[least], least), at(matrix[i], i), exact)
                 factor = product(root(ratio, exact), inner, exact)

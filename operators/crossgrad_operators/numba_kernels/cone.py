@@ -1,4 +1,4 @@
-"""Projection on the cone of directions that conflict with no gradient (UPGrad, DualProj)."""
+"""Projection onto the cone of directions that conflict with no gradient (UPGrad, DualProj)."""
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 
 @strict_device
 def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
-    """Coefficients z [2] of the projection of b [2], of which at most one is larger than b's."""
+    """Fill in coefficients z [2] of the projection of b [2]. At most one is larger than in b."""
     one, other = base[0, 0], base[1, 0]
     first, second = one + cosine * other, cosine * one + other
     z[0, 0], z[1, 0] = one, other
@@ -43,7 +43,7 @@ def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
 
 @strict_section
 def _projected(problem: Polyhedron, z: Pairs) -> None:
-    """Coefficients z of the projection of b; zero where only rounding noise is left of it."""
+    """Fill in coefficients z of the projection of b, or zeros if only rounding noise remains."""
     exact = problem.rounding.exact
     if len(z) == 2 and exact is None:
         _pair(problem.cosines[0, 1, 0], problem.base, z)
@@ -58,13 +58,13 @@ def _projected(problem: Polyhedron, z: Pairs) -> None:
 
 @strict_device
 def _weight(z: Pair, norm: Pair, other: Pair, exact: Exact) -> float:
-    """Weight of a gradient whose direction has the coefficient z in units of a norm."""
+    """Return a gradient's weight, from the coefficient z of its direction in units of `norm`."""
     return product(z, quotient(norm, other, exact), exact)[0]
 
 
 @strict_kernel
 def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """[B, K, K] rows: each gradient, over K, projected on the cone that conflicts with none."""
+    """Return rows [B, K, K]: each gradient, over K, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
@@ -87,7 +87,7 @@ def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: 
 
 @strict_kernel
 def dualproj(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """[B, K] weights of the mean gradient projected on the cone that conflicts with none."""
+    """Return weights [B, K] of the mean gradient projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

@@ -1,7 +1,7 @@
-"""Arithmetic in one float64 number or in two: the same algorithms at 16 and at 32 digits.
+"""Arithmetic with one or two float64 numbers: the same algorithms with 16 and with 32 digits.
 
-A number is a pair (high, low). `exact` is True for 32 digits and None for 16, where only the first
-of the pair counts: a type of its own, so that Numba compiles the two cases apart.
+A number is a pair (high, low). `exact` is True for 32 digits and None for 16 digits, where only the
+high part is used. None and True have different types, so Numba compiles the two cases separately.
 """
 
 from typing import Final, Literal
@@ -29,7 +29,7 @@ ONE: Final = (1.0, 0.0)
 
 @strict_device
 def plus(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """The sum."""
+    """Return the sum."""
     if exact is None:
         return a[0] + b[0], 0.0
     return add(a[0], a[1], b[0], b[1])
@@ -37,7 +37,7 @@ def plus(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def minus(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """The difference."""
+    """Return the difference."""
     if exact is None:
         return a[0] - b[0], 0.0
     return add(a[0], a[1], -b[0], -b[1])
@@ -45,7 +45,7 @@ def minus(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def product(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """The product."""
+    """Return the product."""
     if exact is None:
         return a[0] * b[0], 0.0
     return multiply(a[0], a[1], b[0], b[1])
@@ -53,7 +53,7 @@ def product(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def quotient(a: Pair, b: Pair, exact: Exact) -> Pair:
-    """The quotient."""
+    """Return the quotient."""
     if exact is None:
         return a[0] / b[0], 0.0
     return divide(a[0], a[1], b[0], b[1])
@@ -61,7 +61,7 @@ def quotient(a: Pair, b: Pair, exact: Exact) -> Pair:
 
 @strict_device
 def root(a: Pair, exact: Exact) -> Pair:
-    """The square root; of a negative number, 0."""
+    """Return the square root, or 0 for a negative number."""
     if exact is None:
         return np.sqrt(max(a[0], 0.0)), 0.0
     return square_root(a[0], a[1])
@@ -69,7 +69,7 @@ def root(a: Pair, exact: Exact) -> Pair:
 
 @strict_part
 def products(a: Pairs, b: Pairs, first: int, last: int, exact: Exact) -> Pair:
-    """The sum of a_i b_i, i from `first` to `last` - 1."""
+    """Return the sum of a_i b_i, with i from `first` to `last` - 1."""
     high = low = 0.0
     if exact is None:
         for i in range(first, last):
@@ -84,33 +84,33 @@ def products(a: Pairs, b: Pairs, first: int, last: int, exact: Exact) -> Pair:
 
 @strict_device
 def at(values: Pairs, k: int) -> Pair:
-    """The number at place k."""
+    """Return the number at index k."""
     return values[k, 0], values[k, 1]
 
 
 @strict_device
 def put(values: Pairs, k: int, value: Pair) -> None:
-    """Puts a number at place k."""
+    """Write a number at index k."""
     values[k, 0], values[k, 1] = value
 
 
 @strict_device
 def clear(values: Pairs) -> None:
-    """Fills numbers with zero."""
+    """Set all numbers to zero."""
     for k in range(len(values)):
         values[k, 0], values[k, 1] = 0.0, 0.0
 
 
 @strict_device
 def copy(values: Pairs, to: Pairs) -> None:
-    """Copies numbers."""
+    """Copy all numbers."""
     for k in range(len(values)):
         to[k, 0], to[k, 1] = values[k, 0], values[k, 1]
 
 
 @strict_device
 def longest_of(norms: Pairs) -> tuple[Pair, float]:
-    """The largest of non-negative numbers, and how many of them are not zero."""
+    """Return the largest of non-negative numbers, and the count of numbers above zero."""
     place, count = 0, 0.0
     for k in range(len(norms)):
         if norms[k, 0] > norms[place, 0]:

@@ -1,4 +1,4 @@
-"""Gramians as norms and cosines in numbers of 16 or 32 digits, and what counts as opposite."""
+"""Gramians as norms and cosines with 16 or 32 digits, and the limit for opposite directions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from crossgrad_operators.numba_kernels.polyhedron import Polyhedron, share_left,
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-#: Weights, and which of the blocks more digits may change.
+#: Weights, and True for blocks whose weights more digits may change.
 Solved = tuple[Floats, Flags]
 
 
@@ -30,18 +30,18 @@ Solved = tuple[Floats, Flags]
 def directions(
     gramian: Floats, remainder: Floats, present: Flags, norms: Pairs, cosines: Pairs, exact: Exact
 ) -> int:
-    """Fills norms [K] and cosines [K, K], zero for views that are not present.
+    """Fill in norms [K] and cosines [K, K], with zeros for views that are not present.
 
     Args:
         gramian: [K, K].
-        remainder: [K, K] what rounding took from it; not looked at for 16 digits.
+        remainder: [K, K] rounding residual of the Gramian, unused for 16 digits.
         present: [K].
         norms: [K] numbers.
         cosines: [K, K] numbers.
         exact: True for 32 digits, None for 16.
 
     Returns:
-        How many views are present.
+        The number of views that are present.
     """
     count = 0
     clear(norms)
@@ -63,7 +63,7 @@ def directions(
 
 @strict_device
 def limited(cosine: Pair) -> Pair:
-    """A cosine, within -1 and 1."""
+    """Return a cosine clipped to [-1, 1]."""
     if cosine[0] > 1.0:
         return 1.0, 0.0
     if cosine[0] < -1.0:
@@ -73,7 +73,7 @@ def limited(cosine: Pair) -> Pair:
 
 @strict_device
 def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
-    """The square of the sum of v_k times the k-th direction."""
+    """Return the square of the sum of v_k times the k-th direction."""
     total = 0.0, 0.0
     for i in range(len(v)):
         if v[i, 0] != 0.0:
@@ -84,14 +84,14 @@ def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def cancels(v: Pairs, cosines: Pairs, exact: Exact) -> bool:
-    """Whether only rounding noise is left of the sum of v_k times the k-th direction."""
+    """Return whether the sum of v_k times the k-th direction is only rounding noise."""
     longest = np.abs(v[:, 0]).max()
     return form(v, cosines, exact)[0] <= CANCELLED * longest * longest
 
 
 @strict_device
 def present_in(problem: Polyhedron) -> int:
-    """How many directions there are."""
+    """Return the number of directions that are present."""
     count = 0
     for k in range(problem.active.size):
         if problem.cosines[k, k, 0] > 0.0:
@@ -101,9 +101,10 @@ def present_in(problem: Polyhedron) -> int:
 
 @strict_device
 def what_is_left(problem: Polyhedron, x: Pairs) -> float:
-    """Factor for coefficients x of a result: 0 where it is what opposite directions leave.
+    """Return a factor for coefficients x: 0 if opposite directions leave only rounding noise.
 
-    Of two directions those with 1 + cos up to 1e-12 are opposite; see `share_left` for more.
+    Two directions are opposite if 1 + cos is at most 1e-12. `share_left` describes the rule for
+    more directions.
     """
     if present_in(problem) > 2:
         return share_left(problem, x)

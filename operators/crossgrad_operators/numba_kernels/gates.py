@@ -1,4 +1,4 @@
-"""Running statistics of operators that remember earlier steps."""
+"""Running statistics for operators that use earlier steps."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: A norm this close to its target, relative to the mean norm, has met it.
+#: A norm has reached its target if it is this close to it, relative to the mean norm.
 MET = 1e-9
 
 
@@ -20,16 +20,16 @@ MET = 1e-9
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
-    """[B, K, K] pairs that have probably been conflicting; `moments` are updated in place.
+    """Return the pairs [B, K, K] that have probably been conflicting, and update `moments`.
 
     Args:
         moments: [B, 3, K, K] raw exponential averages of the cosine and its square, and the number
-            of updates. Pairs without a product are not counted.
+            of updates, changed in place. Pairs with a zero product are not counted.
         gramians: [B, K, K].
         present: [B, K].
         beta: Decay of the averages.
-        score: -mean / sqrt(variance / n_eff + 1e-12) from which a conflict is believed.
-        warmup: Updates of a pair before that.
+        score: Value of -mean / sqrt(variance / n_eff + 1e-12) above which a pair conflicts.
+        warmup: Number of updates of a pair before it may conflict.
     """
     blocks, views, _ = gramians.shape
     gates = np.zeros((blocks, views, views), np.bool_)
@@ -56,7 +56,7 @@ def confident(
 
 @strict_device
 def _scale(logs: Floats, active: Flags) -> None:
-    """Shifts log weights so that the active weights add up to their number."""
+    """Shift log weights so that the sum of the active weights equals their number."""
     largest = -np.inf
     count = 0
     for s in range(logs.size):
@@ -75,7 +75,7 @@ def _scale(logs: Floats, active: Flags) -> None:
 
 @strict_device
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
-    """Lengths [S] of the sums over each group; zero where the sum is no more than rounding."""
+    """Fill in lengths [S] of the sums over each group, or zeros for mere rounding noise."""
     views = group.size
     longest = np.zeros(lengths.size)
     lengths[:] = 0.0
@@ -92,12 +92,12 @@ def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
 def follow_losses(
     logs: Floats, gramians: Floats, group: Indices, rates: Floats, alpha: float, lr: float
 ) -> Floats:
-    """[B, K] GradNorm weights of this step; `logs` are the log weights of the next one after it.
+    """Return GradNorm weights [B, K] of this step, and update `logs` for the next step.
 
     Args:
-        logs: [B, S] log weights.
+        logs: [B, S] log weights, changed in place.
         gramians: [B, K, K].
-        group: [K] group of each view, below S.
+        group: [K] group index of each view, below S.
         rates: [S] relative losses.
         alpha: Exponent of the rates.
         lr: Step of a log weight.

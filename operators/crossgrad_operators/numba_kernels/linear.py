@@ -1,4 +1,4 @@
-"""Linear algebra of matrices of a few rows, accurate for graded ones."""
+"""Linear algebra of small matrices, accurate for graded matrices."""
 
 import numpy as np
 
@@ -19,21 +19,21 @@ from crossgrad_operators.numba_kernels.digits import (
 )
 from crossgrad_operators.numba_kernels.normal import Floats, Indices
 
-#: Smallest pivot of a Cholesky factor of cosines. Smaller ones are rounding noise of a singular
-#: matrix; the solution is then dominated by the null vector, which is what callers look for.
+#: Smallest pivot of a Cholesky factor of cosines. Smaller pivots are rounding noise of a singular
+#: matrix. The null vector, which callers look for, then dominates the solution.
 PIVOT = 1e-15
 
-#: Sweeps of Jacobi's method; six are enough for sixteen rows, eight for 32 digits.
+#: Greatest number of Jacobi sweeps. Six are enough for 16 rows, and eight with 32 digits.
 SWEEPS = 30
 #: With 32 digits, off-diagonal elements up to this share of the diagonal ones count as zero.
 NEGLIGIBLE = 1e-31
-#: So does this share of the largest element, whose inverse can still be squared.
+#: Elements up to this share of the largest element also count as zero. Its square is not zero.
 VANISHING = 1e-140
 
 
 @strict_kernel
 def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Floats) -> None:
-    """Solves M_SS x = r_S for positive semi-definite M of unit diagonal by Cholesky.
+    """Solve M_SS x = r_S by Cholesky, for positive semi-definite M with unit diagonal.
 
     Args:
         matrix: [K, K].
@@ -69,10 +69,11 @@ def solve(matrix: Floats, chosen: Indices, count: int, right: Floats, out: Float
 
 @strict_kernel
 def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
-    """Solves (1 + M) x = r for positive semi-definite M by Cholesky.
+    """Solve (1 + M) x = r for positive semi-definite M by Cholesky.
 
-    The pivots of 1 + M are at least 1; where rounding says otherwise, M is too large for the 1 to
-    count, and x is still finite and, as the factor is regular, not uphill.
+    The pivots of 1 + M are at least 1. If a computed pivot is smaller because of rounding, M is so
+    large that the 1 does not matter. Then x is still finite and, since the factor is regular, not
+    an ascent direction.
 
     Args:
         matrix: [n, n] M.
@@ -103,10 +104,10 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
 
 @strict_kernel
 def smallest_pivot(cosines: Floats, count: int) -> float:
-    """The last pivot of Cholesky's factor with the largest pivot first; at least 0.
+    """Return the last pivot, at least 0, of a Cholesky factorization that pivots by size.
 
-    It is above the smallest eigenvalue of the first `count` rows, and seldom more than `count`
-    times.
+    It is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely more than
+    `count` times as large.
     """
     rest = cosines[:count, :count].copy()
     pivot = 1.0
@@ -130,9 +131,9 @@ def smallest_pivot(cosines: Floats, count: int) -> float:
 
 @strict_device
 def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair, Pair, Pair]:
-    """Tangent, cosine and sine of the rotation that clears what is between two of a diagonal."""
+    """Return tangent, cosine and sine of the rotation that clears an off-diagonal element."""
     theta = quotient(minus(other, one, exact), product((2.0, 0.0), between, exact), exact)
-    # Beyond this the square of theta is too large, or 1 is lost beside it.
+    # Above this limit, the square of theta overflows, or adding 1 to it has no effect.
     far = 1e150 if exact is None else 1e17
     if abs(theta[0]) > far:
         t = quotient((0.5, 0.0), theta, exact)
@@ -147,7 +148,7 @@ def _rotation(one: Pair, other: Pair, between: Pair, exact: Exact) -> tuple[Pair
 
 @strict_device
 def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) -> None:
-    """Turns the numbers a and b at p and q of a row: c a - s b and s a + c b."""
+    """Rotate the numbers a and b at p and q of a row: c a - s b and s a + c b."""
     a, b = at(row, p), at(row, q)
     put(row, p, minus(product(cosine, a, exact), product(sine, b, exact), exact))
     put(row, q, plus(product(sine, a, exact), product(cosine, b, exact), exact))
@@ -155,7 +156,7 @@ def _turn(row: Pairs, p: int, q: int, cosine: Pair, sine: Pair, exact: Exact) ->
 
 @strict_part
 def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None:
-    """One Jacobi rotation of a matrix and of its eigenvectors, which clears the element (p, q)."""
+    """Apply a Jacobi rotation that clears the element (p, q) to a matrix and its eigenvectors."""
     between = at(matrix[p], q)
     one, other = at(matrix[p], p), at(matrix[q], q)
     t, cosine, sine = _rotation(one, other, between, exact)
@@ -174,10 +175,10 @@ def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None
 
 @strict_kernel
 def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
-    """Eigenvalues [n] of a positive semi-definite matrix, which are left on its diagonal.
+    """Return the eigenvalues [n] of a positive semi-definite matrix, also left on its diagonal.
 
-    Jacobi's method with the stopping rule |a_ij| <= eps sqrt(a_ii a_jj): small eigenvalues of
-    matrices D C D with a well-conditioned C keep their relative accuracy, whatever the diagonal D
+    The method is Jacobi's with the stopping rule |a_ij| <= eps sqrt(a_ii a_jj). Small eigenvalues
+    of a matrix D C D with a well-conditioned C are then relatively accurate for any diagonal D
     (Demmel and Veselic 1992).
 
     Args:
@@ -213,13 +214,13 @@ def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
 def lost_between(
     matrices: Floats, gramians: Floats, rounding_residuals: Floats, rounded: Floats
 ) -> Floats:
-    """[B, R, R] what rounding took from M Gram M^T: its exact value minus `rounded`.
+    """Return the rounding residuals [B, R, R] of M Gram M^T: its exact value minus `rounded`.
 
     Args:
         matrices: [B, R, K] M.
         gramians: [B, K, K].
-        rounding_residuals: [B, K, K] what rounding took from them.
-        rounded: [B, R, R].
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians.
+        rounded: [B, R, R] rounded value of M Gram M^T.
     """
     blocks, rows, views = matrices.shape
     result = np.empty(rounded.shape)

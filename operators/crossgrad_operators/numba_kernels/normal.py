@@ -1,4 +1,4 @@
-"""What counts as rounding noise in norms and cosines, which no ratio of norms can spoil."""
+"""Limits for rounding noise in norms and cosines, which hold at any ratio of norms."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,14 +7,14 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Two directions with 1 + cos up to this count as exactly opposite: what is left of them after a
-#: projection is rounding noise, which a scale-free optimizer would follow.
+#: Two directions with 1 + cos up to this value count as exactly opposite. After a projection they
+#: would leave rounding noise, which a scale-free optimizer would follow.
 OPPOSITE = 1e-12
-#: A combination whose square is up to this share of that of its longest summand is zero. For two
-#: opposite directions this is the same as `OPPOSITE`.
+#: A combination is zero if its square is at most this share of the square of its longest summand.
+#: For two opposite directions this equals `OPPOSITE`.
 CANCELLED = 2.0 * OPPOSITE
-#: |cos| up to which two directions have no product: sums that cancel round to about that.
+#: Two directions with |cos| up to this value are unrelated: cancelling sums have such an error.
 UNRELATED = 1e-14
 EPSILON = 2.220446049250313e-16
-#: Errors of float64 algorithms on K rows, in units of K eps, generously.
+#: Generous error bound of float64 algorithms on K rows, in units of K eps.
 CAUTION = 4.0

@@ -1,15 +1,15 @@
-"""The point of a polyhedron {x: x.e_k >= h_k} that is nearest to a given one, from cosines alone.
+"""The point of a polyhedron {x: x.e_k >= h_k} nearest to a given point, from cosines alone.
 
 The nearest point to sum b_k e_k is sum (b_k + y_k) e_k with y >= 0, where a multiplier y_k is
-positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all ask for such points. Where the
-e_k depend on each other the multipliers are not unique and the point is.
+positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such points. If the e_k are
+linearly dependent, the multipliers are not unique, but the point is unique.
 
-The matrix of cosines is known up to rounding, which says nothing about its smallest eigenvalues. It
-is therefore made definite by a ridge on its diagonal, which bounds the multipliers and lets them
-depend continuously on the cosines, and the ridge's effect is taken back where it matters by
-repeating the step from its own result (proximal point iteration): of a component along an
-eigenvector of eigenvalue l only (ridge / (l + ridge))^ROUNDS is missing in the end. Directions that
-are far from dependent need no second round.
+The matrix of cosines is known up to rounding, which leaves its smallest eigenvalues unknown. A
+ridge on its diagonal therefore makes it definite. The ridge bounds the multipliers, and makes them
+continuous functions of the cosines. If the effect of the ridge matters, the step is repeated from
+its own result (proximal point iteration). At the end, a component along an eigenvector of
+eigenvalue l is missing only the share (ridge / (l + ridge))^ROUNDS. Directions that are far from
+dependent need no second round.
 """
 
 from typing import NamedTuple
@@ -37,25 +37,26 @@ from crossgrad_operators.numba_kernels.digits import (
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Steps from the last result.
+#: Greatest number of proximal steps, each from the last result.
 ROUNDS = 3
-#: Smallest pivot, the square of a sine, up to which 16 digits may err.
+#: Pivot (square of a sine) up to which 16 digits may be inaccurate.
 ILL_CONDITIONED = 1e-6
-#: Changes of the set of active constraints per view and round; a sixth of it has been seen.
+#: Greatest number of changes of the active set, per view and round. A sixth of it has been seen.
 CHANGES = 12
 
 
 class Rounding(NamedTuple):
-    """Bounds that follow from the digits that the cosines have.
+    """Bounds that follow from the number of digits of the cosines.
 
     Attributes:
         exact: True for 32 digits, None for 16.
-        ridge: Added to the cosines' diagonal: above what rounding makes of a zero eigenvalue (ten
-            times K units, for long sums), below what shows in gradients of half the digits.
-        slack: A constraint counts as violated beyond this share of the terms that it is the sum of.
-        shown: What the ridge may be of a pivot before it has to be taken back.
-        noise: What rounding leaves undetermined in |sum x_k e_k|^2, as a share of sum x_k^2; also
-            what gradients of half the digits differ by that were meant to be opposite.
+        ridge: Value added to the diagonal of the cosines. It is larger than the rounding error of a
+            zero eigenvalue (ten times K units, for long sums), and too small to be visible in
+            gradients with half the digits.
+        slack: A constraint is violated if its violation exceeds this share of its terms.
+        shown: The ridge is corrected if it exceeds this share of a pivot.
+        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. It is also the difference
+            between gradients with half the digits that were meant to be opposite.
     """
 
     exact: Exact
@@ -66,24 +67,25 @@ class Rounding(NamedTuple):
 
 
 class Polyhedron(NamedTuple):
-    """One problem, its solution so far, and room to work in; numbers are pairs.
+    """A problem, its current solution, and working memory. Numbers are pairs.
 
     Attributes:
-        cosines: [K, K]; zero in rows and columns of views that have no gradient.
+        cosines: [K, K], with zeros in rows and columns of views without a gradient.
         base: [K] b.
         heights: [K] h.
         y: [K] multipliers.
-        centre: [K] multipliers that the ridge pulls to.
-        active: [K] whether a multiplier is free to be positive.
-        barred: [K] whether rounding has kept a constraint from becoming active.
-        chosen: [K] the active constraints, at the front.
+        centre: [K] multipliers towards which the ridge pulls.
+        active: [K] True if a multiplier may be positive.
+        barred: [K] True if rounding prevents a constraint from becoming active.
+        chosen: [K] indices of the active constraints, at the front.
         point: [K] b + y.
-        gradient: [K] C (b + y) - h + ridge (y - centre), the slack where y = centre.
-        factor: [K, K] L of the active cosines with their ridge, L L^T; L^T above the diagonal.
+        gradient: [K] C (b + y) - h + ridge (y - centre). It is the slack if y = centre.
+        factor: [K, K] Cholesky factor L of the active cosines with their ridge, and L^T above the
+            diagonal.
         step: [K] change of the multipliers.
-        room: [K] of whatever is being solved for.
-        ill_conditioned: [1] whether directions nearly depend on each other: 16 digits may err.
-        rounding: The digits of it all.
+        room: [K] working memory of `substitute`.
+        ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may err.
+        rounding: Bounds that follow from the number of digits.
     """
 
     cosines: Pairs
@@ -105,7 +107,7 @@ class Polyhedron(NamedTuple):
 
 @strict_part
 def polyhedron(views: int, exact: Exact) -> Polyhedron:
-    """Room for problems of K views."""
+    """Return working memory for problems of K views."""
     if exact is None:
         rounding = Rounding(exact, 1e-13, 1e-15, 1e-10, 1e-14)
     else:
@@ -131,7 +133,7 @@ def polyhedron(views: int, exact: Exact) -> Polyhedron:
 
 @strict_part
 def _slope(problem: Polyhedron) -> float:
-    """Fills the gradient; returns the largest coefficient of the terms that it adds up."""
+    """Fill in the gradient, and return the largest coefficient of its terms."""
     views, exact, ridge = problem.active.size, problem.rounding.exact, problem.rounding.ridge
     size = 0.0
     for k in range(views):
@@ -147,7 +149,7 @@ def _slope(problem: Polyhedron) -> float:
 
 @strict_part
 def _factorise(problem: Polyhedron) -> int:
-    """Lists the active constraints, factorises their matrix, and returns their number."""
+    """List the active constraints, factorize their matrix, and return their number."""
     exact, ridge = problem.rounding.exact, problem.rounding.ridge
     factor, chosen = problem.factor, problem.chosen
     count = 0
@@ -169,7 +171,7 @@ def _factorise(problem: Polyhedron) -> int:
 
 @strict_part
 def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> None:
-    """Solves L L^T x = r for the active constraints; r and x have their places among all."""
+    """Solve L L^T x = r for the active constraints. r and x are indexed by view."""
     factor, chosen, room = problem.factor, problem.chosen, problem.room
     exact = problem.rounding.exact
     for i in range(count):
@@ -183,7 +185,7 @@ def substitute(problem: Polyhedron, count: int, right: Pairs, out: Pairs) -> Non
 
 @strict_device
 def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
-    """The share of the step at which a multiplier meets zero, and which; 1 and -1 if none does."""
+    """Return the share of the step at which a multiplier becomes zero, and its index (or 1, -1)."""
     share, leaving = 1.0, -1
     for i in range(count):
         k = problem.chosen[i]
@@ -197,10 +199,10 @@ def _first_zero(problem: Polyhedron, count: int) -> tuple[float, int]:
 
 @strict_part
 def _settle(problem: Polyhedron, entered: int) -> int:
-    """Goes to the minimum of the active face, dropping constraints whose multiplier meets zero.
+    """Move to the minimum of the active face, and drop constraints with a zero multiplier.
 
     Returns:
-        The number of active constraints of the last factor.
+        The number of active constraints in the last factor.
     """
     exact = problem.rounding.exact
     while True:
@@ -231,7 +233,7 @@ def _unbar(problem: Polyhedron) -> None:
 
 @strict_device
 def forget(problem: Polyhedron) -> None:
-    """Forgets the multipliers."""
+    """Reset the multipliers and the active set."""
     clear(problem.y)
     for k in range(problem.active.size):
         problem.active[k] = False
@@ -239,12 +241,12 @@ def forget(problem: Polyhedron) -> None:
 
 @strict_part
 def approach(problem: Polyhedron) -> int:
-    """Multipliers of the nearest point while the ridge pulls to `centre`, from the present ones.
+    """Improve the multipliers of the nearest point while the ridge pulls towards `centre`.
 
-    Lawson and Hanson's algorithm.
+    The method is the algorithm of Lawson and Hanson.
 
     Returns:
-        The number of active constraints, whose factor is that of `substitute`.
+        The number of active constraints, whose factor `substitute` can use.
     """
     views, share = problem.active.size, problem.rounding.slack
     _unbar(problem)
@@ -269,9 +271,9 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Whether the ridge does not show: all active directions are far from dependent.
+    """Return whether the ridge is not visible, because active directions are far from dependent.
 
-    Notes whether they are so near that more digits are due.
+    The function also sets `ill_conditioned` if the directions require more digits.
     """
     least, count = 1.0, 0
     for k in range(problem.active.size):
@@ -286,7 +288,7 @@ def is_settled(problem: Polyhedron) -> bool:
 
 @strict_part
 def project(problem: Polyhedron) -> None:
-    """Multipliers of the nearest point."""
+    """Fill in the multipliers of the nearest point."""
     forget(problem)
     for _ in range(ROUNDS):
         copy(problem.y, problem.centre)
@@ -297,7 +299,7 @@ def project(problem: Polyhedron) -> None:
 
 @strict_part
 def square(problem: Polyhedron, x: Pairs) -> Pair:
-    """|sum x_k e_k|^2."""
+    """Return |sum x_k e_k|^2."""
     views, exact = problem.active.size, problem.rounding.exact
     total = (0.0, 0.0)
     for k in range(views):
@@ -308,9 +310,9 @@ def square(problem: Polyhedron, x: Pairs) -> Pair:
 
 @strict_part
 def share_left(problem: Polyhedron, x: Pairs) -> float:
-    """Factor for coefficients x: 0 where nothing but rounding noise is left of their sum.
+    """Return a factor for coefficients x: 0 if their sum is only rounding noise.
 
-    From there on the share grows continuously, to 1 at twice the square.
+    Above the noise, the factor grows continuously. It reaches 1 at twice the squared noise.
     """
     noise = problem.rounding.noise * products(x, x, 0, problem.active.size, None)[0]
     if noise == 0.0:

@@ -1,6 +1,6 @@
-"""Pairwise projections: each gradient is changed against the others, one after the other.
+"""Pairwise projections: each gradient is changed against each other gradient in turn.
 
-A vector v is a sum of unit gradients; its coefficients are numbers of 16 or 32 digits.
+A vector v is a sum of unit gradients. Its coefficients are numbers of 16 or 32 digits.
 """
 
 import numpy as np
@@ -35,14 +35,14 @@ from crossgrad_operators.numba_kernels.normal import (
 
 @strict_device
 def _start(v: Pairs, i: int) -> None:
-    """Makes v the direction of g_i."""
+    """Set v to the direction of g_i."""
     clear(v)
     v[i, 0] = 1.0
 
 
 @strict_device
 def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
-    """Coefficients of unit vectors, in units of |g_i|, as coefficients of the gradients."""
+    """Convert coefficients of unit vectors, in units of |g_i|, to coefficients of gradients."""
     for k in range(len(v)):
         if v[k, 0] != 0.0:
             ratio = quotient(at(norms, i), at(norms, k), exact)
@@ -51,7 +51,7 @@ def _as_row(v: Pairs, norms: Pairs, i: int, row: Floats, exact: Exact) -> None:
 
 @strict_device
 def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
-    """The length of a projected vector; it becomes zero where only rounding noise is left."""
+    """Return the length of a projected vector, which is set to zero if it is rounding noise."""
     square, longest = form(v, cosines, exact), np.abs(v[:, 0]).max()
     if square[0] <= CANCELLED * longest * longest:
         clear(v)
@@ -61,13 +61,13 @@ def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def _is_opposite(cosine: Pair, exact: Exact) -> bool:
-    """Whether 1 + cos is rounding noise."""
+    """Return whether 1 + cos is rounding noise."""
     return plus(ONE, cosine, exact)[0] <= OPPOSITE
 
 
 @strict_device
 def _conflicts(along: Pair, size: Pair, least: Pair, exact: Exact) -> bool:
-    """Whether a cosine along / size is below -least."""
+    """Return whether the cosine along / size is below -least."""
     return along[0] < 0.0 and plus(along, product(least, size, exact), exact)[0] < 0.0
 
 
@@ -81,23 +81,23 @@ def projected(
     rule: tuple[float, float],
     exact: Exact,
 ) -> Floats:
-    """[B, K, K] rows v_i: g_i without (a share of) its components against the others.
+    """Return rows v_i [B, K, K]: g_i without (a share of) its components against the others.
 
     For i, for j in order[i]: if cos(v, g_j) < -threshold, v -= strength (v.g_j / |g_j|^2) g_j, with
-    the original g_j. A v that is exactly opposite to g_j becomes exactly zero at full strength, and
-    so does one of which less than 1.4e-6 of its longest summand is left.
+    the original g_j. At full strength, a v exactly opposite to g_j becomes exactly zero. A v also
+    becomes zero if its length is below 1.4e-6 of its longest summand.
 
     Args:
         gramians: [B, K, K].
-        rounding_residuals: [B, K, K] what rounding took from them; not looked at for 16 digits.
+        rounding_residuals: [B, K, K] rounding residuals of the Gramians, unused for 16 digits.
         present: [B, K].
-        order: [K, K] for each i the order of the partners (i itself is passed over).
-        gates: [B, K, K] whether i may be projected along j at all.
+        order: [K, K] order of the partners of each i, where i itself is skipped.
+        gates: [B, K, K] True if i may be projected along j.
         rule: Threshold, 0 or more, and strength, from 0 to 1.
         exact: True for 32 digits, None for 16.
     """
     threshold, strength = rule
-    # Without a threshold the rule is continuous, and the sign of zero makes no difference.
+    # Without a threshold the rule is continuous, so the sign of zero does not matter.
     margin = 0.0 if threshold == 0.0 else OPPOSITE
     least = plus((threshold, 0.0), (margin, 0.0), exact)
     blocks, views, _ = gramians.shape
@@ -129,7 +129,7 @@ def projected(
 
 @strict_device
 def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
-    """What errors of the cosines grow by on their way to a target, or through it to the result."""
+    """Return the growth of the cosines' errors on the way to a target, or to the result."""
     share = np.abs(v[:, 0]).max() / size
     steep = 1.0 + abs(t) / np.sqrt((1.0 - t) * (1.0 + t))
     across = max(np.sqrt((1.0 - phi) * (1.0 + phi)), 1e-6)
@@ -138,14 +138,14 @@ def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
 
 @strict_device
 def _sine(cosine: Pair, exact: Exact) -> Pair:
-    """The sine of an angle between 0 and pi."""
+    """Return the sine of an angle between 0 and pi."""
     one, other = minus(ONE, cosine, exact), plus(ONE, cosine, exact)
     return root(product(one, other, exact), exact)
 
 
 @strict_device
 def _moved(target: float, phi: Pair, beta: float, exact: Exact) -> float:
-    """(1 - beta) t + beta phi, kept within +-0.999."""
+    """Return (1 - beta) t + beta phi, clipped to +-0.999."""
     kept = product(minus(ONE, (beta, 0.0), exact), (target, 0.0), exact)
     moved = plus(kept, product((beta, 0.0), phi, exact), exact)[0]
     return min(max(moved, -0.999), 0.999)
@@ -162,24 +162,24 @@ def aligned_to_targets(
     unit: float,
     exact: Exact,
 ) -> Solved:
-    """Rows v_i of GradVac; `targets` [B, K, K] are updated in place.
+    """Return rows v_i of GradVac, and update `targets`.
 
     For i, for j in order[i]: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of g_j that
-    raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, kept within +-0.999. What
-    leaves a v exactly zero is as in `projected`.
+    raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999. A v
+    becomes exactly zero under the same conditions as in `projected`.
 
     Args:
         gramians: [B, K, K].
         rounding_residuals: As in `projected`.
         present: [B, K].
         order: [K, K].
-        targets: [B, K, K].
+        targets: [B, K, K], changed in place.
         beta: Weight of the newest cosine.
-        unit: Relative error from which a result of 16 digits is doubtful.
+        unit: Relative error above which a result of 16 digits is ill-conditioned.
         exact: True for 32 digits, None for 16.
 
     Returns:
-        [B, K, K] rows, and [B] whether they, or the targets, are doubtful.
+        [B, K, K] rows, and [B] True if rows or targets are ill-conditioned.
     """
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)

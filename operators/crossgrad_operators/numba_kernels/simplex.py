@@ -1,13 +1,14 @@
 """Minima over convex combinations of the gradients (MGDA, CAGrad).
 
-Weights w on the simplex are held as x_k = w_k |g_k| / s, s the smallest norm, so that whatever the
-ratio of the norms the combination is sum x_k e_k with cosines alone, and the constraint reads
-sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor both methods ask for the nearest point of a
+Weights w on the simplex are stored as x_k = w_k |g_k| / s, where s is the smallest norm. At any
+ratio of norms, the combination is then sum x_k e_k, which needs only the cosines. The constraint is
+sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor, both methods need the nearest point of a
 polyhedron {x: x.e_k >= level r_k}:
 
-- MGDA: its nearest point to 0 at any level is the direction of the shortest combination.
+- MGDA: at any level, the polyhedron's nearest point to 0 has the direction of the shortest
+  combination.
 - CAGrad: the direction d with the largest min_k g_k.d in the ball of radius rho about g_0 is the
-  nearest point to g_0 at the level at which that is as far away as rho.
+  nearest point to g_0 at the level for which its distance from g_0 is rho.
 """
 
 from typing import NamedTuple
@@ -52,14 +53,14 @@ from crossgrad_operators.numba_kernels.polyhedron import (
     substitute,
 )
 
-#: Levels that are tried before the last one stands; a handful is usual.
+#: Greatest number of levels that are tried. About five are usual.
 LEVELS = 60
-#: A level stands if the active constraints stay the same and it changes by no more than this share
-#: (or changes back): the next rounds take up what is left.
+#: The level is accepted if the active constraints stay the same, and if its change is at most this
+#: share or reverses. The next rounds correct the remaining error.
 CLOSE = 1e-6
-#: The share of rho^2 that the ridge adds to the distance from which on directions may cancel.
+#: Directions may cancel if the ridge adds more than this share of rho^2 to the distance.
 HELD_BY_RIDGE = 1e-5
-#: A squared distance this close to another one is equal to it.
+#: Two squared distances are equal if their relative difference is at most this value.
 TIE = 1e-9
 #: Smallest square of the sine between two gradients that are combined.
 PIVOT = 1e-15
@@ -67,7 +68,7 @@ PIVOT = 1e-15
 
 @strict_device
 def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
-    """Fills r_k = s / |g_k|, zero for views that are not present."""
+    """Fill in r_k = s / |g_k|, with zeros for views that are not present."""
     shortest = -1
     for k in range(present.size):
         if present[k] and (shortest < 0 or norms[k, 0] < norms[shortest, 0]):
@@ -80,7 +81,7 @@ def _reciprocals(norms: Pairs, present: Flags, r: Pairs, exact: Exact) -> None:
 
 @strict_device
 def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
-    """Fills x [2] with the shortest of the two gradients and their combinations."""
+    """Fill in x [2] for the shortest vector among two gradients and their combinations."""
     one, other = r[0, 0], r[1, 0]
     x[0, 0], x[1, 0] = 1.0 / one, 0.0
     best = x[0, 0] * x[0, 0]
@@ -101,7 +102,7 @@ def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
 
 @strict_section
 def _shortest(problem: Polyhedron, x: Pairs) -> float:
-    """Fills x and returns the share of it that is not rounding noise; heights are r."""
+    """Fill in x, and return its share that is not rounding noise. The heights are r."""
     exact, r = problem.rounding.exact, problem.heights
     if len(x) == 2 and exact is None and r[0, 0] > 0.0 and r[1, 0] > 0.0:
         _mgda_pair(problem.cosines[0, 1, 0], r, x)
@@ -115,7 +116,7 @@ def _shortest(problem: Polyhedron, x: Pairs) -> float:
 
 @strict_kernel
 def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """[B, K] weights of the shortest convex combination; zero where that is zero to rounding."""
+    """Return weights [B, K] of the shortest convex combination, or zeros if its length is noise."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)
@@ -136,12 +137,12 @@ def mgda(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Ex
 
 
 class Search(NamedTuple):
-    """CAGrad as a search: for the level at which the nearest point to g_0 is at distance rho.
+    """The search of CAGrad for the level at which the nearest point to g_0 is at distance rho.
 
     Attributes:
         q: [K] e_k.g_0.
         r: [K] s / |g_k|.
-        rho: Square of the distance, and the distance.
+        rho: The square of the distance, and the distance.
     """
 
     q: Pairs
@@ -151,7 +152,7 @@ class Search(NamedTuple):
 
 @strict_device
 def _limits(search: Search) -> tuple[float, float]:
-    """Levels below which no constraint is active, and at which a single one is as far as rho."""
+    """Return the levels below which no constraint is active, and at which one is at rho."""
     low, high = np.inf, np.inf
     for k in range(len(search.r)):
         q, r = search.q[k, 0], search.r[k, 0]
@@ -162,11 +163,11 @@ def _limits(search: Search) -> tuple[float, float]:
 
 @strict_device
 def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge: float) -> Pair:
-    """Change of the level that brings the nearest point to distance rho on the active face.
+    """Return the level change that moves the nearest point on the active face to distance rho.
 
-    With the slope a = C^-1 r of the multipliers the square of the distance is a quadratic function
-    of the change. Infinite where no constraint is active, or the rounding of huge multipliers
-    leaves nothing of the distance.
+    With the slope a = C^-1 r of the multipliers, the squared distance is a quadratic function of
+    the change. The change is infinite if no constraint is active, or if the rounding error of huge
+    multipliers exceeds the distance.
     """
     exact, slope = problem.rounding.exact, problem.step
     substitute(problem, count, search.r, slope)
@@ -174,7 +175,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     for i in range(count):
         k = problem.chosen[i]
         y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
-        # C y and C a on the active face, where C y + q - level r + ridge (y - centre) = 0.
+        # On the active face C y + q - level r + ridge (y - centre) = 0, which gives C y and C a.
         pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
         force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
         turn = minus(r, (ridge * a[0], ridge * a[1]), exact)
@@ -189,7 +190,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 
 @strict_device
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
-    """Whether the ridge alone holds the multipliers: what they add up to is their rounding."""
+    """Return whether only the ridge bounds the multipliers, so that their sum is rounding noise."""
     total = 0.0
     for k in range(len(search.r)):
         moved = problem.y[k, 0] - problem.centre[k, 0]
@@ -199,7 +200,7 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 
 @strict_device
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
-    """Whether the active constraints are those noted last; notes them."""
+    """Return whether the active constraints equal the last stored ones, and store them."""
     same = True
     for k in range(before.size):
         same &= before[k] == problem.active[k]
@@ -209,10 +210,10 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
 
 @strict_section
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
-    """The level at which the nearest point is at distance rho, and its multipliers.
+    """Return the level at which the nearest point is at distance rho, and fill in multipliers.
 
-    The distance is a convex, increasing function of the level, of which one piece after the other
-    is solved; where that leaves the interval that holds the solution, it is halved instead.
+    The distance is a convex, increasing function of the level. Its pieces are solved one after the
+    other. If a solution leaves the interval that contains the level, the interval is halved.
     """
     exact, before = problem.rounding.exact, np.zeros(problem.active.size, np.bool_)
     low, high = _limits(search)
@@ -240,12 +241,12 @@ def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) 
 
 @strict_section
 def _reach(problem: Polyhedron, search: Search) -> None:
-    """Raises the level of all constraints until the nearest point is as far away as rho."""
+    """Raise the level of all constraints until the nearest point is at distance rho."""
     forget(problem)
     level = (_limits(search)[1], 0.0)
     for turn in range(ROUNDS):
         copy(problem.y, problem.centre)
-        # In the first round the ridge counts as part of the directions: nothing cancels then.
+        # In the first round the ridge counts as part of the directions, so nothing cancels.
         ridge = problem.rounding.ridge if turn > 0 else 0.0
         level = _find_level(problem, search, level, ridge)
         if is_settled(problem) or share_left(problem, problem.y) == 0.0:
@@ -254,10 +255,11 @@ def _reach(problem: Polyhedron, search: Search) -> None:
 
 @strict_section
 def _defined(problem: Polyhedron, search: Search) -> float:
-    """The share of CAGrad's direction that is defined; forgets no multipliers.
+    """Return the share of CAGrad's direction that is defined, and keep the multipliers.
 
-    It is not where 0 is a convex combination of the gradients, so that no level above 0 can be
-    reached, and level 0 is within the distance: then all directions of a whole set are as good.
+    The direction is undefined if 0 is a convex combination of the gradients, so that no level above
+    0 can be reached, and if level 0 is within the distance. Then a whole set of directions is
+    equally good.
     """
     largest, rho = 0.0, search.rho[0][0]
     for k in range(len(search.r)):
@@ -281,11 +283,11 @@ def _defined(problem: Polyhedron, search: Search) -> float:
 
 @strict_device
 def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, float, float]:
-    """Weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of the two), for 1 = n1 >= n2.
+    """Return the weight of g_1 in g_w, |g_w| and |g_0| (g_0 the mean of both), for 1 = n1 >= n2.
 
     The objective (a - b) x / 2 + c |g_0| sqrt(D (x - x_0)^2 + h^2) is convex in x. Sums of squares
-    are arranged so that nothing cancels but the cosine itself, and the weight that may be tiny is
-    that of the longer gradient.
+    are arranged so that only the cosine itself can cancel. The returned weight belongs to the
+    longer gradient, because this weight may be tiny.
     """
     product = n1 * n2
     gap = (n1 - n2) * (n1 - n2)
@@ -309,7 +311,7 @@ def _cagrad_pair(n1: float, n2: float, cosine: float, c: float) -> tuple[float, 
 
 @strict_part
 def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
-    """Fills the weights [2] of two gradients."""
+    """Fill in the weights [2] of two gradients."""
     i, j = (0, 1) if norms[0, 0] >= norms[1, 0] else (1, 0)
     longest = norms[i, 0]
     share, length, mean = _cagrad_pair(1.0, norms[j, 0] / longest, cosine, c)
@@ -321,7 +323,7 @@ def _cagrad_two(norms: Pairs, cosine: float, c: float, result: Floats) -> None:
 
 @strict_device
 def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
-    """The search from the mean, in units of the longest gradient; r are the heights so far."""
+    """Return the search from the mean, in units of the longest gradient. The heights are r."""
     exact, views = problem.rounding.exact, len(norms)
     longest, count = longest_of(norms)
     r = np.empty((views, 2))
@@ -338,10 +340,10 @@ def _set_out(problem: Polyhedron, norms: Pairs, q: Pairs, c: float) -> Search:
 
 @strict_section
 def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
-    """Fills the weights [K] of at least two gradients; q is room to work in.
+    """Fill in the weights [K] of at least two gradients. q is working memory.
 
-    Where the mean, or a convex combination of the gradients, vanishes the direction is undefined,
-    and zero by convention.
+    If the mean or a convex combination of the gradients is zero, the direction is undefined, and
+    the result is zero by convention.
     """
     exact, views = problem.rounding.exact, len(norms)
     search = _set_out(problem, norms, q, c)
@@ -363,7 +365,7 @@ def _cagrad_many(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: 
 
 @strict_device
 def _least_cosine(problem: Polyhedron) -> float:
-    """The smallest cosine between two views that are present."""
+    """Return the smallest cosine between two views that are present."""
     least, cosines = 1.0, problem.cosines
     for i in range(len(cosines)):
         for j in range(i):
@@ -374,7 +376,7 @@ def _least_cosine(problem: Polyhedron) -> float:
 
 @strict_section
 def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
-    """Fills the weights [K] of one block; the heights are r."""
+    """Fill in the weights [K] of one block. The heights are r."""
     views, exact = len(norms), problem.rounding.exact
     _, count = longest_of(norms)
     cosine = _least_cosine(problem)
@@ -393,7 +395,7 @@ def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Float
 def cagrad(
     gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact, c: float
 ) -> Solved:
-    """[B, K] weights 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
+    """Return weights [B, K] 1/K + c |g_0| w_k / |g_w| of CAGrad's direction, without rescaling."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

@@ -1,1 +1,1 @@
-"""Stiff and extreme gradients against exact arithmetic, for every registered operator."""
+"""Tests of every registered operator on extreme gradients, against exact arithmetic."""

@@ -1,4 +1,4 @@
-"""The inputs of the suite: K gradients, short enough to be exact about or repeating themselves."""
+"""Inputs of the suite: K gradients that are short enough for exact sums, or periodic."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,23 +10,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Rows = NDArray[np.float64]
-#: Elements of the largest cases, and of the largest one that is computed exactly.
+#: Elements of the largest cases, and elements of the largest case without repetition.
 LARGE = 10_000_000
 EXACT = 10_000
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """K gradients of P = H + R * Q elements: a head, then R copies of a pattern.
+    """K gradients of P = H + R * Q elements: a head, followed by R copies of a pattern.
 
-    Whatever is linear in the elements, as Gramians are, then has a closed form however large P is.
+    Quantities that are sums over elements, such as Gramians, then have a closed form for any P.
 
     Attributes:
-        name: Shown in the table.
+        name: Name in the table.
         head: [K, H] float64.
         pattern: [K, Q] float64.
         copies: R.
-        dtype: Type of the gradients; head and pattern are rounded to it.
+        dtype: Type of the gradients. Head and pattern are rounded to it.
         absent: Views that do not touch the block.
     """
 
@@ -39,26 +39,26 @@ class Case:
 
     @property
     def views(self) -> int:
-        """K."""
+        """The number of views K."""
         return len(self.head)
 
     @property
     def size(self) -> int:
-        """P."""
+        """The number of elements P."""
         return int(self.head.shape[1] + self.copies * self.pattern.shape[1])
 
     @cached_property
     def exact_head(self) -> Rows:
-        """[K, H] the head as the operator gets it: rounded, zero where absent."""
+        """[K, H] the head as the operator receives it: rounded, and zero for absent views."""
         return self._rounded(self.head)
 
     @cached_property
     def exact_pattern(self) -> Rows:
-        """[K, Q] the pattern as the operator gets it: rounded, zero where absent."""
+        """[K, Q] the pattern as the operator receives it: rounded, and zero for absent views."""
         return self._rounded(self.pattern)
 
     def gradients(self) -> list[Tensor | None]:
-        """The K gradients, made afresh."""
+        """Return new tensors with the K gradients, or None for absent views."""
         head = torch.from_numpy(self.exact_head).to(self.dtype)
         pattern = torch.from_numpy(self.exact_pattern).to(self.dtype)
         return [
@@ -78,13 +78,13 @@ def short(
     dtype: torch.dtype = torch.float32,
     absent: frozenset[int] = frozenset(),
 ) -> Case:
-    """A case without repetition; `rows` is [K, P]."""
+    """Return a case without repetition. `rows` is [K, P]."""
     head = np.asarray(rows, np.float64)
     return Case(name, head, np.zeros((len(head), 0)), 0, dtype, absent)
 
 
 def cases(large: int = LARGE, exact: int = EXACT) -> list[Case]:
-    """All inputs; the largest ones have `large` elements, repeating; `exact` otherwise."""
+    """Return all cases. Periodic cases have up to `large` elements, other cases up to `exact`."""
     return [
         *_ordinary(exact),
         *_ratios(),
@@ -114,7 +114,7 @@ def _ordinary(exact: int) -> Iterator[Case]:
 
 
 def _ratios() -> Iterator[Case]:
-    """Norm ratios at cosine -1/2."""
+    """Yield cases with large norm ratios at cosine -1/2."""
     for power in (3, 6, 12, 20, 30):
         yield short(f"ratio 1e{power}", _at_cosine(-0.5, 1.0, 10.0**-power))
     yield short("ratio 1e30 up", _at_cosine(-0.5, 1e-15, 1e15))
@@ -131,7 +131,7 @@ def _at_cosine(cosine: float, first: float, second: float) -> Rows:
 
 
 def _angles() -> Iterator[Case]:
-    """Cosines close to -1 and +1; eps is the sine."""
+    """Yield cases with cosines close to -1 and +1, where eps is the sine."""
     for eps in (1e-2, 1e-4, 1e-5):
         yield short(f"cos -1 + {eps**2 / 2:.0e}", [[1.0, 0.0], [-1.0, eps]])
         yield short(f"cos 1 - {eps**2 / 2:.0e}", [[1.0, 0.0], [1.0, eps]])
@@ -191,7 +191,7 @@ def _not_finite() -> Iterator[Case]:
 def _many_views() -> Iterator[Case]:
     for views in (1, 3, 4, 5, 8, 12, 16):
         yield short(f"K = {views}", _rng(20 + views).standard_normal((views, 40)))
-    # Pairwise cosines of about -0.04: everything conflicts with everything.
+    # Pairwise cosines are about -0.04, so each view conflicts with all other views.
     rows = _centred(_rng(40).standard_normal((16, 60)))
     yield short("K = 16, all conflict", rows)
     rows = _rng(41).standard_normal((8, 40)) * 10.0 ** np.linspace(0, 12, 8)[:, None]

@@ -1,4 +1,4 @@
-"""`crossgrad stress`: operators against exact arithmetic on stiff and extreme gradients."""
+"""`crossgrad stress`: comparison of operators with exact arithmetic on extreme gradients."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 
 #: Elements of the largest gradients.
 LARGE = 10_000_000
-#: Option -> the kinds of run that it does something for; "" are the fixed cases.
+#: Option -> the kinds of run that use it. "" means the fixed cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {
     "--case": ("",),
     "--elements": ("",),
     "--type": ("--search", "--matrices", "--rows"),
     "--seed": ("--search", "--matrices"),
 }
-#: Seconds between two lines about the progress of a search.
+#: Seconds between two progress messages of a search.
 PAUSE = 10.0
 
 
-#: Types of gradients, as torch has them.
+#: Types of gradients, as torch dtypes.
 Types: TypeAlias = "tuple[torch.dtype, ...]"
 
 
 class Precision(StrEnum):
-    """Types of gradients that a search runs."""
+    """The type of gradients in a search."""
 
     FLOAT32 = "float32"
     FLOAT64 = "float64"
@@ -51,7 +51,7 @@ class Precision(StrEnum):
 
     @property
     def dtypes(self) -> Types:
-        """As torch has them."""
+        """The types as torch dtypes."""
         import torch
 
         both = {"float32": torch.float32, "float64": torch.float64}
@@ -98,7 +98,8 @@ class Options:
 def stress(given: Options) -> None:
     """Hold operators against exact arithmetic on extreme gradients.
 
-    Results are compared with 50 digits; exit status 1 if an operator breaks its promise.
+    Results are compared with 50-digit arithmetic. The exit status is 1 if an operator breaks its
+    promise.
     """
     announce()
     _refuse_idle(given)
@@ -123,7 +124,7 @@ def stress(given: Options) -> None:
 
 
 def _refuse_idle(given: Options) -> None:
-    """Refuses options that the chosen kind of run does nothing with."""
+    """Refuse options that have no effect in the chosen kind of run."""
     modes = {"--search": given.search, "--matrices": given.matrices, "--rows": given.rows}
     others = {
         "--case": given.case,
@@ -213,7 +214,7 @@ def _matrices(
 
 
 class _Clock:
-    """Prints how far a search is, now and then."""
+    """Prints the progress of a search at intervals."""
 
     def __init__(self) -> None:
         self._progress = Progress(PAUSE)

@@ -1,6 +1,6 @@
-"""Exact Gramians and norms as 50-digit numbers, and small linear algebra on them.
+"""Exact Gramians and norms as 50-digit numbers, and linear algebra for small matrices.
 
-The numbers are those of mpmath, a test dependency.
+The numbers are from mpmath, which is a test dependency.
 """
 
 from collections.abc import Sequence
@@ -11,24 +11,24 @@ import numpy as np
 from crossgrad_core.plugin import UserError
 from crossgrad_operators.stress.cases import Case, Rows
 
-#: A 50-digit number; mpmath carries no types.
+#: A 50-digit number. mpmath has no type annotations.
 Number: TypeAlias = Any
 Matrix: TypeAlias = list[list[Number]]
 DIGITS = 50
-#: Binary digits that products of float64 numbers span: a sum of that precision is exact.
+#: Range of products of float64 numbers in binary digits. Sums with this precision are exact.
 _RANGE = 4300
 Vector = list[Number]
-#: Relative size of a pivot that counts as zero; exact singularity shows at about 1e-50.
+#: Relative size of a pivot that counts as zero. Exactly singular matrices have about 1e-50.
 SINGULAR = "1e-35"
-#: A multiple of a direction that is not reached before some entry meets zero.
+#: A multiple of a direction that is large enough for some entry to reach zero first.
 FAR = 10**30
 
 
 def require_mpmath() -> Any:  # noqa: ANN401 - untyped
-    """The module mpmath.
+    """Return the module mpmath.
 
     Raises:
-        UserError: It is not installed.
+        UserError: mpmath is not installed.
     """
     try:
         import mpmath
@@ -41,12 +41,12 @@ def require_mpmath() -> Any:  # noqa: ANN401 - untyped
 
 
 def number(value: object) -> Number:
-    """A 50-digit number."""
+    """Return a 50-digit number."""
     return require_mpmath().mp.mpf(value)
 
 
 def exact_gramian(case: Case) -> Matrix:
-    """[K][K] Gramian of a case, zero in rows of views that are not finite."""
+    """Return the Gramian [K][K] of a case, with zeros in rows of views that are not finite."""
     mpf = require_mpmath().mp.mpf
     views = case.views
     rows = _finite_rows(case)
@@ -59,13 +59,13 @@ def exact_gramian(case: Case) -> Matrix:
 
 
 def finite_views(case: Case) -> list[bool]:
-    """[K] whether each view's gradient is finite."""
+    """Return for each view [K] whether its gradient is finite."""
     both = np.concatenate([case.exact_head, case.exact_pattern], axis=1)
     return [bool(np.isfinite(row).all()) for row in both]
 
 
 def weighted_sum(weights: Sequence[Number], rows: Rows) -> list[Number]:
-    """[P] sum of weights times rows [K, P]; rows of weight 0 are left out."""
+    """Return the sum [P] of weights times rows [K, P], without rows of weight 0."""
     mp = require_mpmath().mp
     used = [(w, row) for w, row in zip(weights, rows.tolist(), strict=True) if w != 0]
     return [mp.fdot([(w, row[i]) for w, row in used]) for i in range(rows.shape[1])]
@@ -77,7 +77,7 @@ def _finite_rows(case: Case) -> tuple[Rows, Rows]:
 
 
 def _dot(a: Rows, b: Rows) -> Number:
-    """The dot product of two float64 vectors, rounded once."""
+    """Return the dot product of two float64 vectors, rounded once."""
     mp = require_mpmath().mp
     with mp.workprec(_RANGE):
         total = mp.fdot(zip(a.tolist(), b.tolist(), strict=True))
@@ -85,27 +85,27 @@ def _dot(a: Rows, b: Rows) -> Number:
 
 
 def dot(a: Sequence[Number], b: Sequence[Number]) -> Number:
-    """a.b."""
+    """Return a.b."""
     return require_mpmath().mp.fdot(zip(a, b, strict=True))
 
 
 def apply(matrix: Matrix, x: Sequence[Number]) -> Vector:
-    """M x."""
+    """Return M x."""
     return [dot(row, x) for row in matrix]
 
 
 def form(matrix: Matrix, x: Sequence[Number]) -> Number:
-    """The quadratic form x^T M x."""
+    """Return the quadratic form x^T M x."""
     return dot(x, apply(matrix, x))
 
 
 def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Vector | None:
-    """Solution x of (M x)_S = right_S, zero outside the support S; None where M_SS is singular.
+    """Return x with (M x)_S = right_S and zero outside the support S, or None if M_SS is singular.
 
-    M is positive semi-definite. The solution is that of Cholesky's method, L D L^T = M_SS.
+    M is positive semi-definite. The method is Cholesky's, L D L^T = M_SS.
     """
     mp = require_mpmath().mp
-    # In units of the diagonal, so that no ratio of norms looks singular.
+    # Scale by the diagonal, so that a large ratio of norms does not look singular.
     unit = [mp.sqrt(matrix[i][i]) for i in support]
     lower: list[Vector] = []
     diagonal: Vector = []
@@ -131,11 +131,11 @@ def solve(matrix: Matrix, support: Sequence[int], right: Sequence[Number]) -> Ve
 
 
 def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
-    """Solution x >= 0 with s = M x + offset >= 0 and x.s = 0: the optimality conditions of a QP.
+    """Return x >= 0 with s = M x + offset >= 0 and x.s = 0, the optimality conditions of a QP.
 
-    Lawson and Hanson's algorithm, whose every result is checked: of the constraints that are not
-    met the worst becomes active, which it can do only if its column does not depend on the active
-    ones, or else one of them leaves; so M may be singular. None where there is no solution.
+    The algorithm of Lawson and Hanson is used, and each result is checked. The most violated
+    constraint becomes active. If its column depends on the active columns, an active constraint
+    leaves first, so M may be singular. None is returned if there is no solution.
     """
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)
@@ -157,12 +157,12 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
 def _settle(
     matrix: Matrix, offset: Sequence[Number], x: list[Number], active: set[int], entered: int
 ) -> bool:
-    """Solves for the active entries of x; those that meet zero on the way are let go."""
+    """Solve for the active entries of x, and release entries that reach zero on the way."""
     least = require_mpmath().mp.mpf("1e-300")
     while active:
         target = solve(matrix, sorted(active), [-o for o in offset])
         if target is None:
-            # The new column depends on the others: along that dependence nothing but x changes.
+            # The new column depends on the other columns, so x can move along the null vector.
             rest = sorted(active - {entered})
             along = solve(matrix, rest, [-row[entered] for row in matrix])
             if along is None or all(v >= 0 for v in along):
@@ -183,7 +183,7 @@ def _settle(
 
 
 def pivots(matrix: Matrix) -> Vector:
-    """Pivots of the Cholesky factor of a positive semi-definite matrix, the largest first."""
+    """Return the Cholesky pivots of a positive semi-definite matrix, the largest first."""
     left = [list(row) for row in matrix]
     found = []
     while left:

@@ -1,8 +1,8 @@
-"""Every method in 50 digits, from its formulas: what the operators are held against.
+"""Reference implementations (oracles) of all methods in 50 digits, from their formulas.
 
-An oracle gets the exact Gramian of the views that have a gradient and answers with their weights.
-Thresholds that are part of a method's definition here (exact opposition up to 1 + cos = 1e-12, the
-eigenvalue floor of Aligned-MTL) are part of its oracle.
+An oracle receives the exact Gramian of the views with a gradient, and returns their weights.
+Thresholds that are part of our definition of a method are part of its oracle: exact opposition up
+to 1 + cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,25 +21,25 @@ from crossgrad_operators.stress.exact import (
     require_mpmath,
 )
 
-#: 1 + cos up to which two directions are exactly opposite.
+#: Two directions with 1 + cos up to this value are exactly opposite.
 OPPOSITE = "1e-12"
-#: |cos| up to which two directions have no product: sums that cancel round to about that.
+#: Two directions with |cos| up to this value are unrelated: cancelling sums have such an error.
 UNRELATED = "1e-14"
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A question to an oracle.
+    """The input of an oracle.
 
     Attributes:
         gramian: [n][n] exact Gramian of the views that have a gradient.
-        places: [n] their positions among the K views.
+        places: [n] indices of these views among the K views.
         views: K.
         options: Options of the operator.
         labels: [n] group labels.
-        ratios: [n] camera distances over the reference distance.
-        rng: A generator in the state of the operator's.
-        memory: What the oracle remembered at the last step; it may write to it.
+        ratios: [n] camera distances divided by the reference distance.
+        rng: A generator in the same state as the operator's generator.
+        memory: Values that the oracle stored in the last step. The oracle may change them.
     """
 
     gramian: Matrix
@@ -57,50 +57,50 @@ class Question:
         return len(self.places)
 
 
-#: [n] weights.
+#: A function that returns [n] weights.
 Oracle = Callable[[Question], Vector]
 
 
 def lengths(gramian: Matrix) -> Vector:
-    """[n] norms."""
+    """Return the norms [n]."""
     mp = require_mpmath().mp
     return [mp.sqrt(gramian[k][k]) for k in range(len(gramian))]
 
 
 def cosines(gramian: Matrix) -> Matrix:
-    """[n][n] cosines."""
+    """Return the cosines [n][n]."""
     n = lengths(gramian)
     size = range(len(n))
     return [[gramian[i][j] / n[i] / n[j] for j in size] for i in size]
 
 
 def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
-    """Whether sum x_k e_k is what exactly opposite directions leave."""
+    """Return whether sum x_k e_k is only rounding noise of exactly opposite directions."""
     return cancels(form(cosine, x), max(abs(v) for v in x))
 
 
 def cancels(square: Number, largest: Number) -> bool:
-    """Whether a sum of this square, with a longest summand of this length, counts as zero."""
+    """Return whether a sum counts as zero, from its square and its longest summand's length."""
     return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
 
 def zeros(count: int) -> Vector:
-    """[n] zero weights."""
+    """Return zero weights [n]."""
     return [number(0)] * count
 
 
 def sum_of(question: Question) -> Vector:
-    """Ones."""
+    """Return weights of 1."""
     return [number(1)] * question.count
 
 
 def mean_of(question: Question) -> Vector:
-    """1 / K with the K of all views."""
+    """Return weights of 1 / K, where K counts all views."""
     return [number(1) / question.views] * question.count
 
 
 def preconditioned(question: Question) -> Vector:
-    """(r / r_ref)^2, the geometry's exponent, with the ratio within [1e-2, 1e2]."""
+    """Return (r / r_ref)^d with the geometry's exponent d and the ratio in [1e-2, 1e2]."""
     power = number(question.options["geometry"])
     limited = (min(max(number(r), number("0.01")), number(100)) for r in question.ratios)
     return [r**power for r in limited]
@@ -114,7 +114,7 @@ def projected_rows(
     strength: Number = 1,
     shuffled: bool = False,
 ) -> Matrix:
-    """[n][n] rows v_i of pairwise projection."""
+    """Return the rows v_i [n][n] of pairwise projection."""
     return [
         _projected_row(question, i, partners, gate, (threshold, strength))
         for i, partners in enumerate(partners_of(question, shuffled=shuffled))
@@ -122,7 +122,7 @@ def projected_rows(
 
 
 def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
-    """For each view that has a gradient, the others in the order in which they are met."""
+    """Return the partners of each view with a gradient, in the order of projection."""
     order = np.tile(np.arange(question.views), (question.views, 1))
     if shuffled and question.views > 2:  # noqa: PLR2004
         order = question.rng.permuted(order, axis=1)
@@ -134,12 +134,12 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
 
 
 class _Combination:
-    """A sum of v_k g_k that grows by one term at a time, with its products with all gradients.
+    """A sum of v_k g_k that grows by one term at a time, and its products with all gradients.
 
     Args:
         gramian: [n][n].
         norms: [n].
-        i: The gradient that it begins with.
+        i: Index of the first gradient.
     """
 
     def __init__(self, gramian: Matrix, norms: Vector, i: int) -> None:
@@ -150,13 +150,13 @@ class _Combination:
         self.add(i, number(1))
 
     def add(self, j: int, x: Number) -> None:
-        """Adds x g_j."""
+        """Add x g_j."""
         self.v[j] += x
         self.products = [p + x * g for p, g in zip(self.products, self._gramian[j], strict=True)]
 
     @property
     def length(self) -> Number:
-        """Its norm; exactly zero where less than 1.4e-6 of its longest summand is left."""
+        """The norm, or exactly zero if it is below 1.4e-6 of the longest summand."""
         square = dot(self.v, self.products)
         longest = max(abs(x) * n for x, n in zip(self.v, self._norms, strict=True))
         return number(0) if cancels(square, longest) else require_mpmath().mp.sqrt(square)
@@ -170,7 +170,7 @@ def _projected_row(
     rule: tuple[Number, Number],
 ) -> Vector:
     threshold, strength = rule
-    # A conflict at the threshold itself, where the rule jumps, is none.
+    # A cosine exactly at the threshold, where the rule jumps, is not a conflict.
     least = threshold + (number(OPPOSITE) if threshold else 0)
     norms = lengths(question.gramian)
     row = _Combination(question.gramian, norms, i)
@@ -189,34 +189,34 @@ def _projected_row(
 
 
 def column_sums(rows: Matrix) -> Vector:
-    """Weights of a matrix whose rows are added."""
+    """Return the weights of a matrix whose rows are added."""
     return [sum(row[k] for row in rows) for k in range(len(rows[0]))] if rows else []
 
 
 def pcgrad(question: Question) -> Vector:
-    """PCGrad with the operator's random order."""
+    """Return the weights of PCGrad with the operator's random order."""
     return column_sums(projected_rows(question, shuffled=True))
 
 
 def symmetric(question: Question) -> Vector:
-    """Pairwise projection in the order of the slots."""
+    """Return the weights of pairwise projection in the order of the slots."""
     return column_sums(projected_rows(question))
 
 
 def soft(question: Question) -> Vector:
-    """With threshold and strength."""
+    """Return the weights of projection with threshold and strength."""
     threshold, strength = (number(question.options[n]) for n in ("threshold", "strength"))
     return column_sums(projected_rows(question, threshold=threshold, strength=strength))
 
 
 def anchors(question: Question) -> Vector:
-    """Projection only between a near and a far view."""
+    """Return the weights of projection only between a near and a far view."""
     pair = set(question.labels) == {question.options["near"], question.options["far"]}
     return symmetric(question) if pair else sum_of(question)
 
 
 def confgate(question: Question) -> Vector:
-    """Projection where the averaged cosine says so."""
+    """Return the weights of projection for pairs whose averaged cosine shows a conflict."""
     cosine = cosines(question.gramian)
     confident = {
         (i, j): i != j
@@ -229,7 +229,7 @@ def confgate(question: Question) -> Vector:
 
 
 def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
-    """Whether a pair has probably been conflicting, this step's cosine included."""
+    """Return whether a pair has probably been conflicting, including this step's cosine."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
     tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]
@@ -246,7 +246,7 @@ def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool
 
 
 def gradvac(question: Question) -> Vector:
-    """GradVac with the operator's random order and remembered targets."""
+    """Return the weights of GradVac with the operator's random order and stored targets."""
     rows = [
         _aligned(question, i, partners)
         for i, partners in enumerate(partners_of(question, shuffled=True))
@@ -277,7 +277,7 @@ def _aligned(question: Question, i: int, partners: Sequence[int]) -> Vector:
 
 
 def gradnorm(question: Question) -> Vector:
-    """GradNorm at constant losses: all groups at their starting loss."""
+    """Return the weights of GradNorm at constant losses: all groups at their initial loss."""
     mp = require_mpmath().mp
     groups = list(dict.fromkeys(question.labels))
     members = {g: [i for i, label in enumerate(question.labels) if label == g] for g in groups}

@@ -1,8 +1,9 @@
-"""The accuracy that each operator promises, and the set of gradients on which it holds.
+"""The accuracy that each operator promises, and the set of gradients for which it is promised.
 
-Inside the set the relative error is at most `PROMISED` u kappa, u the unit roundoff of the
-gradients' type and kappa = max |w_k| |g_k| / |u|; outside the result is finite and at most a stated
-factor times the longest gradient. docs/operators.md repeats the words, and a test holds it to that.
+Inside the set the relative error is at most `PROMISED` u kappa. u is the unit roundoff of the
+gradients' type, and kappa = max |w_k| |g_k| / |u|. Outside the set the result is finite, and its
+length is at most a stated factor times the longest gradient. A test checks that docs/operators.md
+contains the same words.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,24 +22,24 @@ from crossgrad_operators.stress.solvers import shortest
 PROMISED: Final = 8.0
 #: Unit roundoff of float64.
 FLOAT64: Final = 2.0**-53
-#: kappa u up to which the gradients determine the result.
+#: The gradients determine the result if kappa u is at most this value.
 DETERMINED: Final = 0.1
-#: Pivots between these are of directions that nearly depend on each other.
+#: Directions whose pivots are between these values are nearly dependent.
 DEPENDENT: Final = 1e-29
 INDEPENDENT: Final = 1e-13
-#: The same for methods that divide by every eigenvalue.
+#: Upper limit of such pivots for methods that divide by every eigenvalue.
 REGULAR: Final = 1e-8
-#: The amount that rounding may add to a bound of 1.
+#: Amount that rounding may add to a bound of 1.
 SLIGHTLY: Final = 1e-3
-#: Ratio of norms up to which CAGrad tells directions that cancel from others.
+#: Norm ratio up to which CAGrad can distinguish cancelling directions from other directions.
 COMPARABLE: Final = 1e8
-#: Distances of zero from the directions' hull from which on solutions are continuous.
+#: Solutions are continuous if zero is at least this far from the hull of the directions.
 APART: Final = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """The terms in which sets are stated: the n gradients that are not zero, and the exact answer.
+    """The quantities that define the sets: n gradients that are not zero, and the exact result.
 
     Attributes:
         norms: [n] lengths of the gradients.
@@ -66,14 +67,14 @@ class Facts:
 
     @property
     def kappa(self) -> float:
-        """The condition max |w_k| |g_k| / |u|, at least 1; 0 where the exact result is zero."""
+        """The condition max |w_k| |g_k| / |u|, at least 1, or 0 if the exact result is zero."""
         if not self.weights.any():
             return 0.0
         return max(self.largest / self.length, 1.0) if self.length else float("inf")
 
     @property
     def ratio(self) -> float:
-        """The longest over the shortest gradient."""
+        """The length of the longest gradient divided by the length of the shortest."""
         return self.longest / float(self.norms.min(initial=np.inf))
 
     @cached_property
@@ -81,7 +82,7 @@ class Facts:
         """Distance of zero from the convex hull of the directions g_k / |g_k|.
 
         Raises:
-            UnprovenError: The nearest point of the hull is not found.
+            UnprovenError: The nearest point of the hull was not found.
         """
         if not self.cosines:
             return 0.0
@@ -103,9 +104,9 @@ class Facts:
     def partial(self) -> float:
         """|w_1 g_1 + w_2 g_2| + ... + |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
 
-        The most that rounding of each product and of each addition adds, in units of u kappa.
+        It bounds the rounding errors of all products and additions, in units of u kappa.
         """
-        # In units of the largest, whose square may be too much for float64.
+        # Scale by the largest term, because its square may overflow in float64.
         unit = self.largest or 1.0
         terms = self.weights * self.norms / unit
         cosines = np.array(self.cosines, dtype=np.float64).reshape(len(terms), len(terms))
@@ -117,39 +118,39 @@ class Facts:
 
 
 def default_bound(facts: Facts) -> float:
-    """Eight, or where the weighted sum alone may lose more, that and two for the weights."""
+    """Return 8, or more if the rounding of the weighted sum plus 2 for the weights exceeds 8."""
     return max(PROMISED, facts.partial + 2.0)
 
 
 def pairwise_bound(facts: Facts) -> float:
-    """Twice that in float64, where the Gramians of pairs are as coarse as the gradients."""
+    """Return the default bound, doubled in float64, where Gramians are as coarse as gradients."""
     return default_bound(facts) * (1.0 if facts.unit > FLOAT64 else 2.0)
 
 
 def views_bound(facts: Facts) -> float:
-    """One per view, at least eight: sums of one sign never get shorter."""
+    """Return one per view, at least 8, because sums of equal signs never become shorter."""
     return max(PROMISED, float(len(facts.norms)))
 
 
 def everywhere(_facts: Facts) -> bool:
-    """Every Gramian."""
+    """Return True: the set contains every Gramian."""
     return True
 
 
 def determined(facts: Facts) -> bool:
-    """The result is zero, or kappa u is at most 0.1."""
+    """Return whether the result is zero, or kappa u is at most 0.1."""
     return facts.kappa * facts.unit <= DETERMINED
 
 
 def clear(facts: Facts) -> bool:
-    """As `determined`, and directions depend on each other exactly or not nearly."""
+    """Return whether `determined` holds, and directions are dependent exactly or not nearly."""
     return determined(facts) and not _any_between(
         [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
     )
 
 
 def independent(facts: Facts) -> bool:
-    """As `determined`, and directions of more than two views do not nearly depend."""
+    """Return whether `determined` holds, and more than two directions are not nearly dependent."""
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
         several and _any_between(facts.dependence, DEPENDENT, REGULAR)
@@ -157,12 +158,12 @@ def independent(facts: Facts) -> bool:
 
 
 def comparable(facts: Facts) -> bool:
-    """As `clear`; where zero is in the hull of the directions the norms have ratios up to 1e8."""
+    """Return whether `clear` holds, and norm ratios are at most 1e8 if zero is in the hull."""
     return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Zero is not near the hull of the directions."""
+    """Return whether zero is not near the hull of the directions."""
     return facts.distance >= APART
 
 
@@ -175,12 +176,12 @@ class Promise:
     """The promise of one operator.
 
     Attributes:
-        words: The set, in words and formula.
+        words: Description of the set, with formulas.
         factor_words: The factor as a formula.
-        factor: |u| / (longest gradient) that is not exceeded outside the set, for K views.
-        inside: Facts -> whether the Gramian belongs to the set.
-        bound: Facts -> error that is not exceeded inside, in units of u kappa.
-        continuous: Facts -> whether the method is continuous in the gradients there.
+        factor: K -> bound of |u| / (longest gradient) outside the set.
+        inside: Facts -> True if the Gramian belongs to the set.
+        bound: Facts -> bound of the error inside the set, in units of u kappa.
+        continuous: Facts -> True if the method is continuous in the gradients there.
     """
 
     words: str
@@ -191,7 +192,7 @@ class Promise:
     continuous: Callable[[Facts], bool] = everywhere
 
 
-#: What is promised of an operator that nothing is stated for.
+#: The promise of an operator without a stated promise.
 ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), everywhere)
 _DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
 _CLEAR: Final = (
@@ -210,13 +211,13 @@ _COMPARABLE: Final = (
 
 
 def _plain(words: str, factor: Callable[[int], float]) -> Promise:
-    """An operator without exceptions."""
+    """Return the promise of an operator without further exceptions."""
     return Promise(_DETERMINED, words, factor)
 
 
 _SUM: Final = _plain("K", float)
 _PAIRS: Final = Promise(_DETERMINED, "K", float, bound=pairwise_bound)
-#: Operator name -> what is promised of it.
+#: Operator name -> its promise.
 PROMISES: Final[Mapping[str, Promise]] = {
     "sum": _SUM,
     "mean": _plain("1", lambda _views: 1.0),
@@ -246,5 +247,5 @@ PROMISES: Final[Mapping[str, Promise]] = {
 
 
 def promise_of(name: str) -> Promise:
-    """What is promised of the built-in of that name."""
+    """Return the promise of the built-in operator with this name."""
     return PROMISES.get(name, ALL)

@@ -1,4 +1,4 @@
-"""Runs one operator on one case."""
+"""Runs one operator on one case and judges the result."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,25 +24,25 @@ from crossgrad_operators.stress.reference import Answer, Views, answer, sample_v
 from crossgrad_operators.stress.solvers import UnprovenError
 from crossgrad_operators.stress.verdict import ElementRule, ExactCase, Finding, judge
 
-#: The one block of a case.
+#: The only block of a case.
 BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
-#: Elements up to which a case is repeated for its time.
+#: Greatest number of elements for which a case is repeated to measure its time.
 REPEATED = 100_000
-#: Steps that operators with a memory are run for.
+#: Number of steps for operators with memory.
 STEPS = 3
-#: Why a case fails whose oracle finds no answer.
+#: Failure reason if the oracle finds no proven answer.
 UNPROVEN = "the reference is not proven"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One operator on one case (or under one law).
+    """The result of one operator on one case, or for one law.
 
     Attributes:
         operator: Name of the operator.
         case: Name of the case.
         finding: The worst finding of its steps.
-        microseconds: Time of one aggregation, Gramians and weighted sum included.
+        microseconds: Time of one aggregation, including Gramians and weighted sum.
     """
 
     operator: str
@@ -53,13 +53,13 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The reference that an operator is held against.
+    """The reference for an operator.
 
     Attributes:
-        oracle: Exact weights, for operators that have them.
+        oracle: Function that returns exact weights, or None.
         options: Options of the operator, for the oracle.
-        rule: A rule for elements, for operators that work on them.
-        promise: The set on which an error is promised, and what holds outside.
+        rule: A rule for single elements, for operators that work on elements.
+        promise: The set for which an error is promised, and the bounds outside the set.
     """
 
     oracle: Oracle | None
@@ -69,7 +69,7 @@ class Reference:
 
 
 def run_case(name: str, operator: Operator, exact: ExactCase, reference: Reference) -> Cell:
-    """Runs an operator (a few steps, if it remembers) and judges every result."""
+    """Run an operator (several steps if it has memory) and judge every result."""
     case = exact.case
     if not operator.views.admits(case.views):
         return Cell(name, case.name, Finding("refused"))
@@ -85,13 +85,13 @@ def judged(
     reference: Reference,
     views_of: Callable[[int, int], Views] = sample_views,
 ) -> tuple[Finding, list[float]]:
-    """The worst finding of the steps of an operator, and their seconds; none if it failed.
+    """Return the worst finding over an operator's steps, and their seconds (none if it failed).
 
     Args:
         operator: The operator.
         exact: The case.
-        reference: What the results are held against.
-        views_of: (K, step) -> the circumstances of the views.
+        reference: The reference for the results.
+        views_of: (K, step) -> the properties of the views.
     """
     state = EMPTY_STATE
     memory: dict[Any, Any] = {}
@@ -120,7 +120,7 @@ def compared(
     views: Views,
     memory: dict[Any, Any],
 ) -> Finding:
-    """Compares a result with its reference; the oracle may write to the memory."""
+    """Compare a result with its reference. The oracle may change the memory."""
     expected: Answer | ElementRule | None = reference.rule
     try:
         if reference.oracle is not None:
@@ -133,7 +133,7 @@ def compared(
 def timed(
     operator: Operator, case: Case, views: Views, state: PluginState = EMPTY_STATE
 ) -> tuple[Tensor | None, PluginState, float]:
-    """What the operator makes of the gradients of a case, its new state, and seconds."""
+    """Return the aggregated gradient of a case, the operator's new state, and the seconds."""
     gradients = [{BLOCK.name: gradient} for gradient in case.gradients()]
     context = context_of(gradients, (BLOCK,), views)
     start = perf_counter()
@@ -144,7 +144,7 @@ def timed(
 def context_of(
     gradients: Sequence[Mapping[str, Tensor | None]], blocks: tuple[Block, ...], views: Views
 ) -> AggregateContext:
-    """What the hook is offered; no operator may need the scene or the schedule."""
+    """Return the context of an aggregation. Scene and schedule are None."""
     return AggregateContext(
         step=1,
         schedule=cast("Any", None),

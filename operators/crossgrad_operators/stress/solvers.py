@@ -1,9 +1,9 @@
-"""Oracles in 50 digits: small problems, and the nearest point of a polyhedron.
+"""Oracles in 50 digits that solve small optimization problems.
 
-The operators follow active sets in float64, on cosines that a ridge makes definite; here they are
-followed exactly, and every answer is checked against the optimality conditions, which have one
-solution: whatever way led there, it is the minimum. Weights that are not unique (the gradients
-depend on each other) are those of independent gradients.
+The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
+exact active sets. Every answer is checked against the optimality conditions, which have only one
+solution, so the answer is the minimum. If the gradients are linearly dependent, the weights are not
+unique, and the weights of independent gradients are returned.
 """
 
 from collections.abc import Sequence
@@ -34,16 +34,16 @@ from crossgrad_operators.stress.oracles import (
     zeros,
 )
 
-#: Digits for matrices whose eigenvalues are 60 decades apart.
+#: Digits for matrices whose eigenvalues differ by 60 decades.
 WIDE: Final = 150
-#: Newton decrement down to which, and beta up to which, float64 is good enough to start from.
+#: Newton decrement and greatest beta for the start in float64.
 ROUGH: Final = 1e-3
 LONG: Final = 1e7
-#: Ratio of eigenvalues at which float64 is no doubt right about the rank.
+#: Ratio of eigenvalues above which float64 determines the rank without doubt.
 FAR: Final = 1e-10
-#: Square of |sum x_k e_k| over the largest x_k^2 that 50 digits leave of a sum that is zero.
+#: A sum is zero if |sum x_k e_k|^2 over the largest x_k^2 is at most this, in 50 digits.
 VANISHED = "1e-45"
-#: Levels that are tried for CAGrad.
+#: Greatest number of levels that are tried for CAGrad.
 LEVELS = 400
 
 
@@ -52,7 +52,7 @@ class UnprovenError(RuntimeError):
 
 
 def imtl_g(question: Question) -> Vector:
-    """Equal projections, weights adding up to 1; pseudo-inverse where the rank is not full."""
+    """Return weights of equal projections with sum 1, by pseudo-inverse for a singular Gramian."""
     gramian, count = question.gramian, question.count
     n, cosine = lengths(gramian), cosines(gramian)
     if count == 1:
@@ -63,7 +63,7 @@ def imtl_g(question: Question) -> Vector:
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
     total, largest = sum(v), max(abs(x) for x in v)
-    # The sum of the v is a pole, and treated as all sums that cancel are.
+    # The sum of the v is in the denominator. It counts as zero by the rule for cancelling sums.
     if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]
@@ -75,16 +75,16 @@ def _equal_projections(gramian: Matrix, n: Vector, cosine: Matrix) -> Vector:
         v = solve(cosine, range(count), [number(1)] * count)
         if v is not None:
             return [x / y for x, y in zip(v, n, strict=True)]
-    # Digits for eigenvalues 60 decades apart, which errors relative to the largest would swallow.
+    # Use more digits: the largest eigenvalue may exceed the smallest by 60 decades.
     with require_mpmath().mp.workdps(WIDE):
         return _shortest_solution(gramian, n, rank)
 
 
 def _rank(cosine: Matrix) -> int:
-    """Number of eigenvalues above 1e-12 of the largest."""
+    """Return the number of eigenvalues above 1e-12 of the largest."""
     mp = require_mpmath().mp
     rough = np.linalg.eigvalsh(np.array(cosine, dtype=np.float64))
-    # float64 is right to 1e-14; that is enough far from the limit.
+    # float64 is accurate to 1e-14, which is enough if all eigenvalues are far above the limit.
     if rough.min() > FAR * rough.max():
         return len(cosine)
     values, _ = mp.eigsy(mp.matrix(cosine))
@@ -98,7 +98,7 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
     v = zeros(count)
     for i in largest:
         terms = [vectors[k, i] * n[k] for k in range(count)]
-        # At right angles to the norms but for rounding: nothing, divided by whatever.
+        # Skip vectors orthogonal to the norms, because only rounding noise would be divided.
         if abs(sum(terms)) > number(OPPOSITE) * sum(abs(t) for t in terms):
             factor = sum(terms) / values[i]
             v = [a + factor * vectors[k, i] for k, a in enumerate(v)]
@@ -106,7 +106,7 @@ def _shortest_solution(gramian: Matrix, n: Vector, rank: int) -> Vector:
 
 
 def nash(question: Question) -> Vector:
-    """C beta = 1 / beta by Newton's method, times the geometric mean of the norms."""
+    """Return the solution of C beta = 1 / beta, times the geometric mean of the norms."""
     mp = require_mpmath().mp
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     count = question.count
@@ -122,7 +122,7 @@ def nash(question: Question) -> Vector:
 
 
 def _bargain(cosine: Matrix) -> Vector | None:
-    """The bargain's beta; None where it is proven to be so large that the result is zero."""
+    """Return the bargain's beta, or None if beta is so large that the result is zero."""
     mp = require_mpmath().mp
     count = len(cosine)
     beta = _rough_bargain(cosine)
@@ -140,14 +140,14 @@ def _bargain(cosine: Matrix) -> Vector | None:
         decrement = mp.sqrt(abs(dot(slope, step)))
         damping = 1 if decrement < number("0.2") else 1 / (1 + decrement)
         beta = [b * (1 + damping * s) for b, s in zip(beta, step, strict=True)]
-        # The step that was taken squares what is left.
+        # This last step squared the remaining error.
         if decrement < mp.mpf("1e-25"):
             return beta
     raise UnprovenError
 
 
 def _rough_bargain(cosine: Matrix) -> Vector:
-    """Damped Newton steps in float64, as far as they lead: a place to start from."""
+    """Return a start for Newton's method, from damped Newton steps in float64."""
     matrix = np.array(cosine, dtype=np.float64)
     beta = np.ones(len(cosine))
     for _ in range(200):
@@ -163,17 +163,17 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 
 
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
-    """Whether the bargain is proven to be zero by the convex combination beta / sum beta.
+    """Return whether the convex combination beta / sum beta proves that the result is zero.
 
-    With x that combination and u the bargain's sum, |u|^2 = K, sum x_k / beta_k = sum x_k e_k.u is
-    at most |sum x_k e_k| sqrt K, and so is 1 over the largest beta.
+    x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k =
+    sum x_k e_k.u is at most |sum x_k e_k| sqrt K, and so is the inverse of the largest beta.
     """
     share = form(cosine, beta) / sum(beta) ** 2
     return bool(len(beta) * share <= 2 * number(OPPOSITE) / len(beta))
 
 
 def aligned(question: Question) -> Vector:
-    """sqrt(l_min) V L^-1/2 V^T p, eigenvalues above n eps l_max."""
+    """Return sqrt(l_min) V L^-1/2 V^T p with eigenvalues above n eps l_max."""
     mp = require_mpmath().mp
     count = question.count
     cosine = cosines(question.gramian)
@@ -194,14 +194,14 @@ def aligned(question: Question) -> Vector:
 
 
 def _vanishes(cosine: Matrix, x: Vector) -> bool:
-    """Whether a combination is zero; of two directions, also where they count as opposite."""
+    """Return whether a combination is zero. Two directions may also count as opposite."""
     largest = max(abs(v) for v in x)
     exactly = form(cosine, x) <= number(VANISHED) * largest**2
     return exactly or (len(x) == 2 and is_noise(cosine, x))  # noqa: PLR2004
 
 
 def _projection(cosine: Matrix, b: Vector) -> Vector:
-    """Coefficients of the projection of sum b_k e_k on the cone {x: x.e_l >= 0}."""
+    """Return coefficients of the projection of sum b_k e_k onto the cone {x: x.e_l >= 0}."""
     y = complementary(cosine, apply(cosine, b))
     if y is None:
         raise UnprovenError
@@ -210,7 +210,7 @@ def _projection(cosine: Matrix, b: Vector) -> Vector:
 
 
 def upgrad(question: Question) -> Vector:
-    """Each gradient projected, over K."""
+    """Return the weights of the projected gradients, divided by K."""
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     rows = []
     for k in range(question.count):
@@ -220,7 +220,7 @@ def upgrad(question: Question) -> Vector:
 
 
 def dualproj(question: Question) -> Vector:
-    """The mean projected."""
+    """Return the weights of the projected mean."""
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     longest = max(n)
     x = _projection(cosine, [v / longest for v in n])
@@ -228,7 +228,7 @@ def dualproj(question: Question) -> Vector:
 
 
 def mgda(question: Question) -> Vector:
-    """Shortest convex combination."""
+    """Return the weights of the shortest convex combination."""
     n, cosine = lengths(question.gramian), cosines(question.gramian)
     r = [min(n) / v for v in n]
     x = shortest(cosine, r)
@@ -240,10 +240,10 @@ def mgda(question: Question) -> Vector:
 
 
 def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
-    """Coefficients x >= 0 with r.x = 1 of the shortest sum x_k e_k.
+    """Return coefficients x >= 0 with r.x = 1 of the shortest sum x_k e_k.
 
-    They are those of the smallest |sum x_k e_k|^2 + (r.x - 1)^2, up to a factor; that has a
-    solution even if 0 is a convex combination.
+    Up to a factor, they minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a solution even if
+    0 is a convex combination.
     """
     size = range(len(r))
     matrix = [[cosine[i][j] + r[i] * r[j] for j in size] for i in size]
@@ -255,7 +255,7 @@ def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
 
 
 def cagrad(question: Question) -> Vector:
-    """g_0 + c |g_0| g_w / |g_w|, from the nearest point to g_0 where no g_k.d is below a level."""
+    """Return the weights of g_0 + c |g_0| g_w / |g_w|, from the nearest point at a level."""
     mp = require_mpmath().mp
     count, c = question.count, number(question.options["c"])
     share = number(count) / question.views
@@ -274,10 +274,10 @@ def cagrad(question: Question) -> Vector:
 
 
 def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector | None:
-    """Multipliers of the nearest point to the base with e_k.d >= level r_k, at distance rho.
+    """Return multipliers of the nearest point to the base with e_k.d >= level r_k, at distance rho.
 
-    None where 0 is a convex combination and the level 0 is reached within that distance: then no
-    level above is, and the direction is undefined.
+    None is returned if 0 is a convex combination and level 0 is reached within this distance. Then
+    no level above 0 can be reached, and the direction is undefined.
     """
     q = apply(cosine, base)
     x = shortest(cosine, r)
@@ -296,7 +296,7 @@ def _as_far_as(cosine: Matrix, base: Vector, r: Vector, rho: Number) -> Vector |
 def _found(
     cosine: Matrix, problem: tuple[Vector, Vector, Number], interval: tuple[Number, Number]
 ) -> Vector:
-    """The multipliers at which the distance is rho; every level of the interval can be met."""
+    """Return the multipliers for distance rho. Every level of the interval must be reachable."""
     (q, r, rho), (low, high) = problem, interval
     level = high
     for _ in range(LEVELS):
@@ -315,7 +315,7 @@ def _found(
 
 
 def _change(cosine: Matrix, y: Vector, r: Vector, gap: Number) -> Number | None:
-    """Change of the level that closes the gap of the squared distance on the present face."""
+    """Return the level change that closes the gap of the squared distance on the active face."""
     mp = require_mpmath().mp
     support = [k for k, v in enumerate(y) if v > 0]
     a = solve(cosine, support, r) if support else None

@@ -1,4 +1,4 @@
-"""The whole suite: every operator on every case, every law, and the results as text."""
+"""The whole suite: every operator on every case and every law, with the results as text."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chaine
 from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
 from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 
-#: A law returns its error in units of u times the largest norm, or None where it does not apply.
+#: A law returns its error in units of u times the largest norm, or None if it does not apply.
 Law = Callable[[Operator], float | None]
 _UNIT = 2.0**-24
-#: Operators side by side in one part of the table.
+#: Number of operators in one part of the table.
 COLUMNS = 5
 _NAME, _CELL = 24, 16
 LEGEND = (
@@ -58,7 +58,7 @@ def _counts(operator: Operator) -> Iterator[int]:
 
 
 def homogeneity(operator: Operator) -> float | None:
-    """op(c g) = c op(g) for c > 0, from 1e-25 to 1e+25."""
+    """Return the error of op(c g) = c op(g), for c > 0 from 1e-25 to 1e+25."""
     worst = 0.0
     for views in _counts(operator):
         case = _rows(views)
@@ -71,7 +71,7 @@ def homogeneity(operator: Operator) -> float | None:
 
 
 def permutation(operator: Operator) -> float | None:
-    """The order of two views, with their labels and distances, does not matter."""
+    """Return the error after two views, with their labels and distances, exchange their order."""
     if not operator.views.admits(2):
         return None
     case, views = _rows(2), sample_views(2)
@@ -82,7 +82,7 @@ def permutation(operator: Operator) -> float | None:
 
 
 def one_view(operator: Operator) -> float | None:
-    """A single view at the reference distance is left as it is."""
+    """Return the change of a single view at the reference distance, which should stay as it is."""
     if not operator.views.admits(1):
         return None
     case = _rows(1)
@@ -91,7 +91,7 @@ def one_view(operator: Operator) -> float | None:
 
 
 def size(operator: Operator) -> float | None:
-    """A gradient repeated 3,001 times, in whatever chunks, gives the same result repeated."""
+    """Return the error for a gradient repeated 3,001 times, compared with the repeated result."""
     if not isinstance(operator, MatrixOperator):
         return None
     worst = 0.0
@@ -106,7 +106,7 @@ def size(operator: Operator) -> float | None:
 
 
 def block_independence(operator: Operator) -> float | None:
-    """Other blocks in the same step change no bit of a block's result."""
+    """Return 0 if other blocks in the same step change no bit of a block's result, else inf."""
     if not isinstance(operator, MatrixOperator):
         return None
     for views in _counts(operator):
@@ -121,7 +121,7 @@ def block_independence(operator: Operator) -> float | None:
 
 
 def threads(operator: Operator) -> float | None:
-    """The number of threads changes no bit."""
+    """Return 0 if the number of threads changes no bit, else inf."""
     import numba
 
     case = replace(_rows(2), pattern=_rows(2).head, copies=8000)
@@ -142,7 +142,7 @@ LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, block_indepen
 
 
 def run_law(name: str, operator: Operator, law: Law) -> Cell:
-    """One law on one operator."""
+    """Return the finding of one law for one operator."""
     return Cell(name, law.__name__.replace("_", " "), _judged(operator, law))
 
 
@@ -164,23 +164,23 @@ def _reversed(gradient: Tensor | None) -> Tensor | None:
 
 
 def installed() -> list[str]:
-    """Names of all operators, third parties' too."""
+    """Return the names of all operators, including operators of third parties."""
     return installed_names("operators")
 
 
 def made(name: str) -> Operator:
-    """An operator with the options under which the suite runs it."""
+    """Return an operator with the options that the suite uses."""
     return build(Operator, name, OPTIONS.get(name, {}))
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """An operator with everything that it is compared with.
+    """An operator with its references.
 
     Attributes:
         name: Name of the operator.
         operator: The operator.
-        reference: Its 50-digit oracle or its rule for elements, where it has one.
+        reference: Its 50-digit oracle or its rule for elements, if it has one.
     """
 
     name: str
@@ -194,7 +194,7 @@ class Subject:
 
 
 def subject_of(name: str) -> Subject:
-    """The installed operator of a name, with the references of a built-in if it is one.
+    """Return the installed operator with a name, and its references if it is built-in.
 
     Raises:
         UserError: The operator does not exist or cannot be made.
@@ -206,7 +206,7 @@ def subject_of(name: str) -> Subject:
 def run_suite(
     names: Sequence[str], cases: Sequence[Case], progress: Callable[[str], None] = lambda _: None
 ) -> Iterator[Cell]:
-    """Cells of all operators for one case after the other, then the laws.
+    """Yield the cells of all operators, case by case, and then the laws.
 
     Raises:
         UserError: mpmath is not installed, or an operator cannot be made.
@@ -225,7 +225,7 @@ def run_suite(
 
 
 def reference_of(name: str, operator: Operator) -> Reference:
-    """What a built-in operator is held against; a third party's of the same name has nothing."""
+    """Return the reference of a built-in operator. Third-party operators have no reference."""
     options: dict[str, Any] = {
         field: getattr(operator, field) for field in type(operator).model_fields
     }
@@ -238,7 +238,7 @@ def reference_of(name: str, operator: Operator) -> Reference:
 
 
 def as_text(cells: Sequence[Cell]) -> str:
-    """The whole table, a line per operator, and what failed."""
+    """Return the whole table, the worst error of each operator, and the failures."""
     names = list(dict.fromkeys(cell.operator for cell in cells))
     parts = [
         _part(cells, names[start : start + COLUMNS]) for start in range(0, len(names), COLUMNS)
@@ -247,12 +247,12 @@ def as_text(cells: Sequence[Cell]) -> str:
 
 
 def failed(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells that break a promise."""
+    """Return the cells that break a promise."""
     return [cell for cell in cells if cell.finding.verdict == "failed"]
 
 
 def write_csv(cells: Sequence[Cell], path: Path) -> None:
-    """One row per cell."""
+    """Write one row per cell."""
     rows: list[dict[str, str | int | float]] = [
         {
             "operator": cell.operator,

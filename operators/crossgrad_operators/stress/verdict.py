@@ -1,4 +1,4 @@
-"""Whether a result is as close to the exact one as promised."""
+"""Verdicts that compare the error of a result with the promise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: From kappa u on only finiteness is promised: the input does not determine the result any better.
+#: Above this kappa u only finiteness is promised, as the input does not determine the result.
 UNDETERMINED: Final = 0.1
-#: Why a result fails that contains a NaN or an infinity.
+#: Failure reason of a result that contains a NaN or an infinity.
 NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
-#: Distance of a result from the nearest one that a rule for elements allows.
+#: Distance of a result from the nearest result that a rule for elements allows.
 ElementRule = Callable[[Case, Tensor], float]
 
 
@@ -36,11 +36,12 @@ class Finding:
     """The verdict on one result.
 
     Attributes:
-        verdict: `ok`; `undetermined`: kappa u > 0.1 and finite; `outside`: not in the set on which
-            an error is promised, finite and not too long; `refused`: K is not admitted; `failed`.
-        error: Relative error in units of u kappa; NaN without a reference.
-        reason: Why it failed.
-        ratio: |u| over the longest gradient; NaN inside the set.
+        verdict: `ok`; `undetermined`: kappa u > 0.1 and finite; `outside`: outside the set for
+            which an error is promised, finite and not too long; `refused`: K is not admitted;
+            `failed`.
+        error: Relative error in units of u kappa, or NaN without a reference.
+        reason: Reason of a failure.
+        ratio: |u| divided by the longest gradient, or NaN inside the set.
     """
 
     verdict: Verdict
@@ -50,18 +51,18 @@ class Finding:
 
     @property
     def is_outside(self) -> bool:
-        """Whether the gradients lie outside the set on which an error is promised."""
+        """True if the gradients are outside the set for which an error is promised."""
         return not isnan(self.ratio)
 
     @property
     def severity(self) -> tuple[int, float]:
-        """For choosing the worst of several."""
+        """Sort key for the worst of several findings."""
         order = ("ok", "outside", "undetermined", "refused", "failed")
         return order.index(self.verdict), self.error
 
 
 class ExactCase:
-    """A case with its exact Gramian, worked out once for all operators."""
+    """A case with its exact Gramian, computed once for all operators."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -70,7 +71,7 @@ class ExactCase:
 
     @property
     def touched(self) -> bool:
-        """Whether any view that counts touches the block."""
+        """True if a finite view touches the block."""
         return any(f and k not in self.case.absent for k, f in enumerate(self.finite))
 
 
@@ -80,7 +81,7 @@ def judge(
     expected: Answer | ElementRule | None,
     promise: Promise = ALL,
 ) -> Finding:
-    """Compares a result with exact weights, with a rule for elements, or with nothing."""
+    """Compare a result with exact weights, with a rule for elements, or only for finiteness."""
     if found is None or not exact.touched:
         return _either(found is None and not exact.touched, "None is for blocks without any view")
     if not bool(torch.isfinite(found).all()):
@@ -93,7 +94,7 @@ def judge(
 
 
 def by_law(exact: ExactCase, found: Tensor, error: float, promise: Promise = ALL) -> Finding:
-    """Judges the distance of a result from the nearest one that a rule or a law allows."""
+    """Judge the distance of a result from the nearest result that a rule or a law allows."""
     longest = sqrt(float(max(exact.gramian[k][k] for k in range(exact.case.views))))
     scale = max(longest, float(found.double().norm()))
     return _measured(exact.case, error, (scale, scale), promise.bound(facts_of(exact)))
@@ -110,7 +111,7 @@ def _against(exact: ExactCase, found: Tensor, expected: Answer, promise: Promise
 
 
 def facts_of(exact: ExactCase, answer: Answer | None = None) -> Facts:
-    """The terms in which sets are stated; without an answer, for sets that do not depend on it."""
+    """Return the facts that define the sets. Without an answer, weights and length are zero."""
     gramian = exact.gramian
     places = [k for k in range(exact.case.views) if gramian[k][k] > 0]
     part = [[gramian[i][j] for j in places] for i in places]
@@ -140,7 +141,7 @@ def _outside(case: Case, found: Tensor, facts: Facts, promise: Promise) -> Findi
 
 def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float) -> Finding:
     unit, (scale, length) = _unit(case), sizes
-    # What gradual underflow takes from every element cannot be relative.
+    # The error of gradual underflow is absolute for each element, so subtract it.
     lost = sqrt(case.size) * float(torch.finfo(case.dtype).smallest_normal) * unit
     error = max(error - lost, 0.0)
     measured = error / (unit * scale) if error else 0.0
@@ -152,11 +153,11 @@ def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float
 
 
 def distance(case: Case, found: Tensor, expected: Answer) -> float:
-    """|u - u*|: in 50 digits for the head, by its closed form for the repeated pattern."""
+    """Return |u - u*|: in 50 digits for the head, in float64 for the repeated pattern."""
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     exact = weighted_sum(expected.weights, case.exact_head)
-    # Subtracted in 50 digits; the differences then need few.
+    # Subtract in 50 digits. The differences then need few digits.
     parts = [float(e - v) for v, e in zip(values[:head].tolist(), exact, strict=True)]
     if case.copies:
         pattern = np.array([float(v) for v in weighted_sum(expected.weights, case.exact_pattern)])
@@ -167,7 +168,7 @@ def distance(case: Case, found: Tensor, expected: Answer) -> float:
 
 
 def one_sign(case: Case, found: Tensor) -> float:
-    """Distance from sums of elements of one sign: what GradDrop may choose in each place."""
+    """Return the distance from the nearest sums of elements with one sign, as GradDrop allows."""
     values = found.detach().double().numpy()
     head = case.head.shape[1]
     parts = [_to_nearest_sign(case.exact_head, values[None, :head])]

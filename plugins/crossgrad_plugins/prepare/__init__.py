@@ -1,1 +1,1 @@
-"""`crossgrad prepare`: from a folder of photos to a scene that `crossgrad run` reads."""
+"""`crossgrad prepare`: make a scene for `crossgrad run` from a folder of photos."""

@@ -1,4 +1,4 @@
-"""From photos to a scene, stage by stage; each goes on where it was interrupted."""
+"""Stages that make a scene from photos. Each stage continues after an interruption."""
 
 import io
 import json
@@ -43,19 +43,19 @@ if TYPE_CHECKING:
 #: Okabe and Ito's colours, distinguishable with any colour vision.
 _COLORS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5C00")
 _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
-#: Points beyond these percentiles are not in the picture.
+#: Points beyond these percentiles are not drawn.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
-#: Titles of both panels of a scene without a place on Earth, and so without a direction up.
+#: Titles of both panels for a scene without a place on Earth, whose vertical is unknown.
 _TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
 def draw(report: Report, model: "pycolmap.Reconstruction") -> bytes:
-    """The picture as PNG.
+    """Return the picture of the report as PNG.
 
     Args:
-        report: What is known of the scene.
-        model: Its model.
+        report: The facts about the scene.
+        model: The scene's model.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -91,7 +91,7 @@ def _panel(
     centers: Mapping[str, NDArray[np.float64]],
     shown: tuple[int, int],
 ) -> None:
-    """One view of points, links and cameras, along two of the axes."""
+    """Draw points, links and cameras along two of the axes."""
     from matplotlib.collections import LineCollection
 
     across, up = shown
@@ -115,7 +115,7 @@ def _panel(
 
 
 def _limits(axes: "Axes", points: NDArray[np.float64], cameras: NDArray[np.float64]) -> None:
-    """Shows all cameras and most points."""
+    """Set the limits of the axes so that all cameras and most points are visible."""
     inner = np.percentile(points, _INNER, axis=0) if len(points) else cameras
     corners = np.vstack([inner, cameras])
     low, high = corners.min(0), corners.max(0)
@@ -125,21 +125,21 @@ def _limits(axes: "Axes", points: NDArray[np.float64], cameras: NDArray[np.float
 
 
 def _axes(centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] rows: the two directions in which the cameras lie farthest apart, and the third."""
+    """Return rotation rows [3, 3]: the two directions of greatest camera spread, and the third."""
     return np.asarray(np.linalg.svd(centers - centers.mean(0), full_matrices=True)[2])
 
 
 T = TypeVar("T")
 _PAUSE = 5.0
-#: Camera model of photos that look in all directions.
+#: Camera model of 360-degree photos.
 _ALL_AROUND = "EQUIRECTANGULAR"
 
 
 def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | None) -> None:
-    """Makes a scene of a folder of photos, and prints what was found.
+    """Make a scene from a folder of photos, and print a summary.
 
     Raises:
-        UserError: As `prepared`.
+        UserError: For the same reasons as `prepared`.
     """
     report = prepared(photos, scene, settings, threads)
     for line in summary_lines(report):
@@ -151,24 +151,24 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
 
 
 def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:
-    """Makes a scene of a folder of photos, or what is missing of it.
+    """Make a scene from a folder of photos, or its missing parts, and return the report.
 
     Args:
         photos: Folder of the photos.
         scene: Folder of the scene.
-        settings: What the user chose.
-        threads: CPU threads; None for all there are.
+        settings: The user's settings.
+        threads: CPU threads, or None for all cores.
 
     Raises:
-        UserError: There are no photos, the folder of the scene is something else's, nothing fits
+        UserError: There are too few photos, the scene folder contains something else, no photos fit
             together, or the disk is full.
     """
     layout = Layout(scene)
     check_ours(layout, photos)
     _check_lens(settings.lens)
-    # A ready scene needs no photo any more.
+    # A finished scene no longer needs its photos.
     plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
-    if layout.is_ready:  # Nothing is written: others may read it, and the disk may be read-only.
+    if layout.is_ready:  # Write nothing: others may read it, and the disk may be read-only.
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
     with disk_errors(layout.work):
@@ -180,12 +180,13 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
 
 
 def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
-    """Makes a scene of photos, unless it is ready: then photos and workshop may be gone.
+    """Make a scene from photos. If it is ready, its photos and working folder may be missing.
 
     Returns:
-        What is said about it.
+        Messages about the scene.
 
     Raises:
+        UserError: For the same reasons as `prepared`.
         UserError: As `prepared`.
     """
     layout, why = Layout(scene), ""
@@ -231,7 +232,7 @@ def _check_lens(name: str) -> None:
 
 
 def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
-    """The photos and what their files say."""
+    """Return the plan, made from the settings and from the photos' files."""
     progress = Progress(_PAUSE)
 
     def tell(done: int, of: int) -> None:
@@ -243,7 +244,7 @@ def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
 
 
 def _carried_out(layout: Layout, plan: Plan, threads: int) -> Report:
-    """All stages."""
+    """Run all stages and return the report."""
     features = _timed("features", lambda: found_features(layout, plan, threads))
     links = _timed("matches", lambda: matching.found_links(layout, plan, threads))
     models = _timed("poses", lambda: mapping.found_models(layout, plan, threads))
@@ -264,7 +265,7 @@ def _timed(what: str, stage: Callable[[], T]) -> T:
 
 
 def _write_report(layout: Layout, report: Report) -> None:
-    """Writes what else is in the scene's folder; the data last, which says that all is there."""
+    """Write georef.json, the picture and the reports. report.json is last and marks completion."""
     import pycolmap
 
     if report.result.georef is not None:

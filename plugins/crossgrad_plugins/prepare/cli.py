@@ -82,8 +82,9 @@ class Options:
 def prepare(given: Options) -> None:
     """Find the cameras of a folder of photos: from photos to a scene for `crossgrad run`.
 
-    Features, matches, poses, undistorted photos, place on Earth where photos have GPS, and a report
-    (report.md, report.png) of what is in the scene, what is not, and why.
+    The command finds features, matches and poses, and writes undistorted photos. If photos have
+    GPS, it also finds the place on Earth. A report (report.md, report.png) lists the photos in the
+    scene, the missing photos, and the reasons.
     """
     announce(quiet=True)
     for name in _CHOICES:

@@ -1,4 +1,4 @@
-"""Photos that a model holds in one place while most of their matches speak for another."""
+"""Search for photos whose matches mostly contradict their pose in a model."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from crossgrad_plugins.prepare.pycolmap_calls import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Pairs count from so many verified matches on, as many as COLMAP asks of a pose: between photos of
-#: repeated walls and pavements most pairs with fewer are wrong.
+#: Least number of verified matches of a pair that is counted, the same as COLMAP requires for a
+#: pose. With fewer matches, most pairs of photos of repeated walls and pavements are wrong.
 _MATCHES: Final = 30
-#: Pixels from the epipolar line within which a match agrees with two poses, as in verification, and
-#: the share of a pair's matches that have to.
+#: Largest distance in pixels between a match and its epipolar line, as in verification, and the
+#: least share of a pair's matches within this distance for agreement with two poses.
 _PIXELS, _AGREEING = 4.0, 0.5
-#: A photo is misplaced where less than this share of its matches agrees, and pairs with at least so
-#: many other photos do not: one pair may be wrong by itself.
+#: A photo is misplaced if a smaller share of its matches agrees, and if at least this many of its
+#: pairs disagree. A single pair can be wrong by itself.
 _SHARE, _AGAINST = 1.0 / 3.0, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The pairs of a model, and whether they agree with its poses.
+    """The pairs of a model, each with a flag for agreement with the model's poses.
 
     Attributes:
         photos: [P, 2] numbers of the two photos of each pair.
-        matches: [P] verified matches.
-        agrees: [P] whether most of these agree with the two poses.
+        matches: [P] number of verified matches.
+        agrees: [P] True if most of the matches agree with the two poses.
     """
 
     photos: NDArray[np.int64]
@@ -43,18 +43,17 @@ class Votes:
 def contradicted(
     model: "pycolmap.Reconstruction", database: Path, settled: Collection[int] = ()
 ) -> dict[int, tuple[int, int]]:
-    """Photos most of whose matches with other photos of the model contradict its pose.
+    """Return the photos whose matches with other photos of the model contradict their pose.
 
-    Repeated structures look alike in places that are not the same: such pairs pass the verification
-    of two views, and a photo that comes early may be placed by them. Its pairs with the photos that
-    come later tell. The photo with the smallest share of agreeing matches goes first and has no
-    vote on the others.
+    Repeated structures in different places look alike. Such pairs pass the verification of two
+    views, and may place a photo that is added early. Pairs with photos that are added later show
+    the error. The photo with the smallest share of agreeing matches is removed first, and its
+    matches no longer count for the other photos.
 
     Args:
         model: The model.
         database: COLMAP's database with the verified matches.
-        settled: Photos whose matches speak for no other place more than for theirs: whatever
-            speaks against it, nothing better is known.
+        settled: Photos for which no other place has more agreeing matches. They are never returned.
 
     Returns:
         Number of each such photo -> its matches for and against the pose.
@@ -87,7 +86,7 @@ class _Counts:
     def of(
         self, votes: Votes, which: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """[size] matches and [size] pairs of each photo, of some pairs."""
+        """Return the number of matches [size] and pairs [size] of each photo, over some pairs."""
         photos, matches = votes.photos[which].ravel(), np.repeat(votes.matches[which], 2)
         summed = np.bincount(photos, matches.astype(np.float64), minlength=self.size)
         return summed.astype(np.float64), np.bincount(photos, minlength=self.size).astype(np.int64)
@@ -109,7 +108,7 @@ def _votes(model: "pycolmap.Reconstruction", path: Path) -> Votes:
 def _judged(
     model: "pycolmap.Reconstruction", database: "pycolmap.Database"
 ) -> Iterator[tuple[int, int, int, int]]:
-    """Of each pair of the model's photos: their numbers, its matches, and how many agree."""
+    """Yield for each pair of the model's photos their numbers, its matches and agreeing matches."""
     import pycolmap
 
     poses = {number: model.image(number).cam_from_world() for number in model.reg_image_ids()}

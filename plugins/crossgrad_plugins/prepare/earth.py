@@ -1,4 +1,4 @@
-"""GPS positions in a local frame, and the roll of a model about a line of them."""
+"""GPS positions in a local frame, and the roll of a model about a line of GPS positions."""
 
 from collections.abc import Mapping, Sequence
 from statistics import median
@@ -21,21 +21,21 @@ _TOPS: Final = {3: (0.0, 1.0, 0.0), 4: (0.0, 1.0, 0.0), 5: (-1.0, 0.0, 0.0), 6: 
                 7: (1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}  # fmt: skip
 _TOP: Final = (0.0, -1.0, 0.0)
 _STEPS: Final = 1440
-#: Sines of the tilt of level photos, root mean square: at most so much, and at the worst roll at
-#: least so much more, else their directions say nothing about the roll.
+#: Limits for the sine of the tilt of level photos (root mean square): the greatest at the best
+#: roll, and the least difference between best and worst roll that determines the roll.
 _LEVEL, _TELLING = 0.15, 0.3
-#: Photos show their top upwards or look down, by this much on average.
+#: Least average amount by which photos show their top upwards or look down.
 _UPRIGHT: Final = 0.3
 
 
 def origin_of(plan: Plan) -> Position | None:
-    """The middle of where the photos were taken; None where none has GPS."""
+    """Return the median position of the photos, or None if no photo has GPS."""
     places = [photo.position for photo in plan.located if photo.position is not None]
     if not places:
         return None
     longitudes = [place.longitude for place in places]
     if max(longitudes) - min(longitudes) > _HALF:
-        # On both sides of the date line.
+        # The photos are on both sides of the date line.
         longitudes = [each % (2 * _HALF) for each in longitudes]
     east = median(longitudes)
     return Position(
@@ -46,7 +46,7 @@ def origin_of(plan: Plan) -> Position | None:
 
 
 def local_positions(plan: Plan) -> dict[str, NDArray[np.float64]]:
-    """Name -> [3] metres east, north, up of the origin, of each photo with GPS (WGS 84)."""
+    """Return positions [3] by photo name, in metres east, north and up of the origin (WGS 84)."""
     origin = origin_of(plan)
     if origin is None:
         return {}
@@ -56,7 +56,7 @@ def local_positions(plan: Plan) -> dict[str, NDArray[np.float64]]:
 
 
 def _to_local(places: Sequence[Position], origin: Position) -> NDArray[np.float64]:
-    """[N, 3]."""
+    """Return positions [N, 3] in metres east, north and up of the origin."""
     guard_pycolmap()
     import pycolmap
 
@@ -68,7 +68,7 @@ def _to_local(places: Sequence[Position], origin: Position) -> NDArray[np.float6
 
 
 def top_of(orientation: int) -> NDArray[np.float64]:
-    """[3] camera axis towards the top of a photo as it is shown."""
+    """Return the camera axis [3] that points to the top of a photo when it is displayed."""
     return np.array(_TOPS.get(orientation, _TOP))
 
 
@@ -78,11 +78,11 @@ def levelled(
     line: tuple[NDArray[np.float64], NDArray[np.float64]],
     tops: Mapping[str, NDArray[np.float64]],
 ) -> "pycolmap.Sim3d | None":
-    """A similarity turned about a line such that photos are level; None where they do not tell.
+    """Return the similarity rolled about a line so that photos are level, or None if unclear.
 
     Args:
         model: The model.
-        similarity: From the model to metres east, north, up; right but for the roll.
+        similarity: From the model to metres east, north, up, correct except for the roll.
         line: [3] a point of the line and [3] its direction, of length 1.
         tops: Name -> [3] camera axis towards the top of the photo.
     """
@@ -100,7 +100,7 @@ def levelled(
     if tilts.max() - tilts.min() < _TELLING or tilts.min() > _LEVEL:
         return None
     upright = (_heights(up, along, angles) - _heights(ahead, along, angles)).mean(axis=0)
-    # Half a turn apart photos are as level, but one of both stands on its head.
+    # After half a turn photos are equally level, but upside down in one of the two positions.
     best = int(np.argmin(np.where(upright > _UPRIGHT, tilts, np.inf)))
     if upright[best] <= _UPRIGHT or tilts[best] > _LEVEL:
         return None
@@ -113,7 +113,7 @@ def levelled(
 def _heights(
     vectors: NDArray[np.float64], along: NDArray[np.float64], angles: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[N, A] z of vectors [N, 3], each turned about an axis [3] by angles [A] (Rodrigues)."""
+    """Return z [N, A] of vectors [N, 3] rotated about an axis [3] by angles [A] (Rodrigues)."""
     kept = np.outer(vectors @ along, along)
     across = vectors - kept
     return np.asarray(

@@ -18,26 +18,26 @@ from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, quiet, rows_of, wa
 if TYPE_CHECKING:
     import pycolmap
 
-#: Features are found in photos with their longest side reduced to so many pixels (COLMAP).
+#: Longest side in pixels of the reduced photos in which features are found (COLMAP's default).
 LONGEST: Final = 3200
-#: Bytes that SIFT takes for a pixel of the photo, which it looks at at twice its size: measured
-#: 290 (docs/prepare.md); those of a pixel of the file, which is decoded whole, in colours and grey;
-#: and the share of the free memory that all threads together may take.
+#: Memory that SIFT needs per pixel in bytes, including its upscaling to twice the size (measured
+#: in docs/prepare.md). Bytes per pixel of the decoded file, in colour and grey. Greatest share of
+#: the free memory for all threads together.
 _BYTES_PER_PIXEL, _BYTES_DECODED, _SHARE = 320, 4, 0.6
-#: Photos of fewer pixels have few features, and are asked for fainter ones, and for those along
-#: edges: SIFT's threshold on contrast, and on the ratio of curvatures (COLMAP: 0.0067 and 10).
+#: Photos with fewer pixels yield few features, so SIFT also accepts fainter features and features
+#: along edges: contrast threshold and ratio of curvatures (COLMAP's defaults: 0.0067 and 10).
 _SMALL, _FAINT, _ALONG_EDGES = 1e6, 0.002, 20.0
-#: Bytes of a feature in the database, and features of a photo for each one that is asked for: those
-#: with several orientations count as often.
+#: Bytes of a feature in the database, and stored features per requested feature. A feature with
+#: several orientations is stored several times.
 _BYTES_OF_FEATURE, _ORIENTATIONS = 152, 1.6
-#: Photos of a camera that are tried until one can be read.
+#: Greatest number of photos of a camera that are tried until one can be read.
 _TRIED: Final = 5
 
 
 def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
-    """How many features each photo has, found and kept in the database; 0 where it was unreadable.
+    """Find the features and return their number by photo name, 0 for an unreadable photo.
 
-    Photos that are done are not looked at again.
+    Features are stored in the database. Photos with stored features are skipped.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -69,7 +69,7 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
 
 
 def _room(layout: Layout, plan: Plan) -> int:
-    """Bytes that the features that are missing take; SQLite ends the process on a full disk."""
+    """Return the bytes that missing features need, because SQLite aborts on a full disk."""
     done = rows_of(layout.database, "descriptors") if layout.database.is_file() else 0
     each = int(_ORIENTATIONS * plan.settings.max_features) * _BYTES_OF_FEATURE
     return max(0, len(plan.used) - done) * each + JOURNAL
@@ -92,7 +92,7 @@ def _options(
 def _find(
     layout: Layout, plan: Plan, names: Sequence[str], options: "pycolmap.FeatureExtractionOptions"
 ) -> None:
-    """Finds the features of these photos."""
+    """Find the features of these photos."""
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()
@@ -108,7 +108,7 @@ def _find(
 
 
 def _threads(photos: Sequence[Photo], longest: int, threads: int) -> int:
-    """How many photos are looked at at once, such that memory suffices."""
+    """Return the number of photos processed in parallel, limited by the free memory."""
     need = max(
         _BYTES_PER_PIXEL * _pixels(photo, longest) + _BYTES_DECODED * photo.width * photo.height
         for photo in photos
@@ -123,7 +123,7 @@ def _pixels(photo: Photo, longest: int) -> float:
 
 
 def _make_database(layout: Layout, plan: Plan) -> None:
-    """The database with the cameras, the photos and where they were taken, but no features."""
+    """Make the database with cameras, photos and their positions, but without features."""
     import pycolmap
 
     scratch = layout.database.with_name(f".{layout.database.name}.tmp")
@@ -147,7 +147,7 @@ def _write_camera(
     photos: Sequence[Photo],
     positions: Mapping[str, NDArray[np.float64]],
 ) -> None:
-    """Writes photos that share a calibration."""
+    """Write photos that share a calibration."""
     import pycolmap
 
     camera_id = database.write_camera(_camera(plan, photos))
@@ -166,7 +166,7 @@ def _write_camera(
 
 
 def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
-    """The calibration to begin with: the focal length by EXIF, else 1.2 times the longer side."""
+    """Return the initial calibration. The focal length is from EXIF, or 1.2 x the longer side."""
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()
@@ -187,7 +187,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
 def _write_position(
     database: "pycolmap.Database", data: "pycolmap.data_t", position: NDArray[np.float64]
 ) -> None:
-    """Writes a place in the local frame, east, north, up: large coordinates lose digits."""
+    """Write a position in the local frame (east, north, up), as large coordinates lose digits."""
     import pycolmap
 
     system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
@@ -197,7 +197,7 @@ def _write_position(
 
 
 def _counts(path: Path) -> dict[str, int]:
-    """Features of each photo that has any."""
+    """Return the number of features of each photo in the database."""
     import pycolmap
 
     with quiet():

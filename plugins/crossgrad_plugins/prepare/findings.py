@@ -1,4 +1,4 @@
-"""Findings of a report: folders and their joins, photos that are missing or were lost."""
+"""Findings of a report: joins between folders, missing photos and lost photos."""
 
 import math
 from collections import Counter, defaultdict
@@ -11,12 +11,12 @@ from typing import Final
 from crossgrad_plugins.prepare.matching import Link
 from crossgrad_plugins.prepare.plan import Photo, Plan
 
-#: Fewer features than this find no place among others, and fewer than this share of the usual
-#: number, or of the usual sharpness, are worth a word.
+#: A photo with fewer features than this, or than this share of the median, is reported, as is a
+#: photo with less than this share of the median sharpness.
 _FEW, _LOW_SHARE, _BLURRED_SHARE = 200, 0.25, 0.2
 _DARK, _BRIGHT = 30.0, 235.0
-#: Heights of a ramp that joins two regimes differ by this factor, at most: SIFT matches photos
-#: whose scales differ by less than 1.5 well (docs/prepare.md).
+#: Greatest factor between the heights of successive photos on a ramp between two regimes. SIFT
+#: matches photos well if their scales differ by less than 1.5 (docs/prepare.md).
 _RUNG: Final = 1.4
 _MOST_RUNGS: Final = 12
 
@@ -26,10 +26,10 @@ class Lost:
     """A photo without a pose.
 
     Attributes:
-        name: Its name.
-        features: How many features it has.
-        links: With how many photos it has verified matches.
-        why: Why it may have none.
+        name: The photo's name.
+        features: Number of its features.
+        links: Number of photos with which it has verified matches.
+        why: Possible reason for the missing pose.
     """
 
     name: str
@@ -40,13 +40,13 @@ class Lost:
 
 @dataclass(frozen=True)
 class ModelJoin:
-    """The matches between two folders, or within one.
+    """The matches between two folders, or within one folder.
 
     Attributes:
         first: One folder.
-        second: The other; the same for pairs within one.
-        pairs: Pairs of photos with verified matches.
-        matches: These matches together.
+        second: The other folder, or the same folder for pairs within it.
+        pairs: Number of photo pairs with verified matches.
+        matches: Number of verified matches of all these pairs.
     """
 
     first: str
@@ -57,15 +57,15 @@ class ModelJoin:
 
 @dataclass(frozen=True)
 class BridgeReport:
-    """Photos that are missing between two parts of the scene.
+    """A gap between two parts of the scene, which further photos can close.
 
     Attributes:
         first: Folders of the larger part.
-        second: Folders of the part that is not joined to it.
-        photos: Number of photos of that part.
-        pairs: Pairs of photos with verified matches between the parts.
-        heights: Metres above ground of the lower and the higher part, where both are known.
-        advice: What to do, as a sentence.
+        second: Folders of the part that is not joined to the larger part.
+        photos: Number of photos of the second part.
+        pairs: Number of photo pairs with verified matches between the parts.
+        heights: Metres above ground of the lower and the higher part, or None if unknown.
+        advice: A sentence that tells the user what to do.
     """
 
     first: str
@@ -83,14 +83,14 @@ def lost_photos(
     models: Sequence[tuple[frozenset[str], bool]],
     misplaced: Mapping[str, tuple[int, int]],
 ) -> tuple[Lost, ...]:
-    """The photos that are not in the scene, and why they may not be.
+    """Return the photos that are not in the scene, with possible reasons.
 
     Args:
         plan: The plan.
         features: Name -> number of features.
         links: Pairs with verified matches.
-        models: Names of the photos of each model, and whether it is in the scene.
-        misplaced: Name -> matches for and against the pose of those that were taken out of a model.
+        models: Photo names of each model, and True if the model is in the scene.
+        misplaced: Name of a photo taken out of a model -> its matches for and against its pose.
     """
     partners: Counter[str] = Counter()
     for link in links:
@@ -120,7 +120,7 @@ def lost_photos(
 
 
 def _contradicted(agreeing: int, against: int) -> str:
-    """Why a photo was taken out of a model."""
+    """Return the reason why a photo was taken out of a model."""
     return (
         f"its matches contradict each other: {against} speak against the one place that {agreeing} "
         "speak for (walls, windows or pavements that repeat?)"
@@ -128,7 +128,7 @@ def _contradicted(agreeing: int, against: int) -> str:
 
 
 def _why(photo: Photo, features: int, partners: int, usual: tuple[float, float]) -> str:
-    """Why a photo may have no pose: what is wrong with it, then what it lacks."""
+    """Return why a photo may have no pose: first defects of the photo, then missing matches."""
     reasons = []
     if photo.brightness < _DARK:
         reasons.append(f"dark (mean grey level {photo.brightness:.0f} of 255)")
@@ -150,7 +150,7 @@ def _why(photo: Photo, features: int, partners: int, usual: tuple[float, float])
 
 
 def joins_of(plan: Plan, links: Sequence[Link]) -> tuple[ModelJoin, ...]:
-    """By how many matches folders are joined, pairs of folders without any included."""
+    """Return the matches between all pairs of folders, including pairs without matches."""
     folder = {photo.name: photo.folder for photo in plan.used}
     pairs: Counter[tuple[str, str]] = Counter()
     matches: Counter[tuple[str, str]] = Counter()
@@ -168,27 +168,26 @@ def bridges_of(
     parts: Sequence[frozenset[str]],
     heights: Mapping[str, float],
 ) -> tuple[BridgeReport, ...]:
-    """Where photos are missing that would join a part of the scene to its largest part.
+    """Return the gaps between the largest part of the scene and the other parts.
 
     Args:
         plan: The plan.
         links: Pairs with verified matches.
-        parts: Names of the photos of each model, the largest first, and of folders that are in no
-            model at all.
-        heights: Name -> metres above ground, where that is known.
+        parts: Photo names of each model, the largest first, and of folders that are in no model.
+        heights: Name -> metres above ground, if known.
     """
     if not parts:
         return ()
     main, grouped = parts[0], dict[str, set[str]]()
     for part in parts[1:]:
         if part - main:
-            # One bridge leads to all pieces of a folder.
+            # One bridge is enough for all pieces of a folder.
             grouped.setdefault(_folders(plan, part - main), set()).update(part - main)
     return tuple(_bridge(plan, links, (main, frozenset(p)), heights) for p in grouped.values())
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
-    """The photos of each model, and of each folder most of whose photos are in no model."""
+    """Return the photos of each model, and the missing photos of folders mostly in no model."""
     posed = frozenset().union(*models)
     missing: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter(photo.folder for photo in plan.used)
@@ -227,14 +226,14 @@ def _middle(names: Iterable[str], heights: Mapping[str, float]) -> float | None:
 
 
 def _folders(plan: Plan, names: Iterable[str]) -> str:
-    """The folders of photos, those with most of them first."""
+    """Return the folders of photos as text, folders with most photos first."""
     inside = set(names)
     counted = Counter(photo.folder for photo in plan.used if photo.name in inside)
     return " + ".join(folder or "photos in no folder" for folder, _ in counted.most_common(3))
 
 
 def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str:
-    """Which photos would join two parts."""
+    """Return advice on photos that would join two parts."""
     if first == second:
         return f"{first}: the photos fall apart; add some that overlap with both parts"
     if heights is None:
@@ -256,6 +255,6 @@ def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str
 
 
 def fallbacks(low: float, high: float) -> list[float]:
-    """Heights from the lower to the higher end, each a fixed factor above the one before."""
+    """Return heights from the lower to the higher end, with a constant factor between them."""
     steps = min(_MOST_RUNGS, max(1, math.ceil(math.log(high / low) / math.log(_RUNG))))
     return [low * (high / low) ** (step / steps) for step in range(steps + 1)]

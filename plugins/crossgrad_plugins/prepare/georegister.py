@@ -1,4 +1,4 @@
-"""Models in their place on Earth by GPS, and models that only GPS joins."""
+"""Georegistration of models by GPS, and merging of models that only GPS joins."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,29 +13,29 @@ from crossgrad_plugins.prepare.pycolmap_calls import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Photos with GPS that a similarity needs.
+#: Least number of photos with GPS for a similarity.
 FEWEST: Final = 3
-#: Metres by which GPS may be wrong, from a good receiver to a phone between houses; the first at
-#: which most photos agree is taken.
+#: Assumed GPS errors in metres, from a good receiver to a phone between houses. The first error
+#: with which most photos agree is used.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: Photos have to lie apart by so many times what GPS is off: across their main direction, or along
-#: it where they tell which way is up.
+#: Photos have to be this many GPS errors apart across their main direction. Along it this is
+#: enough only if the photos tell which way is up.
 _SPREAD: Final = 3.0
-#: Cameras that lie less across their line than this share of its length have no direction but it.
+#: Cameras are on a line if their spread across it is below this share of the spread along it.
 _STRAIGHT: Final = 0.05
-#: So many photos of a line are compared with each other, at most.
+#: Greatest number of photos on a line that are compared with each other.
 _ASKED: Final = 1_000
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A model on Earth.
+    """The placement of a model on Earth.
 
     Attributes:
         similarity: From the model to metres east, north, up.
-        residuals: Name -> [3] metres that a camera lies from its GPS, of all photos with GPS.
-        agreeing: Names of those that the similarity was found from.
+        residuals: Name of a photo with GPS -> [3] camera position minus GPS position, in metres.
+        agreeing: Names of the photos from which the similarity was found.
     """
 
     similarity: "pycolmap.Sim3d"
@@ -44,13 +44,13 @@ class Placement:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the agreeing residuals in metres."""
+        """Root mean square of the agreeing residuals, in metres."""
         lengths = [float(np.linalg.norm(self.residuals[name])) for name in sorted(self.agreeing)]
         return float(np.sqrt(np.mean(np.square(lengths))))
 
 
 def centers_of(model: "pycolmap.Reconstruction") -> dict[str, NDArray[np.float64]]:
-    """Name -> [3] centre of each camera of a model."""
+    """Return the centre [3] of each camera of a model, by photo name."""
     images = (model.image(number) for number in model.reg_image_ids())
     return {image.name: np.asarray(image.projection_center()) for image in images}
 
@@ -60,12 +60,12 @@ def placement_of(
     positions: Mapping[str, NDArray[np.float64]],
     tops: Mapping[str, NDArray[np.float64]],
 ) -> tuple[Placement | None, str]:
-    """The place of a model, and why it has none where it has none.
+    """Return the placement of a model, or None and the reason why it has no placement.
 
     Args:
         model: The model.
-        positions: Name -> [3] metres east, north, up, of the photos with GPS.
-        tops: Name -> [3] camera axis towards the top of the photo, of all photos.
+        positions: Name of a photo with GPS -> [3] metres east, north, up.
+        tops: Name of any photo -> [3] camera axis towards the top of the photo.
     """
     centers = centers_of(model)
     names = sorted(centers.keys() & positions.keys())
@@ -96,7 +96,7 @@ def placement_of(
 
 
 def _moved(similarity: "pycolmap.Sim3d", points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, 3]."""
+    """Return the transformed points [N, 3]."""
     matrix = similarity.matrix()
     return np.asarray(points @ matrix[:, :3].T + matrix[:, 3])
 
@@ -104,9 +104,9 @@ def _moved(similarity: "pycolmap.Sim3d", points: NDArray[np.float64]) -> NDArray
 def _line(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], tuple[float, float], NDArray[np.float64]]:
-    """Middle [3] of points [N, 3], how far they lie along and across their line, its direction.
+    """Fit a line to points [N, 3] and return middle [3], spread along and across, direction [3].
 
-    Distances are root mean squares.
+    The spreads are root mean squares.
     """
     middle = points.mean(0)
     _, sizes, axes = np.linalg.svd(points - middle, full_matrices=False)
@@ -117,7 +117,7 @@ def _line(
 def _aligned(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """The similarity between points [N, 3] that most agree with, and which do."""
+    """Return the similarity between points [N, 3] with which most agree, and the agreeing ones."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
@@ -139,10 +139,10 @@ def _aligned(
 def _on_a_line(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """A similarity of points [N, 3] on a line, with any roll about it, and which agree with it.
+    """Return a similarity for points [N, 3] on a line, and the agreeing points.
 
-    Its scale and direction are the medians of those of all pairs (Theil and Sen); of many photos,
-    of those of some all along it.
+    The roll about the line is arbitrary. Scale and direction are medians over all pairs of points
+    (Theil-Sen estimator), or over pairs of at most `_ASKED` points along the line.
     """
     import pycolmap
     from scipy.spatial.transform import Rotation
@@ -173,10 +173,10 @@ def _on_a_line(
 def merged(
     model: "pycolmap.Reconstruction", others: "Sequence[pycolmap.Reconstruction]"
 ) -> "pycolmap.Reconstruction":
-    """A model with the photos and points of others that lie in the same frame.
+    """Return a model with the added photos and points of other models in the same frame.
 
-    Photos that it has already are not added again. Other models have calibrated their cameras by
-    themselves, so these come as cameras of their own.
+    Photos that the model already contains are not added again. Other models calibrated their
+    cameras independently, so their cameras are added as new cameras.
     """
     import pycolmap
 

@@ -1,4 +1,4 @@
-"""The folder of a scene that is prepared: what is where, and whose folder it is."""
+"""The folder of a prepared scene: its files, and the check that `prepare` made the folder."""
 
 import shutil
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from crossgrad_core.commands import (
 )
 from crossgrad_plugins.prepare.pycolmap_calls import is_whole
 
-#: The folder of what is needed on the way, and the file that says that `prepare` made it.
+#: The folder of intermediate files, and the file that shows that `prepare` made it.
 WORK: Final = "prepare"
 PLAN: Final = "plan.json"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything is; each thing has its name only when it is complete.
+    """The paths in a scene folder. A file or folder gets its name only when it is complete.
 
     Attributes:
         scene: The scene's folder.
@@ -32,47 +32,47 @@ class Layout:
 
     @property
     def work(self) -> Path:
-        """What is needed on the way."""
+        """The folder of intermediate files."""
         return self.scene / WORK
 
     @property
     def plan(self) -> Path:
-        """The photos and settings; says that the folder is ours."""
+        """The photos and settings. The file shows that `prepare` made the folder."""
         return self.work / PLAN
 
     @property
     def database(self) -> Path:
-        """Cameras, features and matches, in COLMAP's form."""
+        """Cameras, features and matches, as a COLMAP database."""
         return self.work / "database.db"
 
     @property
     def features(self) -> Path:
-        """How many features each photo has; there when all are found."""
+        """Number of features of each photo. The file exists when all features are found."""
         return self.work / "features.json"
 
     @property
     def links(self) -> Path:
-        """The pairs of photos with verified matches; there when all pairs are compared."""
+        """Photo pairs with verified matches. The file exists when all pairs are compared."""
         return self.work / "links.json"
 
     @property
     def models(self) -> Path:
-        """One folder for each model, distorted as the photos are; there when mapping is done."""
+        """One folder for each model of the distorted photos. Exists when mapping is finished."""
         return self.work / "models"
 
     @property
     def misplaced(self) -> Path:
-        """The photos that were taken out of models; there when mapping is done."""
+        """The photos that were taken out of models. The file exists when mapping is finished."""
         return self.work / "misplaced.json"
 
     @property
     def placed(self) -> Path:
-        """The model of the scene, in its place on Earth where that is known."""
+        """The model of the scene, georegistered if its place on Earth is known."""
         return self.work / "placed"
 
     @property
     def undistorted(self) -> Path:
-        """Photos on their way to their place; only its scratch folder is ever there."""
+        """Undistorted photos before they are moved. Only the scratch folder of this path exists."""
         return self.work / "undistorted"
 
     @property
@@ -87,7 +87,7 @@ class Layout:
 
     @property
     def model(self) -> Path:
-        """The model of the undistorted photos; there when the scene is complete."""
+        """The model of the undistorted photos. The folder exists when the scene is complete."""
         return self.scene / "sparse" / "0"
 
     @property
@@ -97,26 +97,26 @@ class Layout:
 
     @property
     def report(self) -> Path:
-        """The report as data; written last."""
+        """The report as data, which is written last."""
         return self.scene / "report.json"
 
     @property
     def is_ready(self) -> bool:
-        """Whether the scene is complete: nothing more will be written."""
+        """True if the scene is complete, so that nothing more is written."""
         return self.report.is_file() and self.model.is_dir() and self.images.is_dir()
 
     @property
     def is_whole(self) -> bool:
-        """Whether everything is there that tells what a ready scene was made of."""
+        """True if all files exist that show how a finished scene was made."""
         files, folders = (self.plan, self.features, self.links), (self.models, self.placed)
         return all(each.is_file() for each in files) and all(each.is_dir() for each in folders)
 
 
 def check_ours(layout: Layout, photos: Path) -> None:
-    """Refuses a folder that `prepare` did not make, and one that lies where the photos are.
+    """Refuse a folder that `prepare` did not make, and a folder among the photos.
 
     Raises:
-        UserError: What is in the way, and what to do.
+        UserError: The folder is refused. The error tells the user what to do.
     """
     scene = layout.scene
     if layout.is_ready:
@@ -133,7 +133,7 @@ def check_ours(layout: Layout, photos: Path) -> None:
         )
     if layout.plan.is_file() or not scene.is_dir():
         return
-    # Only the lock, and what a process that was killed at once left of the plan.
+    # Accept only the lock, and temporary files of a plan that a killed process left.
     left = [path for path in scene.iterdir() if path.name not in {WORK, "run.lock"}]
     if left or (layout.work.is_dir() and any(not _is_hidden(p) for p in layout.work.iterdir())):
         raise UserError(
@@ -146,7 +146,7 @@ def check_ours(layout: Layout, photos: Path) -> None:
 
 
 def _check_whole(layout: Layout) -> None:
-    """Refuses a ready scene of which something is gone or cut short."""
+    """Refuse a finished scene with a missing or truncated part."""
     if not layout.is_whole:
         raise UserError(
             "the scene is ready, but nothing tells any more which photos it was made of",
@@ -170,7 +170,7 @@ def _is_hidden(path: Path) -> bool:
 
 
 def emptied(folder: Path) -> Path:
-    """The folder, new and empty.
+    """Make the folder new and empty, and return it.
 
     Raises:
         UserError: The disk is full, or the folder may not be written to.
@@ -182,9 +182,9 @@ def emptied(folder: Path) -> Path:
 
 
 def clear_leftovers(layout: Layout) -> None:
-    """Deletes what a killed process left half-made; only one process works in the folder.
+    """Delete unfinished files of a killed process. Only one process works in the folder.
 
-    Other hidden files and folders are the user's, such as those of version control.
+    Other hidden files and folders belong to the user, such as version control.
     """
     for made in (layout.undistorted, layout.placed, layout.models):
         _delete(scratch_of(made))
@@ -196,7 +196,7 @@ def clear_leftovers(layout: Layout) -> None:
 
 
 def clear_damaged(layout: Layout) -> None:
-    """Deletes models that are cut short, and what was made of them."""
+    """Delete truncated models, and everything that was made from them."""
     damaged = False
     for made in (layout.models, layout.placed, layout.model):
         damaged = damaged or not _is_sound(layout, made)
@@ -205,13 +205,13 @@ def clear_damaged(layout: Layout) -> None:
 
 
 def _is_sound(layout: Layout, made: Path) -> bool:
-    """Whether the models of a stage are whole, or not made yet."""
+    """Return whether the models of a stage are complete, or not made yet."""
     models = models_in(made) if made == layout.models else [made]
     return not made.is_dir() or all(is_whole(model) for model in models)
 
 
 def models_in(folder: Path) -> list[Path]:
-    """The folders of the models that mapping found, in the order of their numbers."""
+    """Return the folders of the models that mapping found, sorted by number."""
     models = [path for path in folder.glob("*") if path.name.isdecimal()]
     return sorted(models, key=lambda path: int(path.name))
 
@@ -224,5 +224,5 @@ def _delete(path: Path) -> None:
 
 
 def scratch_of(path: Path) -> Path:
-    """Where a folder is made before it gets its name."""
+    """Return the scratch path in which a folder is made before it gets its name."""
     return path.with_name(f".{path.name}.tmp")

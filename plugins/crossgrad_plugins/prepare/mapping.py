@@ -1,4 +1,4 @@
-"""From matches to poses and points: one model, or several where photos cannot be joined."""
+"""Mapping: poses and points from matches, as one model or as several unconnected models."""
 
 import itertools
 import json
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Points that a pose needs, as in COLMAP's incremental mapping, and that two photos of one model
-#: share, directly or by others in between: as many as the matches of a verified pair.
+#: Least number of points for a pose, as in COLMAP's incremental mapping, and least number of points
+#: that two photos of a model share, directly or through other photos, as for a verified pair.
 _POINTS, _SHARED = 30, 15
 
 
 def sound_models(
     models: "Iterable[pycolmap.Reconstruction]", smallest: int
 ) -> "list[pycolmap.Reconstruction]":
-    """The models without photos that too few points hold, each part of a model by itself.
+    """Return the models without weakly supported photos, each connected part as its own model.
 
-    Global mapping places every photo that rotations reach, by a single wrong pair if need be, and
-    says nothing of it; the points that survive tell.
+    Global mapping places every photo that it can reach by rotations, even through a single wrong
+    pair, and gives no warning. The points that remain show whether the photo is supported.
 
     Args:
-        models: The models as mapping left them.
-        smallest: Photos that a model has at least.
+        models: The models after mapping.
+        smallest: Least number of photos in a model.
     """
     return [
         _only(model, part) for model in models for part in _parts(model) if len(part) >= smallest
@@ -46,7 +46,7 @@ def sound_models(
 
 
 def _parts(model: "pycolmap.Reconstruction") -> list[frozenset[int]]:
-    """Numbers of the photos of each part."""
+    """Return the numbers of the photos of each connected part."""
     numbers = np.array(sorted(model.reg_image_ids()))
     counts = np.array([model.image(int(number)).num_points3D for number in numbers])
     held = numbers[counts >= _POINTS]
@@ -66,7 +66,7 @@ def _parts(model: "pycolmap.Reconstruction") -> list[frozenset[int]]:
 
 
 def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.Reconstruction":
-    """The model with the photos of a part alone."""
+    """Return a copy of the model with only the photos of a part."""
     import pycolmap
 
     alone = pycolmap.Reconstruction(model)
@@ -76,16 +76,16 @@ def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.R
     return alone
 
 
-#: From so many photos on all poses are found at once: those of one folder, and of several, which
-#: may be joined by few matches: global mapping misplaces such parts (docs/prepare.md).
+#: Least number of photos for global mapping: for one folder, and for several folders. Folders may
+#: be joined by few matches, and global mapping misplaces such parts (docs/prepare.md).
 _MANY, _MANY_OF_FOLDERS = 100, 1000
-#: A model of fewer photos is none.
+#: Least number of photos in a model.
 _SMALLEST: Final = 3
 Models = Mapping[int, "pycolmap.Reconstruction"]
 
 
 def way_of(plan: Plan) -> str:
-    """How poses are found."""
+    """Return the name of the mapping method."""
     if plan.settings.mapper != "auto":
         return plan.settings.mapper
     many = _MANY if len(plan.folders) == 1 else _MANY_OF_FOLDERS
@@ -93,7 +93,7 @@ def way_of(plan: Plan) -> str:
 
 
 def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Reconstruction]":
-    """The models, that with most photos first.
+    """Return the models, sorted by number of photos, the largest first.
 
     Raises:
         UserError: No two photos could be brought together, the disk is full, or pycolmap failed.
@@ -121,7 +121,7 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
 
 
 def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
-    """Name -> matches for and against the pose of each photo that was taken out of a model."""
+    """Return the matches for and against the pose of each photo taken out of a model, by name."""
     if not layout.misplaced.is_file():
         return {}
     return {
@@ -132,12 +132,12 @@ def misplaced(layout: Layout) -> dict[str, tuple[int, int]]:
 def _without_misplaced(
     layout: Layout, models: "list[pycolmap.Reconstruction]", settled: frozenset[int] = frozenset()
 ) -> "list[pycolmap.Reconstruction]":
-    """The models without photos whose matches contradict their poses; those are written down.
+    """Remove photos whose matches contradict their poses, and store their names and matches.
 
     Args:
-        layout: Where.
-        models: The models, the largest one first.
-        settled: Its photos for which no better place is known.
+        layout: The paths of the scene.
+        models: The models, the largest first.
+        settled: Photos of the largest model for which no better place is known.
     """
     found: dict[str, tuple[int, int]] = {}
     for number, model in enumerate(models):
@@ -161,7 +161,7 @@ def _without_misplaced(
 
 
 def read_models(folder: Path) -> "Iterator[tuple[Path, pycolmap.Reconstruction]]":
-    """The models of a folder in the order of their numbers."""
+    """Yield the models of a folder and their paths, sorted by number."""
     import pycolmap
 
     for path in models_in(folder):
@@ -194,7 +194,7 @@ def _options(threads: int) -> "pycolmap.IncrementalPipelineOptions":
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
     options.min_model_size = _SMALLEST
-    # It places photos by pairs, too, without asking how many agree.
+    # The fallback also places photos by pairs, but does not check how many pairs agree.
     options.structure_less_registration_fallback = False
     return options
 
@@ -206,7 +206,7 @@ def _looked_again(
     scratch: Path,
     models: "list[pycolmap.Reconstruction]",
 ) -> "tuple[list[pycolmap.Reconstruction], frozenset[int]]":
-    """The models after a second look at doubtful photos, and those for which nothing is better."""
+    """Return the models with doubtful photos refined, and the photos without a better pose."""
     adjust = partial(_adjusted, threads, Path(plan.photos))
     with disk_errors(scratch):
         return waited(
@@ -221,7 +221,7 @@ def _looked_again(
 def _adjusted(
     threads: int, photos: Path, token: "pycolmap.CancellationToken", database: Path, place: Path
 ) -> "pycolmap.Reconstruction":
-    """The model in a folder with its points made anew by a database, and mapped on from there."""
+    """Return the model in a folder after a new triangulation and continued mapping."""
     import pycolmap
 
     anew, found = (emptied(place / name) for name in ("anew", "found"))

@@ -1,4 +1,4 @@
-"""Masks of photos: which file is whose, whether it fits, and its pixels as the photo is stored."""
+"""Masks of photos: pairing with photos, checks, and pixels in the orientation of the photo."""
 
 import os
 from collections import defaultdict
@@ -19,23 +19,23 @@ from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 
-#: Folders of this name hold masks, and so do files beside the photos whose stem ends so.
+#: Folders with this name contain masks, and so do files next to photos whose stem ends like this.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
 #: The level of a mask or of transparency below which a pixel does not count.
 HALF: Final = 128
-#: EXIF orientations by which a photo is shown turned by a quarter -> those that turn it back.
+#: EXIF orientations that rotate a photo by a quarter turn -> orientations that undo the rotation.
 _BACK: Final = {5: 5, 6: 8, 7: 7, 8: 6}
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """The image files below a folder, told apart by their names.
+    """The image files below a folder, separated by their names.
 
     Attributes:
         photos: Names of the photos.
-        masks: Name of a photo -> its mask, where it has one.
-        left_out: Folders of masks where nobody may expect them, and masks of no photo.
+        masks: Name of a photo with a mask -> its mask.
+        left_out: Reported mask folders, and masks that match no photo.
     """
 
     photos: tuple[str, ...]
@@ -44,16 +44,16 @@ class Sorted:
 
 
 def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
-    """Tells photos from masks.
+    """Separate photos from masks.
 
     Args:
         root: Folder of the photos.
         files: Names of the image files below it.
-        wanted: Folder of the masks; None for `masks` below the photos, folders of this name with
-            the masks of photos beside them, and files beside the photos.
+        wanted: Folder of the masks. If None, masks are searched in the folder `masks`, in other
+            folders named `masks` whose files match photos next to them, and next to the photos.
 
     Raises:
-        UserError: The folder is not there, or no photo has a mask in it.
+        UserError: The folder is missing, or contains no mask for any photo.
     """
     if wanted is not None and not wanted.is_dir():
         raise UserError(
@@ -70,7 +70,7 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
         masks = _usual(root, photos, folders)
     else:
         masks = _wanted(root, photos, wanted)
-        # The folder may be that of the photos.
+        # The mask folder may be the folder of the photos.
         taken = frozenset(map(os.path.realpath, masks.values()))
         photos = [name for name in photos if os.path.realpath(root / name) not in taken]
         masks = {name: masks[name] for name in photos if name in masks}
@@ -80,10 +80,10 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
 
 
 def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str, list[str]]:
-    """The folders of masks among the photos, with the names of their files.
+    """Return the mask folders among the photos, with the names of their files.
 
-    These are the one that was asked for, `masks` itself, and others of this name most of whose
-    files are named after photos beside them.
+    These are the requested folder, the top folder `masks`, and other folders with this name if
+    most of their files are named after photos next to them.
     """
     asked = _asked(root, wanted)
 
@@ -107,13 +107,13 @@ def _folders(root: Path, files: Sequence[str], wanted: Path | None) -> dict[str,
 
 
 def _asked(root: Path, wanted: Path | None) -> str | None:
-    """The true place of the folder that was asked for; None where it is the one of the photos."""
+    """Return the real path of the requested folder, or None if it is the folder of the photos."""
     asked = None if wanted is None else os.path.realpath(wanted)
     return None if asked == os.path.realpath(root) else asked
 
 
 def _below(folder: str, name: str) -> str | None:
-    """A photo's name below the folder that a folder of masks lies in; None where it is not."""
+    """Return a photo's name relative to the parent of a mask folder, or None if outside of it."""
     base = PurePosixPath(folder).parent.as_posix()
     if base == ".":
         return name
@@ -121,7 +121,7 @@ def _below(folder: str, name: str) -> str | None:
 
 
 def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[str]) -> set[str]:
-    """Those files of a folder of masks that are named after photos."""
+    """Return the files of a mask folder that are named after photos."""
     below = (_below(folder, name) for name in photos)
     named = {f"{folder}/{each}" for name in below if name is not None for each in mask_names(name)}
     named |= {path.relative_to(root).as_posix() for path in _paired(root, folder, photos).values()}
@@ -129,14 +129,14 @@ def _of_photos(root: Path, folder: str, inside: Iterable[str], photos: Sequence[
 
 
 def _paired(root: Path, folder: str, photos: Sequence[str]) -> dict[str, Path]:
-    """The masks in a folder below `root`, of the photos beside it: photo -> mask."""
+    """Return photo -> mask for the masks in a folder below `root` and the photos next to it."""
     below = {name: each for name in photos if (each := _below(folder, name)) is not None}
     found = pair_masks(root / folder, [*below.values()])
     return {name: found[each] for name, each in below.items() if each in found}
 
 
 def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[str, Path]:
-    """The masks that are found without being asked for: in `masks`, other folders, or beside."""
+    """Return the default masks: in `masks`, in other folders with this name, or next to photos."""
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in photos}
     beside = {name: [root / f"{stem}{end}.png" for end in _ENDS] for name, stem in stems.items()}
     masks = _first(root, beside)
@@ -147,7 +147,7 @@ def _usual(root: Path, photos: Sequence[str], folders: Iterable[str]) -> dict[st
 
 
 def _wanted(root: Path, photos: Sequence[str], folder: Path) -> dict[str, Path]:
-    """The masks in the folder that was asked for."""
+    """Return the masks in the requested folder."""
     masks = _first(root, {name: [folder / each for each in mask_names(name)] for name in photos})
     if os.path.realpath(folder) == os.path.realpath(root):
         return masks
@@ -157,7 +157,7 @@ def _wanted(root: Path, photos: Sequence[str], folder: Path) -> dict[str, Path]:
 
 
 def _first(root: Path, places: Mapping[str, Iterable[Path]]) -> dict[str, Path]:
-    """The first file that is there, for each photo that has one; no photo is a mask of itself."""
+    """Return the first existing file for each photo. A photo is never its own mask."""
     found: dict[str, Path] = {}
     for name, paths in places.items():
         own = os.path.realpath(root / name)
@@ -184,7 +184,7 @@ def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) 
 def _tell_folders(
     root: Path, folders: Mapping[str, Sequence[str]], photos: Sequence[str], wanted: Path | None
 ) -> Iterator[LeftOut]:
-    """What is said of folders of masks: not of `masks` itself, unless it holds other files."""
+    """Yield messages on mask folders, on `masks` itself only if it contains other files."""
     asked = _asked(root, wanted)
     for folder, inside in sorted(folders.items()):
         named = _of_photos(root, folder, inside, photos)
@@ -201,7 +201,7 @@ def _tell_folders(
 
 
 def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
-    """Files among the photos that are named as masks, and are none."""
+    """Yield files among the photos that are named like masks but are not masks."""
     stems = {str(PurePosixPath(name).with_suffix("")) for name in photos}
     masks = {f"{stem}{end}" for stem in stems for end in _ENDS}
     for name in beside:
@@ -216,10 +216,10 @@ def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
 
 
 def with_mask(photo: Photo, mask: Path) -> Photo:
-    """The photo with its mask, which is decoded once, so that a damaged one is known at once.
+    """Return the photo with its mask. The mask is decoded, so that damage is found early.
 
     Raises:
-        UserError: It is damaged, or not in the proportion of the photo, stored or as it is shown.
+        UserError: The mask is damaged, or matches neither the stored nor the displayed proportions.
     """
     check_mask(mask, (photo.width, photo.height), may_turn=photo.orientation in _BACK)
     decode_mask(mask)
@@ -227,10 +227,10 @@ def with_mask(photo: Photo, mask: Path) -> Photo:
 
 
 def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
-    """[H, W] 255 where a pixel of a photo counts, by its mask and its transparency; None: all do.
+    """Return [H, W] with 255 for pixels that count by mask and transparency, or None for all.
 
     Raises:
-        UserError: The photo or its mask is damaged, or does not fit any more.
+        UserError: The photo or its mask is damaged, or the mask no longer fits.
     """
     kept = None if photo.mask is None else _as_stored(photo, Path(photo.mask))
     if not photo.transparent:
@@ -243,7 +243,7 @@ def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
 
 
 def _as_stored(photo: Photo, path: Path) -> NDArray[np.uint8]:
-    """[H, W] a mask in the size of its photo; one that was drawn on the turned photo is turned."""
+    """Return a mask [H, W] in the size of its stored photo, rotated back if it was rotated."""
     from PIL import Image
 
     size = photo.width, photo.height

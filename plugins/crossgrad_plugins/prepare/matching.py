@@ -1,4 +1,4 @@
-"""Which photos show the same: pairs with matches that one epipolar geometry explains."""
+"""Search for photo pairs with matches that one epipolar geometry explains."""
 
 import json
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Visual words, and features that they are made from: faiss asks for 39 of each word.
+#: Number of visual words, and of features from which they are made. faiss requires 39 per word.
 _WORDS, _SAMPLE = 2048, 100_000
-#: Iterations of k-means, once; the words need not be good.
+#: Iterations of k-means, in one round, because approximate words are good enough.
 _ITERATIONS: Final = 20
-#: Numbers of a feature, and of its embedding in the index (pycolmap).
+#: Number of values of a feature, and of its embedding in the index (pycolmap).
 _SIFT, _EMBEDDED = 128, 64
 
 
 def index_of(layout: Layout, threads: int) -> Path:
-    """The file of the index, made where it is not there.
+    """Return the file of the visual index, which is made if it does not exist.
 
     Raises:
         UserError: Pycolmap failed.
@@ -55,7 +55,7 @@ def _build(layout: Layout, threads: int) -> "pycolmap.VisualIndex":
 
 
 def _sample(layout: Layout) -> NDArray[np.float32]:
-    """[N, 128] features, as many of each photo."""
+    """Return a sample of features [N, 128] with an equal number from each photo."""
     import pycolmap
 
     rng = np.random.default_rng(0)
@@ -75,25 +75,25 @@ def _sample(layout: Layout) -> NDArray[np.float32]:
     return np.concatenate(parts)
 
 
-#: Up to so many photos all pairs are compared; without GPS, up to the second, and where they are in
-#: several folders, which few pairs may join, up to the third.
+#: Greatest number of photos for comparing all pairs: always, without GPS, and without GPS if the
+#: photos are in several folders, which only few pairs may join.
 _FEW, _SOME, _SOME_OF_FOLDERS = 60, 100, 250
-#: Share of the photos that need GPS for neighbours to be told by it.
+#: Least share of photos with GPS for choosing neighbours by GPS.
 _MOST_LOCATED: Final = 0.9
-#: Photos that each one is compared with: the nearest by GPS, the most alike, the next by name.
+#: Number of photos that each photo is compared with: nearest by GPS, most alike, next by name.
 _NEAREST, _ALIKE, _NEXT = 40, 40, 5
-#: Next by name where nothing else tells neighbours.
+#: Number of next photos by name if nothing else determines neighbours.
 _NEXT_ALONE: Final = 20
-#: Neighbours by GPS are not farther away, in metres: GPS that is wrong finds none.
+#: Greatest distance of neighbours by GPS in metres. Wrong GPS then finds no neighbours.
 _FARTHEST: Final = 500.0
-#: Features of a photo by which others like it are looked up, at most.
+#: Greatest number of features of a photo that are used to look up similar photos.
 _LOOKED_UP: Final = 2000
-#: Geometries that are tried to explain the matches of a pair, at most. COLMAP tries five times as
-#: many of pairs that show nothing in common.
+#: Greatest number of geometries that are tried for the matches of a pair. COLMAP tries five times
+#: as many for pairs that share no content.
 _TRIALS: Final = 2000
-#: Bytes of a pair in the database for each feature of a photo that is asked for.
+#: Bytes of a pair in the database for each requested feature of a photo.
 _BYTES_OF_PAIR: Final = 2
-#: How photos to compare are chosen -> pycolmap's ways that this takes.
+#: Method for choosing photos to compare -> pycolmap's pairing methods.
 _WAYS: Final = {
     "exhaustive": ("exhaustive",),
     "spatial": ("spatial", "sequential"),
@@ -104,12 +104,12 @@ _WAYS: Final = {
 
 @dataclass(frozen=True)
 class Link:
-    """Two photos that show the same.
+    """Two photos that show the same scene content.
 
     Attributes:
-        first: Name of one.
-        second: Name of the other.
-        matches: Matches that their epipolar geometry explains.
+        first: Name of one photo.
+        second: Name of the other photo.
+        matches: Number of matches that their epipolar geometry explains.
     """
 
     first: str
@@ -118,7 +118,7 @@ class Link:
 
 
 def way_of(plan: Plan) -> str:
-    """How photos to compare are chosen."""
+    """Return the name of the method that chooses photos to compare."""
     chosen, photos = plan.settings.matching, len(plan.used)
     if chosen != "auto":
         return chosen
@@ -131,7 +131,7 @@ def way_of(plan: Plan) -> str:
 
 
 def check_gps(plan: Plan) -> None:
-    """Refuses to tell neighbours by GPS where photos have none.
+    """Refuse to choose neighbours by GPS if fewer than two photos have GPS.
 
     Raises:
         UserError: Fewer than two photos have GPS.
@@ -146,7 +146,7 @@ def check_gps(plan: Plan) -> None:
 
 
 def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
-    """The pairs with verified matches; pairs that are done are not compared again.
+    """Return the pairs with verified matches. Finished pairs are not compared again.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -172,7 +172,7 @@ def found_links(layout: Layout, plan: Plan, threads: int) -> tuple[Link, ...]:
 
 
 def _room(layout: Layout, plan: Plan, way: str) -> int:
-    """Bytes that the pairs that are missing take; SQLite ends the process on a full disk."""
+    """Return the bytes that missing pairs need, because SQLite aborts on a full disk."""
     photos = len(plan.used)
     each = {"exhaustive": photos / 2, "sequential": _NEXT_ALONE}.get(way, _ALIKE + _NEXT)
     missing = photos * min(each, photos / 2) - rows_of(layout.database, "two_view_geometries")
@@ -190,7 +190,7 @@ def _match(
 
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = threads
-    # Each pair by itself: the same in whatever order, and after whatever interruption.
+    # A fixed seed for each pair makes results independent of order and interruptions.
     verification.ransac.random_seed = 0
     verification.ransac.max_num_trials = _TRIALS
     compare = getattr(pycolmap, f"match_{way}")
@@ -201,13 +201,13 @@ def _match(
 
 
 def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
-    """Pycolmap's options for one of its ways to choose pairs."""
+    """Return pycolmap's options for one of its pairing methods."""
     import pycolmap
 
     options: Any
     if each == "spatial":
         options = pycolmap.SpatialPairingOptions()
-        # Photos from the ground are neighbours of those from above them.
+        # Photos from the ground are neighbours of photos taken above them.
         options.ignore_z = True
         options.max_num_neighbors, options.max_distance = _NEAREST, _FARTHEST
     elif each == "vocabtree":
@@ -224,7 +224,7 @@ def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
 
 
 def _pairs(layout: Layout, pairings: dict[str, object]) -> str:
-    """How many pairs will be compared, as " of 378"; empty where it takes long to know."""
+    """Return the number of pairs to compare as text, " of 378", or "" if it is slow to compute."""
     import pycolmap
 
     kinds: dict[str, Any] = {

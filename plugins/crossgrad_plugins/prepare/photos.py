@@ -1,4 +1,4 @@
-"""The photos of a folder: those that can be used, with what their files say, and the others."""
+"""The photos of a folder: usable photos with their metadata, and unusable files."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +31,7 @@ _MAKE, _MODEL, _FOCAL, _FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405
 
 
 def camera_of(image: "Image") -> str:
-    """Make, model and focal length, as the photo says; photos of one zoom agree."""
+    """Return make, model and focal length from EXIF, which agree for photos of the same zoom."""
     header = image.getexif()
     details = header.get_ifd(_EXIF)
     parts = [header.get(_MAKE), header.get(_MODEL), _number(details.get(_FOCAL)),
@@ -40,13 +40,13 @@ def camera_of(image: "Image") -> str:
 
 
 def orientation_of(image: "Image") -> int:
-    """How the photo is turned when it is shown, 1 to 8; 1 where it does not say."""
+    """Return the EXIF orientation of the photo, 1 to 8, or 1 if it is missing."""
     found = image.getexif().get(_ORIENTATION)
     return found if isinstance(found, int) and found in _ORIENTATIONS else 1
 
 
 def position_of(image: "Image") -> Position | None:
-    """Where the photo was taken; None where it does not say, or says what no place is."""
+    """Return the GPS position of the photo, or None if it is missing or invalid."""
     latitude, longitude, altitude = gps_of(image)
     if not is_place(latitude, longitude) or not isfinite(altitude):
         return None
@@ -61,7 +61,7 @@ def _number(value: object) -> float | None:
     return number if isfinite(number) else None
 
 
-#: Photo files that pycolmap reads, and others that cameras and editors write.
+#: Suffixes of photo files that pycolmap reads, and of other files of cameras and editors.
 _READ: Final = frozenset({".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"})
 _UNREAD: Final = frozenset(
     {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef",
@@ -72,12 +72,12 @@ _IMPOSSIBLE: Final = (
     "its name has control characters or backslashes, is too long or is not UTF-8: rename it"
 )
 _SMALLEST: Final = 64
-#: So many times the usual most pixels may be those of a JPEG file: phones have 200 megapixels.
+#: A JPEG file may have this many times the usual limit of pixels: phones have 200 megapixels.
 _REDUCIBLE: Final = 2
-#: Photos are looked at with their longest side at about so many pixels.
+#: Approximate longest side in pixels of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-#: Photos larger than a share of the most pixels are decoded one after the other.
+#: Lock that makes large photos (a fixed share of the greatest size) be decoded one at a time.
 _LARGE: Final = Lock()
 Tell = Callable[[int, int], None]
 
@@ -85,18 +85,18 @@ Tell = Callable[[int, int], None]
 def find_photos(
     root: Path, settings: Settings, tell: Tell, fewest: int = 2
 ) -> tuple[tuple[Photo, ...], tuple[LeftOut, ...]]:
-    """All photos below a folder, by name, and the files that cannot be used.
+    """Return all usable photos below a folder, sorted by name, and the unusable files.
 
-    Every photo is decoded at a reduced size, so that damaged ones are known before they cost more.
+    Every photo is decoded at a reduced size, so that damaged photos are found early.
 
     Args:
         root: The folder.
-        settings: Where masks are, and which photos share a calibration.
-        tell: Told how many photos of how many are looked at.
-        fewest: Photos that there have to be: a pose needs a second one.
+        settings: Gives the mask folder, and which photos share a calibration.
+        tell: Called with the number of inspected photos and the number of all photos.
+        fewest: Least number of photos. A pose requires at least two photos.
 
     Raises:
-        UserError: There is no such folder, fewer photos in it can be used, one of them is too large
+        UserError: The folder is missing, it contains too few usable photos, a photo is too large
             to be decoded, or a mask does not fit or is damaged.
     """
     _check_folder(root)
@@ -123,7 +123,7 @@ def find_photos(
 
 
 def has_photos(root: Path) -> bool:
-    """Whether photos lie in a folder, or in those below it."""
+    """Return whether a folder or its subfolders contain photos."""
     return any(Path(name).suffix.lower() in _READ for name in _names(root))
 
 
@@ -139,7 +139,7 @@ def _check_folder(root: Path) -> None:
 
 
 def _check_text(folder: Path) -> None:
-    """Refuses a folder that cannot be written down in the plan."""
+    """Refuse a folder whose name cannot be written into the plan."""
     try:
         str(folder).encode()
     except UnicodeEncodeError as error:
@@ -152,27 +152,27 @@ def _check_text(folder: Path) -> None:
 
 
 def _names(root: Path) -> Iterator[str]:
-    """Paths of all files below a folder, sorted in each folder; hidden ones are left out."""
+    """Yield paths of all files below a folder, sorted in each folder, without hidden files."""
     for below, folders, files in walked(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         here = PurePosixPath(below)
         yield from ((here / file).as_posix() for file in sorted(files) if file[0] != ".")
 
 
-#: What a TIFF may hold that no photo has; by Pillow's names.
+#: Pillow's names for TIFF pixel modes that are not used for photos.
 _MODES_OF_TIFF: Final = ("I", "1")
 _VALUES: Final = {"F": "floating point", "I": "32 bits", "1": "1 bit"}
 
 
 def _listed(names: Iterable[str]) -> tuple[list[str], list[LeftOut]]:
-    """Names of the photos, and of those that cannot be used by what they are called."""
+    """Return the usable photo names, and the files that are unusable because of their name."""
     usable, left_out = [], []
     for name in names:
         suffix = PurePosixPath(name).suffix.lower()
         if suffix in _UNREAD:
             what = suffix[1:].upper()
             left_out.append(LeftOut(name=_shown(name), why=f"{what} cannot be read: save as JPEG"))
-        # Its mask has one more suffix; COLMAP's models may come from Windows.
+        # The mask's name has one more suffix. COLMAP models may come from Windows.
         elif "\\" in name or not is_possible_name(f"{name}.png"):
             left_out.append(LeftOut(name=_shown(name), why=_IMPOSSIBLE))
         else:
@@ -185,10 +185,10 @@ def _shown(name: str) -> str:
 
 
 def _looked_at(root: Path, name: str, mask: Path | None, cameras: str) -> Photo | LeftOut:
-    """The photo, or why it cannot be used.
+    """Return the photo, or the reason why it cannot be used.
 
     Raises:
-        UserError: It is too large, or its mask is not one for it.
+        UserError: The photo is too large, or its mask does not fit.
     """
     path = root / name
     try:
@@ -209,16 +209,16 @@ def _looked_at(root: Path, name: str, mask: Path | None, cameras: str) -> Photo 
 
 
 def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
-    """The photo without its mask.
+    """Return the photo without its mask.
 
     Raises:
-        UserError: It cannot be decoded.
-        OSError: It cannot be read.
+        UserError: The photo cannot be decoded.
+        OSError: The file cannot be read.
     """
     path = root / name
     with opened(path, "the photo cannot be decoded") as image:
         if image.mode == "F" or (image.format == "TIFF" and image.mode in _MODES_OF_TIFF):
-            # COLMAP would write them again in a form that nobody reads.
+            # COLMAP would write such photos in a format that no program reads.
             raise UserError(
                 "its values are none of a photo",
                 where=path,
@@ -248,17 +248,17 @@ def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
 
 
 def _reason(error: UserError | OSError) -> str:
-    """Why a photo cannot be used."""
+    """Return the reason why a photo cannot be used."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
     return f"{error.what} ({error.found})" if error.found else error.what
 
 
 def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
-    """Mean of the grey levels, mean square of their Laplacian at a reduced size, transparency."""
+    """Return brightness (mean grey), sharpness (mean squared Laplacian) and transparency."""
     longest = max(image.size)
     image.draft("L", (image.width * _LOOKED_AT // longest, image.height * _LOOKED_AT // longest))
-    # As the core does, which ignores transparency of photos with more than 8 bits.
+    # The core also ignores transparency of photos with more than 8 bits.
     transparent = False
     if header.alpha and not image.mode.startswith(("I", "F")):
         least, _ = image.convert("RGBA").getchannel("A").getextrema()
@@ -272,7 +272,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
 
 
 def _most_pixels(header: PhotoHeader) -> int:
-    """How many pixels a photo may have: COLMAP decodes it whole, though it is looked at reduced."""
+    """Return the greatest pixel count of a photo, which COLMAP decodes at full size."""
     return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 
@@ -290,7 +290,7 @@ def _too_large(path: Path, header: PhotoHeader) -> UserError:
 
 
 def _without_doubles(photos: Sequence[Photo]) -> tuple[list[Photo], list[LeftOut]]:
-    """The photos without those whose file another one has, too; the first of each stays."""
+    """Return the photos without duplicate files. The first photo of each file is kept."""
     first: dict[str, Photo] = {}
     for photo in photos:
         first.setdefault(photo.sha256, photo)
@@ -304,7 +304,7 @@ def _without_doubles(photos: Sequence[Photo]) -> tuple[list[Photo], list[LeftOut
 
 
 def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> UserError:
-    """The error where no scene can be made."""
+    """Return the error for too few usable photos."""
     first = "; ".join(f"{each.name}: {each.why}" for each in left_out[:3])
     nothing = not used and not left_out
     todo = "name the folder that the photos are in"

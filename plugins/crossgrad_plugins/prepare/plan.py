@@ -1,4 +1,4 @@
-"""The plan: which photos are used, with which settings; what a second start has to agree with."""
+"""The plan: used photos and settings, which a later call on the same scene has to match."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from crossgrad_core.commands import UserError, write_atomically
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.layout import Layout
 
-#: Version of the file; raised where an older reader could misread a newer one.
+#: Version of the file. It is raised if an older reader could misread the new format.
 FORMAT: Final = 1
 
 
@@ -20,17 +20,17 @@ class _Fixed(BaseModel):
 
 
 class Settings(_Fixed):
-    """The choices of the user.
+    """The settings chosen by the user.
 
     Attributes:
         features: Kind of features.
-        matching: Which photos are compared.
-        mapper: How poses are found.
-        cameras: Which photos share a calibration.
+        matching: Method that chooses photos to compare.
+        mapper: Method that finds poses.
+        cameras: Rule that decides which photos share a calibration.
         lens: Camera model of COLMAP.
-        masks: Folder of masks; None for those beside the photos.
-        max_size: Longest side of the scene's photos in pixels; None as they are.
-        max_features: Features of a photo, at most.
+        masks: Folder of masks, or None for masks next to the photos.
+        max_size: Longest side of the scene's photos in pixels, or None to keep their size.
+        max_features: Greatest number of features of a photo.
     """
 
     features: str = "sift"
@@ -44,7 +44,7 @@ class Settings(_Fixed):
 
 
 class Position(_Fixed):
-    """A place on Earth: degrees, and metres above whatever the receiver counts from."""
+    """A place on Earth: degrees, and altitude in metres above the receiver's reference."""
 
     latitude: float
     longitude: float
@@ -55,18 +55,18 @@ class Photo(_Fixed):
     """A photo that is used.
 
     Attributes:
-        name: Its path below the folder of photos, with forward slashes.
-        folder: Its folder; empty for photos that lie in none.
-        width: Pixels, as stored.
-        height: Likewise.
-        orientation: How it is turned when it is shown (EXIF); 1 where it does not say.
-        camera: What photos of one calibration share.
-        position: Where its GPS says it was taken.
-        mask: Path of its mask; None where it has none.
-        mask_sha256: Digest of that file; None in plans of before it was kept.
-        transparent: Whether it has pixels with alpha below a half, which do not count.
-        brightness: Mean of its grey levels, 0 to 255.
-        sharpness: Mean square of the Laplacian of its grey levels at a reduced size.
+        name: Path relative to the folder of photos, with forward slashes.
+        folder: Folder of the photo, or an empty text.
+        width: Width in pixels, as stored.
+        height: Height in pixels, as stored.
+        orientation: EXIF orientation, or 1 if it is missing.
+        camera: Key that photos with the same calibration share.
+        position: GPS position, or None.
+        mask: Path of the mask, or None.
+        mask_sha256: Digest of the mask, or None in plans of older versions.
+        transparent: True if the photo has pixels with alpha below a half, which do not count.
+        brightness: Mean of the grey levels, 0 to 255.
+        sharpness: Mean square of the Laplacian of the grey levels at a reduced size.
         bytes: Size of the file.
         sha256: Digest of the file.
     """
@@ -88,21 +88,21 @@ class Photo(_Fixed):
 
 
 class LeftOut(_Fixed):
-    """A file that is not used, and why."""
+    """A file that is not used, and the reason."""
 
     name: str
     why: str
 
 
 class Plan(_Fixed):
-    """Photos and settings of a scene.
+    """The photos and settings of a scene.
 
     Attributes:
         format: Version of the file.
         photos: Folder of the photos.
-        settings: What the user chose.
-        used: The photos that are used, by name.
-        left_out: Those that are not.
+        settings: Settings chosen by the user.
+        used: The photos that are used, sorted by name.
+        left_out: The files that are not used.
     """
 
     format: int = FORMAT
@@ -123,10 +123,10 @@ class Plan(_Fixed):
 
 
 def agreed(layout: Layout, plan: Plan) -> Plan:
-    """The plan that is carried out: this one, which is written down where the scene has no such.
+    """Return the plan to carry out, and write it if the scene has no such plan yet.
 
-    The same photos may lie in another folder than before, and their masks, too. A scene that is
-    ready needs none of them: some may be gone.
+    The same photos and masks may be in another folder than before. A finished scene no longer
+    needs its photos, so some may be missing.
 
     Raises:
         UserError: The scene was begun with other photos or settings, or its plan is damaged.
@@ -156,10 +156,10 @@ def _check_same(layout: Layout, known: Plan, plan: Plan) -> None:
 
 
 def read_plan(layout: Layout) -> Plan:
-    """The plan of a scene.
+    """Return the plan of a scene.
 
     Raises:
-        UserError: It is damaged, or of a later version.
+        UserError: The plan is damaged, or of a later version.
     """
     try:
         plan = Plan.model_validate_json(layout.plan.read_bytes())
@@ -182,15 +182,15 @@ def read_plan(layout: Layout) -> Plan:
 
 
 def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
-    """What tells two plans apart, in words; empty where nothing does.
+    """Describe the differences between two plans. Return an empty text for equal plans.
 
     Args:
         known: The plan of the scene.
-        plan: The plan of now.
-        some: Whether some of the photos will do.
+        plan: The new plan.
+        some: True if photos may be missing from the new plan.
     """
     was, now = known.settings.model_dump(), plan.settings.model_dump()
-    # Where masks lie does not matter, but what is in them.
+    # Only the content of masks is compared, not their folder.
     told = [f"{key} was {was[key]}, now {now[key]}" for key in was
             if was[key] != now[key] and key != "masks"]  # fmt: skip
     after = {photo.name: photo for photo in plan.used}
@@ -199,7 +199,7 @@ def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
     told += _changes("photo", *sums)
     both = [(before[name], after[name]) for name in before.keys() & after.keys()]
     new = {photo.name: photo.mask_sha256 for _, photo in both if photo.mask}
-    # Plans of before digests were kept have none.
+    # Older plans contain no mask digests.
     old = {each.name: each.mask_sha256 or photo.mask_sha256 for each, photo in both
            if each.mask and (photo.mask or not some)}  # fmt: skip
     return "; ".join([*told, *_changes("mask", old, new)])
@@ -208,7 +208,7 @@ def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
 def _changes(
     noun: str, before: Mapping[str, str | None], after: Mapping[str, str | None]
 ) -> list[str]:
-    """What became of files by their names and digests, in words."""
+    """Describe new, missing and changed files by their names and digests."""
     kinds = {
         "new": after.keys() - before.keys(),
         "gone": before.keys() - after.keys(),
@@ -222,10 +222,10 @@ def _changes(
 
 
 def digest_of(path: Path) -> str:
-    """The digest of a file.
+    """Return the SHA-256 digest of a file.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,10 +1,10 @@
-"""Where the verified pairs of a photo say that it is, by rays and epipolar lines.
+"""Pose of a photo from its verified pairs, by rays and epipolar lines.
 
-All pairs of a photo with photos that have poses are asked. The relative pose of a pair is a
-direction to go from the other photo; it becomes a place where the direction of a second pair
-crosses it, and where the points that the other photo shows tell how far to go. Of these places that
-is the best which most matches agree with, whole pairs at a time. Source: Hartley and Zisserman,
-Multiple View Geometry, 9.6, for the relative pose; the rest is ours.
+All pairs with photos that have poses are used. The relative pose of a pair gives a rotation and a
+direction from the other photo. The distance comes from the direction of a second pair, or from
+points that the other photo shows. Each distance gives a candidate pose. The best pose has the most
+agreeing matches. A pair counts only if enough of its matches agree. Source of the relative
+pose: Hartley and Zisserman, Multiple View Geometry, 9.6. The rest is our own method.
 """
 
 import itertools
@@ -19,44 +19,44 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Pairs count from so many verified matches on; a pair agrees with two poses where this share of
-#: its matches lies within so many pixels of the epipolar lines: more than in verification, because
-#: a place is not exact before it is adjusted.
+#: Least number of verified matches of a pair, the share of its matches that has to agree with two
+#: poses, and the largest distance in pixels to an epipolar line for agreement. This distance is
+#: larger than in verification, because a pose is not exact before bundle adjustment.
 _MATCHES, _AGREEING, _PIXELS = 15, 0.5, 6.0
-#: Pairs and agreeing matches that a place needs: one or the other.
+#: A pose needs at least this many pairs and this many agreeing matches, in one of two combinations.
 _NEEDED: Final = ((3, 60), (2, 100))
-#: Of a photo so many pairs, those with most matches, are asked for places.
+#: Number of a photo's pairs, with the most matches first, that give candidate poses.
 _ASKED: Final = 16
-#: Points that tell how far to go, at least, and the quantiles of the distances that are tried.
+#: Least number of points that determine a distance, and the quantiles of distances that are tried.
 _POINTS, _QUANTILES = 4, (0.35, 0.5, 0.65)
-#: Two directions cross where rotations differ by less, and directions by more, than these (cosines
-#: of 5 and 2 degrees).
+#: Two directions intersect if their rotations differ by at most 5 degrees and their directions by
+#: at least 2 degrees. Both values are cosines.
 _SAME_ROTATION, _SAME_DIRECTION = 0.9962, 0.9994
 
 
 @dataclass(frozen=True, order=True)
 class Support:
-    """Evidence for a place: agreeing matches, and the pairs that they are of."""
+    """Evidence for a pose: the number of agreeing matches and the number of their pairs."""
 
     matches: int = 0
     pairs: int = 0
 
     @property
     def enough(self) -> bool:
-        """Whether a photo may stand there."""
+        """True if the evidence is enough for a pose."""
         return any(self.pairs >= pairs and self.matches >= least for pairs, least in _NEEDED)
 
 
 @dataclass(frozen=True, eq=False)
 class PairView:
-    """A pair of a photo with another one that has a pose.
+    """A pair of a photo with another photo that has a pose.
 
     Attributes:
         other: Number of the other photo.
-        pose: Its pose, world to camera.
-        focals: Of the other one and of the photo, pixels.
-        rays: [N, 2] matches in the other one and in the photo, in units of the focal length.
-        features: [N] which features of the other one they are.
+        pose: Pose of the other photo, world to camera.
+        focals: Focal lengths of the other photo and of the photo, in pixels.
+        rays: [N, 2] matches in the other photo and in the photo, in units of the focal length.
+        features: [N] indices of the matched features of the other photo.
     """
 
     other: int
@@ -66,17 +66,17 @@ class PairView:
     features: NDArray[np.int64]
 
     def agreeing(self, pose: "pycolmap.Rigid3d") -> int:
-        """How many matches agree with a pose of the photo; 0 where too few of the pair do."""
+        """Return the number of matches that agree with a pose, or 0 if too few of the pair do."""
         near = int((off_lines((self.pose, pose), self.rays, self.focals) <= _PIXELS).sum())
         return near if near >= _AGREEING * len(self.features) else 0
 
     def relative(self) -> "pycolmap.Rigid3d | None":
-        """The photo's pose relative to the other one, its translation of any length."""
+        """Return the photo's pose relative to the other photo, up to the translation's length."""
         import pycolmap
 
         options = pycolmap.TwoViewGeometryOptions()
         options.compute_relative_pose, options.ransac.random_seed = True, 0
-        # Verification has looked for them; these cameras have no borders.
+        # Verification already searched for watermarks, and these cameras have no borders.
         options.detect_watermark = False
         cameras = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0, 0])
@@ -95,10 +95,10 @@ class PairView:
 
 
 class Pairs:
-    """All verified pairs of a database, as cameras see them.
+    """All verified pairs of a database, as rays of their cameras.
 
     Args:
-        cameras: By number; those of the database where one is missing.
+        cameras: Cameras by number. Missing cameras are read from the database.
         database: COLMAP's database, open.
     """
 
@@ -120,7 +120,7 @@ class Pairs:
                 self.partners.setdefault(two, []).append(one)
 
     def sights(self, photo: int, poses: "Mapping[int, pycolmap.Rigid3d]") -> list[PairView]:
-        """The pairs of a photo with those that have poses, that with most matches first."""
+        """Return the pairs of a photo with photos that have poses, most matches first."""
         found = []
         for other in self.partners.get(photo, ()):
             if other in poses:
@@ -132,12 +132,12 @@ class Pairs:
         return sorted(found, key=lambda sight: (-len(sight.features), sight.other))
 
     def without(self, aside: Collection[tuple[int, int]]) -> frozenset[int]:
-        """The photos that have no pair beside these."""
+        """Return the photos for which `aside` contains all pairs."""
         left = {photo for pair in self.matches if pair not in aside for photo in pair}
         return frozenset(self.partners.keys() - left)
 
     def contradicting(self, poses: "Mapping[int, pycolmap.Rigid3d]") -> frozenset[tuple[int, int]]:
-        """The pairs of photos with poses that do not agree with these."""
+        """Return the pairs of photos with poses that do not agree with these poses."""
         return frozenset(
             (sight.other, photo)
             for photo in poses
@@ -147,7 +147,7 @@ class Pairs:
 
 
 def support(sights: Sequence[PairView], pose: "pycolmap.Rigid3d") -> Support:
-    """What speaks for a pose."""
+    """Return the evidence for a pose."""
     agreeing = [count for sight in sights if (count := sight.agreeing(pose))]
     return Support(sum(agreeing), len(agreeing))
 
@@ -155,7 +155,7 @@ def support(sights: Sequence[PairView], pose: "pycolmap.Rigid3d") -> Support:
 def best_place(
     model: "pycolmap.Reconstruction", sights: Sequence[PairView]
 ) -> "tuple[Support, pycolmap.Rigid3d | None]":
-    """The place that most pairs agree with; no pose where no pair tells any."""
+    """Return the pose with the most evidence, and the evidence. The pose is None without any."""
     most, best = Support(), None
     for pose in _places(model, sights[:_ASKED]):
         this = support(sights, pose)
@@ -179,13 +179,13 @@ def _places(
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """Where a pair says that a photo is.
+    """A half-line that contains the centre of a photo according to one pair.
 
     Attributes:
         rotation: [3, 3] world to the photo.
-        start: [3] the centre of the other photo.
-        direction: [3] from there to the photo, of length 1.
-        distances: How far to go by points that the other photo shows.
+        start: [3] centre of the other photo.
+        direction: [3] direction from the other photo to the photo, of length 1.
+        distances: Distances along the direction, from points that the other photo shows.
     """
 
     rotation: NDArray[np.float64]
@@ -194,14 +194,14 @@ class _Way:
     distances: NDArray[np.float64]
 
     def to(self, distance: float) -> "pycolmap.Rigid3d":
-        """The pose at that distance."""
+        """Return the pose at a distance."""
         import pycolmap
 
         center = self.start + distance * self.direction
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), -self.rotation @ center)
 
     def crossing(self, other: "_Way") -> float | None:
-        """The distance at which it comes nearest to another way; None where they do not meet."""
+        """Return the distance nearest to another half-line, or None if they do not meet."""
         turned = (np.trace(self.rotation @ other.rotation.T) - 1.0) / 2.0
         along = float(self.direction @ other.direction)
         if turned < _SAME_ROTATION or abs(along) > _SAME_DIRECTION:
@@ -233,7 +233,7 @@ def _distances(
     rotation: NDArray[np.float64],
     direction: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """[M] how far along the direction the photo sees each point of the other one where it is."""
+    """Return the distances [M] at which the photo sees points of the other photo correctly."""
     points = model.image(sight.other).points2D
     rows = [row for row, at in enumerate(sight.features) if points[int(at)].has_point3D()]
     if not rows:
@@ -242,7 +242,7 @@ def _distances(
     offsets = np.stack(places) - sight.pose.inverse().translation
     rays = np.column_stack([sight.rays[1][rows], np.ones(len(rows))]) @ rotation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # Beside the ray to a point, what is left of its offset and of the direction is parallel.
+    # Perpendicular to the ray to a point, offset and direction are parallel.
     across = direction - rays * (rays @ direction)[:, None]
     beside = offsets - rays * (rays * offsets).sum(axis=1, keepdims=True)
     square = (across**2).sum(axis=1)
@@ -253,10 +253,10 @@ def _distances(
 
 
 class Rays:
-    """Features of photos without lens distortion, read when they are asked for, and kept.
+    """Features of photos without lens distortion, read when needed and cached.
 
     Args:
-        cameras: By number; those of the database where one is missing.
+        cameras: Cameras by number. Missing cameras are read from the database.
         database: COLMAP's database, open.
     """
 
@@ -268,7 +268,7 @@ class Rays:
         self._rays: dict[int, NDArray[np.float32]] = {}
 
     def camera(self, number: int) -> "pycolmap.Camera":
-        """The camera of a photo."""
+        """Return the camera of a photo."""
         if number not in self._cameras:
             camera = self._database.read_image(number).camera_id
             self._cameras[number] = (
@@ -277,11 +277,11 @@ class Rays:
         return self._cameras[number]
 
     def focal(self, number: int) -> float:
-        """The focal length of a photo, pixels."""
+        """Return the focal length of a photo, in pixels."""
         return float(self.camera(number).mean_focal_length())
 
     def of(self, number: int) -> NDArray[np.float32]:
-        """[N, 2] features of a photo in units of the focal length."""
+        """Return the features [N, 2] of a photo, in units of the focal length."""
         if number not in self._rays:
             pixels = np.asarray(self._database.read_keypoints(number)[:, :2], dtype=np.float64)
             rays = self.camera(number).cam_from_img(pixels)
@@ -294,12 +294,12 @@ def off_lines(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     focals: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """[N] pixels that matches lie from each other's epipolar lines, the larger of both.
+    """Return the distances [N] of matches from epipolar lines in pixels, the larger of two photos.
 
     Args:
-        poses: Of two photos, world to camera.
-        rays: [N, 2] matches in each, in units of the focal length.
-        focals: Of each, pixels.
+        poses: Poses of two photos, world to camera.
+        rays: [N, 2] matches in each photo, in units of the focal length.
+        focals: Focal length of each photo, in pixels.
     """
     relative = poses[1] * poses[0].inverse()
     x, y, z = relative.translation
@@ -308,7 +308,7 @@ def off_lines(
     here, there = (np.column_stack([points, np.ones(len(points))]) for points in rays)
     lines, back = here @ essential.T, there @ essential
     error = np.abs((there * lines).sum(axis=1))
-    # Two photos of one place have no epipolar lines, and nothing to contradict.
+    # Two photos with the same centre have no epipolar lines, so nothing contradicts the poses.
     tiny = np.finfo(np.float64).tiny
     in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * focals[1]
     in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * focals[0]

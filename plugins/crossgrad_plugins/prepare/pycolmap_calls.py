@@ -1,6 +1,6 @@
-"""Long calls of pycolmap, and a check of the models that they write.
+"""Long calls of pycolmap, and a check of the models that pycolmap writes.
 
-They are walked before pycolmap reads them: given files that are cut short it loops without an end.
+The models are checked before pycolmap reads them, because it loops without end on truncated files.
 """
 
 import struct
@@ -22,28 +22,28 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-#: Seconds between two looks at how far a call is, and between two lines about it.
+#: Seconds between two checks of a call, and between two progress messages.
 _LOOK, _PAUSE = 0.1, 10.0
-#: Counts the rows of a table, for which it waits so many seconds.
+#: Program that counts the rows of a table, and the seconds after which it is stopped.
 _COUNT: Final = (
     "import sqlite3, sys; found = sqlite3.connect(sys.argv[1] + '?mode=ro', uri=True);"
     "print(*found.execute('SELECT COUNT(*) FROM ' + sys.argv[2]).fetchone())"
 )
 _PATIENCE: Final = 5.0
-#: Bytes that SQLite may write beside a database before it takes them over.
+#: Greatest size in bytes of the journal that SQLite writes next to a database.
 JOURNAL: Final = 2**23
-#: Glog's level of what ends the process. What pycolmap says below that does not concern the user: a
-#: failure that counts is told by its exception, or by what is missing afterwards.
+#: Glog's level of fatal messages. Lower levels do not concern the user: a failure raises an
+#: exception, or leaves a file missing.
 _FATAL: Final = 3
-#: Files of a model beside those that the reader walks -> bytes of a record, which are all alike:
-#: each rig of `prepare` is one camera, and each frame one photo.
+#: Files of a model that the reader does not check -> bytes of a record. All records are equal in
+#: size, because each rig of `prepare` is one camera, and each frame is one photo.
 _RECORDS: Final = {"rigs.bin": 16, "frames.bin": 84}
 _COUNT_OF_RECORDS: Final = struct.Struct("<Q")
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Pycolmap prints nothing inside the block."""
+    """Silence pycolmap's messages inside the block."""
     guard_pycolmap()
     import pycolmap
 
@@ -57,15 +57,15 @@ def quiet() -> Iterator[None]:
 def waited(
     what: str, call: "Callable[[pycolmap.CancellationToken], T]", far: Callable[[], str]
 ) -> T:
-    """What a long call answers; it runs in another thread, so that signals are heard meanwhile.
+    """Run a long call in another thread, so that signals are handled, and return its result.
 
     Args:
-        what: What is done, for people.
-        call: The call, with a token by which it can be cancelled.
-        far: How far it is, in words; asked every few seconds.
+        what: Name of the call, for messages.
+        call: The call. Its argument is a token by which it can be cancelled.
+        far: Returns the progress as text. It is called every few seconds.
 
     Raises:
-        UserError: Pycolmap cannot do it; says why.
+        UserError: Pycolmap failed. The error contains the reason.
     """
     guard_pycolmap()
     import pycolmap
@@ -93,10 +93,11 @@ def waited(
 
 
 def rows_of(database: Path, table: str) -> int:
-    """How many rows a table of COLMAP's database has, as far as it can be told now.
+    """Return the number of rows of a table of COLMAP's database, or 0 if it is unknown.
 
-    Another process looks: Python's SQLite and that of pycolmap in one process take each other's
-    locks away, and the database breaks (https://sqlite.org/howtocorrupt.html, section 2.2.1).
+    The rows are counted in another process. Python's SQLite and pycolmap's SQLite in one process
+    would remove each other's locks, and damage the database
+    (https://sqlite.org/howtocorrupt.html, section 2.2.1).
     """
     program = [sys.executable, "-I", "-S", "-c", _COUNT, database.absolute().as_uri(), table]
     try:
@@ -107,7 +108,7 @@ def rows_of(database: Path, table: str) -> int:
 
 
 def write_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
-    """Writes a model into a folder that is there.
+    """Write a model into an existing folder.
 
     Raises:
         UserError: The disk is full.
@@ -121,7 +122,7 @@ def write_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
 
 
 def check_written(folder: Path) -> None:
-    """Refuses a model that pycolmap has just written, and not to its end.
+    """Refuse a truncated model that pycolmap has just written.
 
     Raises:
         UserError: The disk is full.
@@ -131,7 +132,7 @@ def check_written(folder: Path) -> None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether no file of a model is missing or cut short."""
+    """Return whether all files of a model exist and are not truncated."""
     try:
         read_binary(folder)
     except UserError:
@@ -141,7 +142,7 @@ def is_whole(folder: Path) -> bool:
 
 
 def _has_all(path: Path, record: int) -> bool:
-    """Whether a file has as many records as it says."""
+    """Return whether a file contains as many records as its header says."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

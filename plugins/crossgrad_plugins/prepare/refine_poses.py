@@ -1,10 +1,10 @@
-"""Photos that mapping left out, or put where most of their pairs disagree, placed by their pairs.
+"""Second search for poses of photos that mapping left out or probably misplaced, by pairs.
 
-Mapping adds a photo by the points of the model that it shows, in the place that most of them speak
-for at that time, and does not look back. A photo that shares much with two others, but little that
-a third one shows, has few such points; and of walls and pavements that repeat the wrong ones may
-come first. So doubtful photos are placed once more, by all their pairs (by_pairs.py); pairs that
-contradict the poses are laid aside, points are made anew, and mapping goes on from there.
+Mapping adds a photo by the model's points that it shows, and does not check the pose again later.
+A photo may share many features with two photos, but few with a third, and then shows few such
+points. Repeated walls and pavements may place a photo wrongly at first. Doubtful photos are
+therefore placed again by all their pairs (pose_from_pairs.py). Pairs that contradict the poses are
+disabled, points are triangulated again, and mapping continues.
 """
 
 import logging
@@ -24,29 +24,29 @@ from crossgrad_plugins.prepare.pycolmap_calls import JOURNAL, write_model
 if TYPE_CHECKING:
     import pycolmap
 
-#: How often all doubtful photos are looked at, at most.
+#: Greatest number of rounds over all doubtful photos.
 _ROUNDS: Final = 5
-#: A photo is doubtful where less than this share of its matches agrees with its place; another
-#: place has to have so many times as many agreeing matches.
+#: A photo is doubtful if a smaller share of its matches agrees with its pose. Another pose must
+#: have this many times as many agreeing matches.
 _DOUBTFUL, _BETTER = 0.6, 1.3
-#: Least and most focal length in photo sizes, and most lens distortion: COLMAP's own limits.
+#: Least and greatest focal length in photo sizes, and greatest distortion: COLMAP's own limits.
 _POSSIBLE: Final = (0.1, 10.0, 1.0)
 _LOG = logging.getLogger(__name__)
 
 Models: TypeAlias = "list[pycolmap.Reconstruction]"
-#: Makes points anew for the model in a folder, by a database, and goes on mapping from there.
+#: Triangulates points of the model in a folder again, by a database, and continues mapping.
 Adjust: TypeAlias = "Callable[[Path, Path], pycolmap.Reconstruction]"
 Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
 
 
 @dataclass(frozen=True)
 class Look:
-    """The places of doubtful photos by their pairs.
+    """The poses of doubtful photos by their pairs.
 
     Attributes:
-        better: Photo -> a pose that more speaks for than for its own, or that it has none yet.
-        settled: Photos with a pose for which there is no better one.
-        agreeing: Matches that agree with the poses of the model, over all photos.
+        better: Photo -> a pose with more evidence than its current pose, if it has one.
+        settled: Doubtful photos with a pose, for which no better pose was found.
+        agreeing: Number of matches that agree with the poses of the model, over all photos.
     """
 
     better: Poses
@@ -61,18 +61,20 @@ def looked_again(
     adjust: Adjust,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Models, frozenset[int]]:
-    """The models, photos of the largest one placed once more where their pairs ask for it.
+    """Return the models after photos of the largest model were placed again by their pairs.
 
     Args:
-        models: Of mapping; photos of smaller ones go over to the largest where more speaks for it.
+        models: Models of mapping. Photos of smaller models move to the largest model if there is
+            more evidence for it.
         database: COLMAP's database with the verified matches.
         scratch: An empty folder.
-        adjust: Goes on mapping.
-        cancelled: Whether nobody waits for the answer any more; asked at every photo.
+        adjust: Function that continues mapping.
+        cancelled: Returns True if the call was cancelled. It is called for every photo.
 
     Returns:
-        The models, the largest one as it was when most matches agreed with its poses, and photos
-        of it for which no better place is known, though pairs speak against theirs.
+        The models, and the settled photos of the largest model. The largest model is returned in
+        its state with most agreeing matches. For settled photos no better pose is known, although
+        pairs contradict their pose.
 
     Raises:
         UserError: The disk is full.
@@ -101,7 +103,7 @@ def looked_again(
             break
         _leave_out_impossible(main)
         look = again.look(main)
-        # What speaks for a photo alone need not hold for all that were moved with it.
+        # Evidence for single photos need not hold after all of them are moved.
         if look.agreeing >= seen.agreeing:
             best, seen, gone = main, look, moved
     here = set(best.reg_image_ids())
@@ -112,14 +114,14 @@ def looked_again(
 
 
 class _Again:
-    """Looks at a model, and moves what is better elsewhere.
+    """A search for better poses in a model.
 
     Args:
-        database: COLMAP's database; only read.
-        copy: A copy of it, made when it is needed, in which pairs are laid aside.
+        database: COLMAP's database, which is only read.
+        copy: Path of a copy of the database, made when needed, in which pairs are disabled.
         main: The largest model.
         others: The other models.
-        cancelled: Whether nobody waits for the answer any more.
+        cancelled: Returns True if the call was cancelled.
     """
 
     def __init__(
@@ -137,7 +139,7 @@ class _Again:
         self._aside: frozenset[tuple[int, int]] = frozenset()
 
     def look(self, model: "pycolmap.Reconstruction") -> Look:
-        """What pairs say of the photos that are doubtful in a model, or not in it."""
+        """Return the evidence on photos that are doubtful in a model, or missing from it."""
         with _opened(self._database) as database:
             return self._look(model, self._pairs(model, database), self._elsewhere(database))
 
@@ -171,7 +173,7 @@ class _Again:
         return Look(better, frozenset(settled), agreeing)
 
     def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
-        """What speaks for the poses in the other models, by their own cameras."""
+        """Return the evidence for poses in the other models, with the cameras of these models."""
         found = {}
         for model in self._others:
             pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
@@ -180,12 +182,12 @@ class _Again:
         return found
 
     def move(self, model: "pycolmap.Reconstruction", look: Look) -> None:
-        """Places photos, and lays pairs aside that contradict the poses; those that did are back.
+        """Place photos, disable pairs that contradict the poses, and enable the other pairs.
 
-        A photo that few pairs agree with when the others have moved, too, is left out.
+        A photo is left out if too few pairs agree with its pose after all photos are moved.
         """
         if not self.copy.exists():
-            # On a full disk SQLite ends the process.
+            # SQLite aborts the process on a full disk.
             check_folder(self.copy.parent, self._database.stat().st_size + JOURNAL)
             shutil.copyfile(self._database, self.copy)
         with _opened(self._database) as database, _opened(self.copy) as copied:
@@ -196,7 +198,7 @@ class _Again:
                 if not support(pairs.sights(photo, poses), poses[photo]).enough:
                     model.deregister_frame(model.image(photo).frame_id)
             against = pairs.contradicting(poses_of(model))
-            # Mapping does not know of photos without a pair.
+            # Mapping does not handle photos without a pair.
             for photo in pairs.without(against) & poses_of(model).keys():
                 model.deregister_frame(model.image(photo).frame_id)
             for one, two in sorted(self._aside ^ against):
@@ -219,22 +221,22 @@ def _opened(path: Path) -> "Iterator[pycolmap.Database]":
 
 
 def poses_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Rigid3d]":
-    """Photo -> its pose, world to camera."""
+    """Return the pose of each photo, world to camera."""
     return {photo: model.image(photo).cam_from_world() for photo in model.reg_image_ids()}
 
 
 def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]":
-    """The cameras of photos with poses, which mapping has refined."""
+    """Return the cameras of photos with poses, as refined by mapping."""
     numbers = {model.image(photo).camera_id for photo in model.reg_image_ids()}
     return {number: model.camera(number) for number in numbers}
 
 
 def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pycolmap.Camera]":
-    """Every camera as the first of the models has refined it, else with a better guess.
+    """Return each camera as refined by the first model that contains it, else a better guess.
 
-    A focal length that nothing is known of is a guess from the size of the photos. What mapping
-    made of the same guess for other cameras corrects it: places by a wrong one are far off, and
-    adjusting all together does not always come back from there.
+    Without EXIF, a focal length is guessed from the size of the photos. Mapping has refined the
+    same guess for other cameras, and the median of this correction is applied. With a wrong focal
+    length, poses have large errors, and bundle adjustment does not always correct them.
     """
     known: dict[int, pycolmap.Camera] = {}
     for model in models:
@@ -256,7 +258,7 @@ def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pyc
 
 
 def _leave_out_impossible(model: "pycolmap.Reconstruction") -> None:
-    """Takes photos out whose camera no lens has; their matches may agree all the same."""
+    """Remove photos with impossible camera parameters, even if their matches agree."""
     for photo in list(model.reg_image_ids()):
         image = model.image(photo)
         if model.camera(image.camera_id).has_bogus_params(*_POSSIBLE):
@@ -270,7 +272,7 @@ def _place(
     photo: int,
     pose: "pycolmap.Rigid3d",
 ) -> None:
-    """Gives a photo a pose in a model, which need not have it, or its camera, yet."""
+    """Set the pose of a photo in a model. Photo and camera are added if they are missing."""
     import pycolmap
 
     image = database.read_image(photo)

@@ -1,4 +1,4 @@
-"""The report on a prepared scene: as data, in words, and as a picture."""
+"""The report on a prepared scene: as data, as text, and as a picture."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +21,7 @@ from crossgrad_plugins.prepare.results import Result
 
 #: Version of report.json.
 FORMAT: Final = 1
-#: How many lines of one kind are printed; the files have all of them.
+#: Greatest number of printed lines of one kind. The files contain all lines.
 _SHOWN: Final = 8
 
 
@@ -33,8 +33,8 @@ class Report:
         plan: Photos and settings.
         features: Name -> number of features.
         links: Pairs with verified matches.
-        result: What is in the scene.
-        ways: How photos were compared, and how poses were found.
+        result: Content of the scene.
+        ways: Method that chose photos to compare, and method that found poses.
         misplaced: Name -> matches for and against the pose of photos taken out of a model.
     """
 
@@ -58,18 +58,18 @@ class Report:
 
     @property
     def joins(self) -> tuple[ModelJoin, ...]:
-        """What joins the folders."""
+        """The matches between the folders."""
         return joins_of(self.plan, self.links)
 
     @property
     def bridges(self) -> tuple[BridgeReport, ...]:
-        """Where photos are missing."""
+        """The gaps in the scene, in which photos are missing."""
         parts = parts_of(self.plan, [frozenset(part.photos) for part in self.result.parts])
         return bridges_of(self.plan, self.links, parts, self.heights)
 
     @property
     def heights(self) -> dict[str, float]:
-        """Name -> metres above ground, where that is known."""
+        """Name -> metres above ground, if known."""
         return {
             name: height
             for part in reversed(self.result.parts)
@@ -78,7 +78,7 @@ class Report:
 
 
 def data_of(report: Report) -> dict[str, Any]:
-    """The report as data."""
+    """Return the report as data."""
     plan, posed = report.plan, report.posed
     found = report.result.figures
     parts = [
@@ -122,7 +122,7 @@ def _folder(report: Report, name: str) -> dict[str, Any]:
 
 
 def summary_lines(report: Report) -> list[str]:
-    """What is printed when the scene is ready."""
+    """Return the lines that are printed when the scene is finished."""
     return [*_in_short(report), *_missing(report, _SHOWN)]
 
 
@@ -193,7 +193,7 @@ def _some(lines: Sequence[str], most: int) -> Iterator[str]:
 
 
 def page_of(report: Report) -> str:
-    """The report in words, as Markdown."""
+    """Return the report as Markdown text."""
     plan = report.plan
     everything = len(plan.used) + len(plan.left_out)
     lines = ["# From photos to a scene", "", f"Photos: `{plan.photos}`. Compared: {report.ways[0]}."

@@ -1,4 +1,4 @@
-"""The model that becomes the scene: chosen, placed on Earth, joined with others where GPS can."""
+"""The model of the scene: georegistered, and merged with other models that GPS can join."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _FILE: Final = "placed.json"
-#: The ground is where so many of all points lie below, in percent.
+#: Percentile of the points' heights that is taken as the ground.
 _GROUND: Final = 5.0
 
 
@@ -31,9 +31,9 @@ class Part:
         photos: Names of its photos.
         points: Number of its points.
         error: Mean reprojection error in pixels.
-        unplaced: Why it has no place on Earth; empty where it has one.
-        joined: Whether it is in the scene: the largest is, and those that GPS joins to it.
-        heights: Name -> metres above ground; empty where it has no place on Earth.
+        unplaced: Reason why it has no place on Earth. Empty if it has one.
+        joined: True if it is in the scene: the largest model, and models that GPS joins to it.
+        heights: Name -> metres above ground. Empty without a place on Earth.
     """
 
     photos: tuple[str, ...]
@@ -50,8 +50,8 @@ class Result:
 
     Attributes:
         parts: The models, the largest first.
-        georef: Where the scene lies on Earth, as in georef.json; None where that is not known.
-        figures: Registered photos, points, observations, errors of the scene's model.
+        georef: Place of the scene on Earth, as in georef.json, or None if unknown.
+        figures: Registered photos, points, observations and errors of the scene's model.
     """
 
     parts: tuple[Part, ...]
@@ -60,7 +60,7 @@ class Result:
 
 
 def placed(layout: Layout, plan: Plan, models: "Sequence[pycolmap.Reconstruction]") -> Result:
-    """Places the models, joins those that can be, and writes the model of the scene.
+    """Georegister the models, merge models that GPS joins, and write the model of the scene.
 
     Raises:
         UserError: The disk is full.
@@ -109,7 +109,7 @@ def _part(
 
 
 def _heights(model: "pycolmap.Reconstruction") -> dict[str, float]:
-    """Name -> metres above ground of each photo of a model in a frame whose z is up."""
+    """Return metres above ground of each photo, by name, for a model whose z axis points up."""
     points: NDArray[np.float64] = np.array([point.xyz for point in model.points3D.values()])
     if not len(points):
         return {}
@@ -128,7 +128,7 @@ def _figures(model: "pycolmap.Reconstruction") -> dict[str, float]:
 
 
 def _georef(plan: Plan, placements: Sequence[Placement]) -> dict[str, Any]:
-    """The scene's place on Earth: its frame is east, north, up of the origin, in metres."""
+    """Return the scene's place on Earth: metres east, north and up of the origin."""
     origin = origin_of(plan)
     assert origin is not None
     residuals = {name: each for found in placements for name, each in found.residuals.items()}

@@ -1,4 +1,4 @@
-"""Photos, masks and the model without lens distortion: the scene as `crossgrad run` reads it."""
+"""Photos, masks and model without lens distortion, as `crossgrad run` reads them."""
 
 import io
 import shutil
@@ -18,16 +18,16 @@ from crossgrad_plugins.prepare.pycolmap_calls import check_written, quiet, waite
 if TYPE_CHECKING:
     import pycolmap
 
-#: Photos that are undistorted between two looks at what is done.
+#: Number of photos that are undistorted between two checks.
 _BATCH: Final = 32
 _QUALITY: Final = 95
-#: Bytes that a pixel of a photo takes on the disk, and what is written beside photos and model:
-#: a sharp photo takes 0.4 as a JPEG file of this quality, one of nothing but noise 2.
+#: Assumed bytes of a photo's pixel on the disk, and of files other than photos and model. A sharp
+#: JPEG photo of this quality needs 0.4 bytes per pixel, and pure noise needs 2.
 _BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
-    """Writes the undistorted photos, their masks and, when all are there, the model.
+    """Write the undistorted photos, their masks and, when all photos exist, the model.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -60,9 +60,9 @@ def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
 def _room(
     layout: Layout, plan: Plan, model: "pycolmap.Reconstruction", names: Sequence[str]
 ) -> int:
-    """Bytes that the undistorted photos of these names take, with the model of all beside them.
+    """Return the bytes needed for the undistorted photos of these names and for the model.
 
-    They are asked for beforehand: on a full disk the writer of JPEG files ends the process.
+    The space is checked in advance, because the JPEG writer aborts the process on a full disk.
     """
     import pycolmap
 
@@ -75,7 +75,7 @@ def _room(
 
 
 def _undistort(layout: Layout, plan: Plan, names: Sequence[str], threads: int, far: str) -> None:
-    """Writes some photos and the model of all to the scratch folder."""
+    """Write some photos and the whole model to the scratch folder."""
     import pycolmap
 
     work = emptied(scratch_of(layout.undistorted))
@@ -111,8 +111,8 @@ def _moved(here: Path, there: Path) -> None:
 
 
 def _is_written(photo: Path) -> bool:
-    """Whether a photo is there, to its end."""
-    # What writes JPEG files does not go on where it cannot write; other files may be cut short.
+    """Return whether a photo file exists and is complete."""
+    # A JPEG writer that cannot write aborts the process. Other files may be truncated.
     if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
         return photo.is_file()
     try:
@@ -123,7 +123,7 @@ def _is_written(photo: Path) -> bool:
 
 
 def _write_masks(layout: Layout, plan: Plan, model: "pycolmap.Reconstruction") -> None:
-    """Writes the masks of the photos that have one or are transparent, undistorted as these are."""
+    """Write undistorted masks of the photos that have a mask or transparent pixels."""
     import pycolmap
     from PIL import Image
 

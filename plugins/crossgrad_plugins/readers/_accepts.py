@@ -1,4 +1,4 @@
-"""Which reader accepts a folder, answered without importing the readers.
+"""Tests that tell which reader accepts a folder, without an import of the readers.
 
 The entry points of the group `crossgrad.readers.accepts` name these functions.
 """
@@ -16,24 +16,24 @@ from crossgrad_plugins.readers.colmap_files.folder import find_models
 
 #: The poses of NeRF synthetic scenes.
 BLENDER_FILE: Final = "transforms_train.json"
-#: The poses of nerfstudio and of a block of MatrixCity, and the key that only MatrixCity has.
+#: The pose file of nerfstudio and of a MatrixCity block, and the key that only MatrixCity uses.
 TRANSFORMS_FILE: Final = "transforms.json"
 _ROTATION: Final = b'"rot_mat"'
-#: Folders in which blocks are looked for, and how deep: such as small_city/aerial/train/block_1.
+#: Folders that are searched for blocks, and the greatest depth: small_city/aerial/train/block_1.
 _BLOCKS: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
 _DEEPEST: Final = 4
-#: The reconstruction of OpenSfM, and that of a project of OpenDroneMap.
+#: The reconstruction of OpenSfM, and the reconstruction in an OpenDroneMap project.
 OPENSFM_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
 #: Columns of RealityCapture's CSV.
 NAME_COLUMN: Final = "name"
 POSE_COLUMNS: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 COLUMNS: Final = frozenset({NAME_COLUMN, *POSE_COLUMNS, "f"})
-#: A file with this many of the columns is meant to be one of RealityCapture.
+#: A file with at least this many of the columns is probably meant as a RealityCapture CSV.
 _NEARLY: Final = 5
-#: Names of UC-GS: how a folder of held-out photos begins, and the word in a held-out photo's name.
+#: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in photo names.
 _TEST: Final = "test"
 _EVAL: Final = re.compile(r"(?<![a-z])eval(?![a-z])")
-#: Photos that are looked at to recognise a scene of UC-GS.
+#: Greatest number of photo names that are read to recognise a UC-GS scene.
 _MOST: Final = 10_000
 
 
@@ -51,22 +51,22 @@ def colmap(path: Path) -> bool:
 
 
 def matrixcity(path: Path) -> bool:
-    """Return whether the folder holds a block of MatrixCity, or blocks below it."""
+    """Return whether the folder is a MatrixCity block, or contains such blocks."""
     return any(holds(path / name, _ROTATION) for name in pose_files(path))
 
 
 def metashape(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds Metashape's XML of cameras."""
+    """Return whether the folder holds a Metashape XML file of cameras."""
     return bool(METASHAPE.find(Inside(path), file))
 
 
 def nerfstudio(path: Path, file: str = TRANSFORMS_FILE) -> bool:
-    """Return whether the folder holds the frames of nerfstudio or instant-ngp."""
+    """Return whether the folder holds a frames file of nerfstudio or instant-ngp."""
     return begins_with(path / file, b"{") and not holds(path / file, _ROTATION)
 
 
 def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
-    """Return whether the folder holds a reconstruction of OpenSfM."""
+    """Return whether the folder holds an OpenSfM reconstruction."""
     return any(begins_with(path / name, b"[") for name in names)
 
 
@@ -76,23 +76,23 @@ def photos_alone(path: Path) -> bool:  # noqa: ARG001 - no folder is prepared un
 
 
 def realitycapture(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds RealityCapture's CSV of camera parameters."""
+    """Return whether the folder holds a RealityCapture CSV of camera parameters."""
     return bool(REALITYCAPTURE.find(Inside(path), file))
 
 
 def uc_gs(path: Path, images: str = "images") -> bool:
-    """Return whether the folder holds a COLMAP model whose photo names tell what is held out."""
+    """Return whether the folder holds a COLMAP model with photo names that mark held-out photos."""
     return colmap(path) and any(map(is_held_out, _photos_below(path / images)))
 
 
 def pose_files(scene: Path) -> list[str]:
-    """Names of the pose files of all blocks; that of the scene's own folder alone, if any."""
+    """Return the pose files of all blocks, or only the scene's own pose file if there is one."""
     found = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
     return [TRANSFORMS_FILE] if TRANSFORMS_FILE in found else sorted(found)
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """The pose files in a folder and in those below that may be of this data set."""
+    """Yield the pose files in a folder and in subfolders that can belong to MatrixCity."""
     try:
         inner = [path for path in folder.iterdir() if _BLOCKS.fullmatch(path.name)]
     except OSError:
@@ -105,7 +105,7 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def is_held_out(name: str) -> bool:
-    """Return whether UC-GS holds out a photo of this name."""
+    """Return whether UC-GS holds out a photo with this name."""
     path = PurePosixPath(name)
     folders = (folder.lower() for folder in path.parts[:-1])
     named = _EVAL.search(path.name.lower()) is not None
@@ -113,7 +113,7 @@ def is_held_out(name: str) -> bool:
 
 
 def _photos_below(images: Path) -> Iterator[str]:
-    """Names of photos below a folder, in two folders at most; the first many of them."""
+    """Yield names of photos in a folder, at most two folders deep and at most `_MOST` names."""
     found = (path for pattern in ("*.*", "*/*.*", "*/*/*.*") for path in images.glob(pattern))
     try:
         for _, path in zip(range(_MOST), found, strict=False):
@@ -137,15 +137,15 @@ def _has_most_columns(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file.
+    """A kind of camera file.
 
     Attributes:
-        form: Such as XML.
-        program: Whose it is.
-        suffix: Of its names, with the dot.
-        holds: Whether a file is of the kind, from its first bytes.
-        expected: What is in it, for errors.
-        nearly: Whether a file lacks little to be of the kind.
+        form: Format of the file, such as XML.
+        program: Program that writes the file.
+        suffix: Suffix of the file name, with the dot.
+        holds: Returns whether a file is of this kind, from its first bytes.
+        expected: Description of a correct file, for errors.
+        nearly: Returns whether a file is almost of this kind.
     """
 
     form: str
@@ -156,22 +156,22 @@ class Kind:
     nearly: Callable[[Path], bool] = lambda _: False
 
     def find(self, inside: Inside, named: str | None) -> list[Path]:
-        """The files of the kind: at most the named one, else those of the scene's own folder."""
+        """Return the files of this kind: only the named file, or all in the scene's own folder."""
         files = self._files(inside) if named is None else [inside.scene / named]
         return list(filter(self.holds, files))
 
     def find_near(self, inside: Inside) -> list[Path]:
-        """The files of the scene's own folder that lack little to be of the kind."""
+        """Return the files in the scene's own folder that are almost of this kind."""
         return list(filter(self.nearly, self._files(inside)))
 
     def _files(self, inside: Inside) -> list[Path]:
         return [path for path in inside.files("*") if path.suffix.lower() == self.suffix]
 
     def one(self, inside: Inside, named: str | None) -> Path:
-        """The file that is named by `reader.file`, else the only one of the kind, or nearly.
+        """Return the file named by `reader.file`, or else the only file that (almost) matches.
 
         Raises:
-            UserError: There is none, or there are several, or it leads out of the scene.
+            UserError: There is no such file, there are several, or the name leads out of the scene.
         """
         if named is not None:
             return inside.file(inside.name(named, "reader.file"), "reader.file")

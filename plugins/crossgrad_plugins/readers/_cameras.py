@@ -1,4 +1,4 @@
-"""Poses and lenses of other programs, in the terms of COLMAP."""
+"""Poses and lenses of other programs, converted to COLMAP's conventions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,14 @@ _CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective ones first"
 def from_opengl(
     rotation: NDArray[np.float64], center: NDArray[np.float64], frame: Frame3D = SAME
 ) -> NDArray[np.float64]:
-    """[4, 4] world to camera, from a camera in a frame: x right, y up, z backward.
+    """Return the pose [4, 4], world to camera, of a camera with OpenGL's axes.
+
+    OpenGL's axes are x right, y up, z backward.
 
     Args:
-        rotation: [3, 3] camera to that frame.
-        center: [3] in it.
-        frame: From it to the world.
+        rotation: [3, 3] rotation from the camera to the source frame.
+        center: [3] camera centre in the source frame.
+        frame: Transform from the source frame to the world.
     """
     return from_opencv(rotation @ _OPENGL, center, frame)
 
@@ -32,7 +34,7 @@ def from_opengl(
 def from_opencv(
     rotation: NDArray[np.float64], center: NDArray[np.float64], frame: Frame3D = SAME
 ) -> NDArray[np.float64]:
-    """The same of a camera whose axes are OpenCV's: x right, y down, z forward."""
+    """Return the pose like `from_opengl`, for OpenCV's axes: x right, y down, z forward."""
     pose = np.eye(4)
     pose[:3, :3] = (frame.rotation @ rotation).T
     pose[:3, 3] = -pose[:3, :3] @ frame.points(center[None])[0]
@@ -41,17 +43,17 @@ def from_opencv(
 
 @dataclass(frozen=True, eq=False)
 class Frame(Pinhole):
-    """Size, focal lengths and principal point of a lens, to which its distortion is added."""
+    """Image size, focal lengths and principal point of a lens, without its distortion."""
 
     @property
     def params(self) -> tuple[float, float, float, float]:
-        """In COLMAP's order."""
+        """Focal lengths and principal point, in COLMAP's order."""
         return self.fx, self.fy, self.cx, self.cy
 
     def brown(self, radial: Sequence[float], tangential: Sequence[float]) -> Calibration:
-        """Brown's model in OpenCV's terms: k1, k2, k3 and p1, p2.
+        """Return the calibration with Brown's distortion, in OpenCV's terms k1, k2, k3, p1, p2.
 
-        The simplest of COLMAP's models that holds it: a pinhole where all are zero.
+        The simplest COLMAP model that holds all terms is used: a pinhole if all are zero.
         """
         k1, k2, k3 = radial
         params = (*self.params, k1, k2, *tangential)
@@ -62,7 +64,7 @@ class Frame(Pinhole):
         return self._as("PINHOLE", self.params)
 
     def fisheye(self, radial: Sequence[float]) -> Calibration:
-        """OpenCV's equidistant fisheye: k1 to k4."""
+        """Return the calibration of OpenCV's equidistant fisheye with k1 to k4."""
         return self._as("OPENCV_FISHEYE", (*self.params, *radial))
 
     def _as(self, model: str, params: tuple[float, ...]) -> Calibration:
@@ -70,7 +72,7 @@ class Frame(Pinhole):
 
 
 def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
-    """The error for cameras that have no pinhole to be undistorted to, or none that is known."""
+    """Return the error for cameras that cannot be undistorted to a known pinhole camera."""
     return UserError(
         f"photos of {kind} cannot be undistorted",
         where=where,
@@ -81,7 +83,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
 
 
 def refuse_term(term: str, value: float, where: object) -> UserError:
-    """The error for a term of a lens that COLMAP's models lack."""
+    """Return the error for a lens term that COLMAP's models do not contain."""
     return UserError(
         f"the lens has a term that cannot be undistorted: {term}",
         where=where,

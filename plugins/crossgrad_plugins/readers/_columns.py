@@ -1,4 +1,4 @@
-"""The first bytes of files, and the header of a table: line, separator, columns."""
+"""The first bytes of a file, and the header of a table: its line, separator and columns."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ class Columns:
     """The columns of a table.
 
     Attributes:
-        names: In lower case, without a `#` before the first one.
-        delimiter: The sign between two cells.
+        names: Column names in lower case, without a `#` before the first name.
+        delimiter: The separator between two cells.
     """
 
     names: tuple[str, ...]
@@ -22,9 +22,9 @@ class Columns:
 
     @classmethod
     def of(cls, path: Path, known: frozenset[str]) -> "Columns":
-        """The columns of a file: of the line among its first ones with most of the known names.
+        """Return the columns of a file, from the line that contains most of the known names.
 
-        Comments may come before that line.
+        Only the first bytes of the file are searched. Comments may precede the header line.
         """
         head = head_of(path)
         wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
@@ -35,7 +35,7 @@ class Columns:
 
 
 def column_names(cells: list[str]) -> tuple[str, ...]:
-    """The names of columns in the cells of a header, without empty ones at the end."""
+    """Return the column names in the cells of a header, without empty names at the end."""
     names = [cell.strip(' "\r\ufeff').lstrip("#").strip().lower() for cell in cells]
     while names and not names[-1]:
         names.pop()
@@ -43,7 +43,7 @@ def column_names(cells: list[str]) -> tuple[str, ...]:
 
 
 def head_of(path: Path) -> bytes:
-    """The first bytes of a file; none where there is no such file, or it may not be read."""
+    """Return the first bytes of a file, or no bytes if it is missing or cannot be read."""
     try:
         if not path.is_file():
             return b""
@@ -54,10 +54,10 @@ def head_of(path: Path) -> bytes:
 
 
 def begins_with(path: Path, sign: bytes) -> bool:
-    """Whether a file begins with a sign, but for spaces and a byte order mark."""
+    """Return whether a file begins with `sign`, after a byte order mark and white space."""
     return head_of(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(sign)
 
 
 def holds(path: Path, piece: bytes) -> bool:
-    """Whether a piece stands among the first bytes of a file."""
+    """Return whether the first bytes of a file contain `piece`."""
     return piece in head_of(path)

@@ -1,4 +1,4 @@
-"""Photos of cameras with equal labels: folder, sensor or group tells which photo is meant."""
+"""Photos of cameras with equal labels, distinguished by folder, sensor or camera group."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -13,13 +13,13 @@ from crossgrad_core.scene.wording import name_some
 
 @dataclass(frozen=True)
 class Labelled:
-    """A camera by its label.
+    """A camera, identified by its label.
 
     Attributes:
-        label: As in the file; may have folders, and may lack the suffix of the photo.
-        group: Label of the camera's group; empty without one.
-        sensor: Label of its sensor.
-        size: Width and height of the sensor's photos.
+        label: Label as in the file. It may contain folders and may lack the photo's suffix.
+        group: Label of the camera's group, or an empty text.
+        sensor: Label of the camera's sensor.
+        size: Width and height of the sensor's photos, in pixels.
     """
 
     label: str
@@ -29,7 +29,7 @@ class Labelled:
 
     @property
     def text(self) -> str:
-        """The camera for messages."""
+        """The camera as shown in messages."""
         group = f", group {self.group}" if self.group else ""
         return f"{self.label} (sensor {self.sensor or 'without a label'}{group})"
 
@@ -37,19 +37,20 @@ class Labelled:
 def paired(
     cameras: Sequence[Labelled], photos: FileNames, folder: Path
 ) -> tuple[list[str], list[str]]:
-    """The photo of each camera, and notes; the label itself if the photo is missing.
+    """Return the photo of each camera, or its label if the photo is missing, and notes.
 
-    A label can stand for photos in several folders. Folders named in the label, the label of the
-    group and that of the sensor choose the folder of that name; then the size of the photo, and
-    what other cameras leave; at last the order, if groups or sensors are as many as folders.
+    A label can match photos in several folders. The photo is then chosen by folders named in the
+    label, by the label of the group and by the label of the sensor. If several photos remain, the
+    photo's size and the photos of other cameras decide. The last criterion is the order, if the
+    number of groups or sensors equals the number of folders.
 
     Args:
         cameras: All cameras, in the order of the file.
-        photos: Names below `folder`.
-        folder: The photos.
+        photos: Photo names relative to `folder`.
+        folder: Folder of the photos.
 
     Raises:
-        UserError: Photos of some cameras stay open, or two cameras have one photo.
+        UserError: Some cameras still match several photos, or two cameras match one photo.
     """
     fits = [_candidates(camera, photos, folder) for camera in cameras]
     _leave_to_others(cameras, fits)
@@ -83,7 +84,7 @@ def paired(
 
 
 def _candidates(camera: Labelled, photos: FileNames, folder: Path) -> list[str]:
-    """Photos that the label can stand for, as few as folders and size leave."""
+    """Return the photos that match the label, reduced by folder names and photo size."""
     names = photos.fitting(camera.label)
     for hints in (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,)):
         names = _in_folders(names, hints) or names
@@ -93,7 +94,7 @@ def _candidates(camera: Labelled, photos: FileNames, folder: Path) -> list[str]:
 
 
 def _in_folders(names: Sequence[str], hints: Sequence[str]) -> list[str]:
-    """The names in folders that have all of these names."""
+    """Return the names whose folders include all hints."""
     wanted = {hint.casefold() for hint in hints}
     return [
         name
@@ -108,7 +109,7 @@ def _size_of(photo: Path) -> tuple[int, int]:
 
 
 def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None:
-    """Takes a photo that belongs to one camera from all others with an equal label."""
+    """Remove a photo that belongs to one camera from all other cameras with an equal label."""
     alike: defaultdict[str, set[int]] = defaultdict(set)
     for index, camera in enumerate(cameras):
         alike[PurePosixPath(camera.label).name].add(index)
@@ -129,7 +130,7 @@ def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None
 
 
 def _is_sure(camera: Labelled, name: str) -> bool:
-    """Whether the label, the group or the sensor names the folder of a photo."""
+    """Return whether the label, the group or the sensor names the folder of a photo."""
     hints = (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,))
     return camera.label == name or any(
         hint and all(hint) and _in_folders([name], hint) for hint in hints
@@ -137,7 +138,7 @@ def _is_sure(camera: Labelled, name: str) -> bool:
 
 
 def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
-    """Pairs groups or sensors with folders in their order; a note where that was needed."""
+    """Pair groups or sensors with folders by their order, and return a note if this was needed."""
     unclear = [i for i, names in enumerate(fits) if len(names) > 1]
     folders = sorted({_folder(name) for i in unclear for name in fits[i]})
     for of in ("group", "sensor"):

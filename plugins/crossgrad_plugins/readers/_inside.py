@@ -1,6 +1,6 @@
-"""Names of files within a scene: none leads out of its folder; links are what they stand for.
+"""Names of files within a scene: a name must not lead out of the scene's folder.
 
-docs/reliability.md has the rule and its reasons.
+Symbolic links are resolved. docs/reliability.md explains the rule.
 """
 
 import os
@@ -24,13 +24,13 @@ from crossgrad_core.scene.photos.file_names import (
 from crossgrad_core.scene.photos.photo_files import walked
 from crossgrad_core.scene.raw import LONGEST_NAME, LONGEST_PART, is_possible_name
 
-#: Folders that tell training views from held-out ones and nothing else.
+#: Folders that only separate training views from held-out views.
 SPLIT_FOLDERS: Final = frozenset({"train", "test", "val"})
 
 
 @dataclass(frozen=True)
 class Inside:
-    """The files of one scene, by names that a file of the scene gives them.
+    """The files of one scene, found by the names that the scene's own files use.
 
     Attributes:
         scene: The scene's folder.
@@ -44,30 +44,30 @@ class Inside:
 
     @cached_property
     def _files(self) -> list[str]:
-        """Paths of all files below the scene."""
+        """Paths of all files in the scene."""
         tree = ((PurePosixPath(below), files) for below, _, files in walked(self.scene))
         return [(below / file).as_posix() for below, files in tree for file in files]
 
     @cached_property
     def photos(self) -> FileNames:
-        """The photos of the scene, to be found by the end of their path."""
+        """The photos of the scene, which can be found by the end of their path."""
         return FileNames(name for name in self._files if kind_of(name) == PHOTO)
 
     @cached_property
     def masks(self) -> FileNames:
-        """The masks of the scene, likewise."""
+        """The masks of the scene, which can be found by the end of their path."""
         return FileNames(name for name in self._files if kind_of(name) == MASK)
 
     @cached_property
     def points(self) -> FileNames:
-        """The point files of the scene, likewise."""
+        """The point files of the scene, which can be found by the end of their path."""
         return FileNames(name for name in self._files if kind_of(name) == POINTS)
 
     def name(self, text: str, where: object, base: str = "") -> str:
-        """A name relative to the folder `base` of the scene, as a plain one below the scene.
+        """Return a name relative to the scene, from a name relative to its folder `base`.
 
         Raises:
-            UserError: It leads out of the scene, or no file can have it.
+            UserError: The name leads out of the scene, or no file can have this name.
         """
         if not is_possible_name(text):
             raise _impossible(where, text)
@@ -77,7 +77,7 @@ class Inside:
         return plain
 
     def found(self, text: str, where: object, base: str, files: FileNames) -> str:
-        """Like `name`; a name of no file stands for the one whose path ends as the name does.
+        """Return like `name`, but if the file is missing, search `files` by the end of the path.
 
         Raises:
             UserError: There is no such file, and the name leads out of the scene.
@@ -85,13 +85,13 @@ class Inside:
         plain = self._plain(text, base)
         if plain is None or not is_file(self.scene / plain):
             other = files.find(plain or text)
-            # Suffix and case are left as they are: the photo is paired and noted later.
+            # Keep suffix and case: the photo is paired, and a note is written, later.
             if other is not None and (plain is None or not same_spelling(plain, other)):
                 return other
         return self.name(text, where, base)
 
     def _plain(self, text: str, base: str) -> str | None:
-        """A name as a plain one below the scene; None where it leads out of the scene."""
+        """Return a normalised name relative to the scene, or None if it leads out of the scene."""
         slashed = text.replace("\\", "/")
         for root in (os.path.abspath(self.scene), self._true):
             if slashed.startswith(os.path.join(root, "")):
@@ -101,13 +101,13 @@ class Inside:
         return None if leads_out else plain
 
     def file(self, name: str, where: object) -> Path:
-        """The file of a plain name, there or not; may be a link, for folders that are made of them.
+        """Return the path of a normalised name. The file may be missing, or may be a link.
 
-        Photos and masks need no such check: a folder of them may lie anywhere, and what is no photo
-        is refused.
+        Photos and masks do not need this check: their folder may be anywhere, and a file that is
+        not a photo is refused.
 
         Raises:
-            UserError: A folder on the way is a link that leads out of the scene.
+            UserError: A folder in the path is a link that leads out of the scene.
         """
         path = self.scene / name
         true = os.path.realpath(path.parent)
@@ -116,7 +116,7 @@ class Inside:
         return path
 
     def files(self, pattern: str) -> list[Path]:
-        """The files of the scene's own folder that fit a pattern, sorted; none if unreadable."""
+        """Return the sorted files in the scene's own folder that match, or [] if unreadable."""
         try:
             return sorted(path for path in self.scene.glob(pattern) if path.is_file())
         except OSError:
@@ -146,13 +146,13 @@ def _impossible(where: object, text: str) -> UserError:
 
 
 def shared_folder(names: Iterable[str]) -> str:
-    """The first folder of all names below a scene, `.` where they have none in common."""
+    """Return the first folder that all names share, or `.` if they do not share a folder."""
     first = {PurePosixPath(name).parts[:-1][:1] for name in names}
     return first.pop()[0] if len(first) == 1 and first != {()} else "."
 
 
 def place_of(name: str) -> str:
-    """A name without the folders that only tell training views from held-out ones."""
+    """Return a name without the folders that only separate training from held-out views."""
     parts = PurePosixPath(name).parts
     kept = [part for part in parts[:-1] if part.lower() not in SPLIT_FOLDERS]
     return "/".join((*kept, parts[-1]))

@@ -1,4 +1,4 @@
-"""JSON files of scenes: of bounded size and depth, with typed fields whose errors name them."""
+"""JSON files of scenes, with limits on size and depth, and typed fields named in errors."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,9 +13,9 @@ from crossgrad_core.plugin import UserError
 from crossgrad_core.plugin import read_json as json_in
 from crossgrad_core.scene.raw import FARTHEST
 
-#: Bytes of a file. Large reconstructions have millions of points.
+#: Largest file in bytes. Large reconstructions contain millions of points.
 LARGEST: Final = 512 << 20
-#: Pixels along a side of a photo.
+#: Largest width or height of a photo, in pixels.
 LONGEST_SIDE: Final = 10_000_000
 _AGAIN = "mend the file, or export it again"
 _LONGEST: Final = 80
@@ -23,12 +23,12 @@ _LONGEST: Final = 80
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """A JSON object; each getter raises a `UserError` that names file and field.
+    """A JSON object. Each getter raises a `UserError` that names the file and the field.
 
     Attributes:
-        value: Its members.
-        file: Where it stands.
-        place: Its own place in the file, such as `frames[3]`; empty at the top.
+        value: The members of the object.
+        file: The file that contains the object.
+        place: Path of the object in the file, such as `frames[3]`. Empty for the top object.
     """
 
     value: Mapping[str, object]
@@ -37,18 +37,18 @@ class Fields:
 
     @property
     def here(self) -> str:
-        """Names the object in an error."""
+        """The file and place of the object, for errors."""
         return f"{self.file}: {self.place}"
 
     def where(self, key: str) -> str:
-        """Names a field in an error."""
+        """Return the file and place of a field, for errors."""
         return f"{self.file}: {self.place}{'.' if self.place else ''}{key}"
 
     def __contains__(self, key: str) -> bool:
         return self.value.get(key) is not None
 
     def wrong(self, key: str, expected: str, found: str | None = None) -> NoReturn:
-        """Refuses a field.
+        """Refuse a field.
 
         Raises:
             UserError: Always.
@@ -63,7 +63,7 @@ class Fields:
         )
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number."""
+        """Return a finite number."""
         if key not in self and default is not None:
             return default
         number = _number(self.value.get(key))
@@ -72,28 +72,28 @@ class Fields:
         return number
 
     def positive(self, key: str) -> float:
-        """A finite number above zero."""
+        """Return a finite number above zero."""
         number = self.number(key)
         if number <= 0.0:
             self.wrong(key, "a number above zero")
         return number
 
     def side(self, key: str) -> int:
-        """The width or height of a photo: a whole number of pixels."""
+        """Return the width or height of a photo, a whole number of pixels."""
         number = self.number(key)
         if number != int(number) or not 1 <= number <= LONGEST_SIDE:
             self.wrong(key, f"a whole number from 1 to {LONGEST_SIDE:,}")
         return int(number)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A text that is not empty."""
+        """Return a text that is not empty."""
         value = self.value.get(key, default)
         if not isinstance(value, str) or not value:
             self.wrong(key, "a text")
         return value
 
     def numbers(self, key: str, *shape: int) -> NDArray[np.float64]:
-        """Finite numbers in lists of that shape."""
+        """Return finite numbers in nested lists of the given shape."""
         flat = list(_flat(self.value.get(key), shape))
         numbers = [number for number in map(_number, flat) if number is not None]
         if len(numbers) != len(flat) or len(flat) != math.prod(shape):
@@ -102,7 +102,7 @@ class Fields:
         return np.array(numbers, dtype=np.float64).reshape(shape)
 
     def texts(self, key: str) -> list[str]:
-        """A list of texts."""
+        """Return a list of texts."""
         value = self.value.get(key)
         if not isinstance(value, list):
             self.wrong(key, "a list of texts")
@@ -112,18 +112,18 @@ class Fields:
         return texts
 
     def inner(self, key: str) -> "Fields":
-        """An object in the object."""
+        """Return an object that is a member of this object."""
         return self._child(self.value.get(key), key)
 
     def members(self, key: str) -> dict[str, "Fields"]:
-        """Objects by their names in an object."""
+        """Return the objects in a member that is an object, by their names."""
         value = self.value.get(key)
         if not isinstance(value, dict):
             self.wrong(key, "an object")
         return {name: self._child(each, f"{key}.{name}") for name, each in value.items()}
 
     def items(self, key: str) -> list["Fields"]:
-        """The objects of a list."""
+        """Return the objects of a list."""
         value = self.value.get(key)
         if not isinstance(value, list):
             self.wrong(key, "a list of objects")
@@ -143,7 +143,7 @@ class Fields:
 
 
 def read_json(path: Path) -> object:
-    """The value in a JSON file in UTF-8, with or without a byte order mark.
+    """Return the value in a JSON file in UTF-8, with or without a byte order mark.
 
     Raises:
         UserError: The file is missing, too large, too deep, or not JSON.
@@ -161,10 +161,10 @@ def read_json(path: Path) -> object:
 
 
 def read_object(path: Path) -> Fields:
-    """The object in a JSON file.
+    """Return the object in a JSON file.
 
     Raises:
-        UserError: See `read_json`; or the file holds something else.
+        UserError: As for `read_json`, or the file does not contain an object.
     """
     value = read_json(path)
     if not isinstance(value, dict):
@@ -179,15 +179,15 @@ def _unreadable(path: Path, found: str, expected: str = "JSON") -> UserError:
 
 
 def _number(value: object) -> float | None:
-    """A number that is finite and can be worked with, else None; truth values are none."""
+    """Return a number that is finite and not too large, else None. Booleans give None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    # Compared before it becomes a float: whole numbers in JSON have any number of digits.
+    # Compare before the conversion to float: whole numbers in JSON have any number of digits.
     return float(value) if -FARTHEST <= value <= FARTHEST else None
 
 
 def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
-    """What stands in lists of that shape; nothing where a list has another length."""
+    """Yield the values in nested lists of this shape, and nothing from a list of another length."""
     if not shape:
         yield value
     elif isinstance(value, list) and len(value) == shape[0]:

@@ -1,8 +1,9 @@
-"""Multi-camera systems of Metashape: the poses of slave cameras follow from those of their masters.
+"""Multi-camera systems of Metashape: poses of slave cameras, computed from their masters.
 
-A slave camera has no transform of its own. The location of its sensor is the slave's centre in the
-axes of the master, in the units of the chunk, and the rotation turns the slave's axes into the
-master's: transform of the slave = transform of the master * [rotation | location].
+A slave camera has no transform of its own. Its sensor contains a location and a rotation. The
+location is the slave's centre in the axes of the master, in the units of the chunk. The rotation
+turns the slave's axes into the master's axes. The transform of the slave is therefore
+transform of the master * [rotation | location].
 Source: Metashape Expert Manual, "The slave-sensor transform: composition rule",
 https://photogrammetrycommunity.github.io/metashape-expert-manual/workflow/camera-calibration/slave-sensor-transform-recipes/
 """
@@ -27,8 +28,8 @@ class Rig:
     """The poses of all cameras of a chunk.
 
     Attributes:
-        offsets: Id of a slave sensor -> [4, 4] slave to master.
-        transforms: Id of a camera -> [4, 4] camera to chunk, of cameras with a transform.
+        offsets: Id of a slave sensor -> [4, 4] transform from slave to master.
+        transforms: Id of a camera with a transform -> [4, 4] transform from camera to chunk.
         sensors: Id of a camera -> id of its sensor.
     """
 
@@ -38,10 +39,10 @@ class Rig:
 
     @classmethod
     def of(cls, chunk: Element, cameras: list[Element], file: Path) -> "Rig":
-        """The rig of a chunk with these cameras.
+        """Return the rig of a chunk with these cameras.
 
         Raises:
-            UserError: A transform or an offset is no rotation and a shift.
+            UserError: A transform or an offset is not a rotation and a shift.
         """
         offsets = {
             each.get("id", ""): offset
@@ -57,18 +58,18 @@ class Rig:
         return cls(offsets, transforms, sensors)
 
     def is_slave(self, camera: Element) -> bool:
-        """Whether the pose of a camera is that of a master and an offset."""
+        """Return whether the pose of a camera is computed from a master and an offset."""
         return camera.find("transform") is None and camera.get("master_id") is not None
 
     def pose(self, camera: Element) -> NDArray[np.float64] | None:
-        """[4, 4] camera to chunk; None without a transform, and for slaves without an offset."""
+        """Return the pose [4, 4], camera to chunk, or None if transform or offset is missing."""
         if not self.is_slave(camera):
             return self.transforms.get(camera.get("id", ""))
         master = camera.get("master_id", "")
         pose, offset = self.transforms.get(master), self.offsets.get(camera.get("sensor_id", ""))
         if pose is None or offset is None:
             return None
-        # Any sensor of a rig can be the one to which the offsets of all sensors refer.
+        # The offsets of all sensors can refer to any sensor of the rig.
         of_master = self.offsets.get(self.sensors.get(master, ""), _IDENTITY)
         return np.asarray(pose @ np.linalg.inv(of_master) @ offset)
 
@@ -79,7 +80,7 @@ def _transform(element: Element, file: Path, place: str) -> NDArray[np.float64]:
 
 
 def _offset(sensor: Element, file: Path, place: str) -> NDArray[np.float64] | None:
-    """[4, 4] slave to master; None for sensors that have no offset."""
+    """Return the transform [4, 4] from slave to master, or None if the sensor has no offset."""
     location, rotation = sensor.find("location"), sensor.find("rotation")
     if sensor.get("master_id") is None or (location is None and rotation is None):
         return None

@@ -1,4 +1,4 @@
-"""Raw scenes of readers that have posed photos in a folder and points beside them."""
+"""Raw scenes for readers of formats with posed photos in a folder and separate points."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from crossgrad_core.scene.raw import RawScene, RawView
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 from crossgrad_plugins.readers._inside import Inside, place_of
 
-#: Names under which tools put points beside their poses, the first one that is there is taken.
+#: File names that tools use for points next to the poses. The first existing file is read.
 USUAL: Final = ("sparse_pc.ply", "points3D.ply", "points3d.ply", "point_cloud.ply", "points.ply")
 
 
 def raw_scene(
     inside: Inside, images: str, views: tuple[RawView, ...], points: PointCloud, *notes: str
 ) -> RawScene:
-    """The scene of some views, without a split or a background of its own.
+    """Return the scene of some views, without a split or a background of its own.
 
     Args:
         inside: The files of the scene.
-        images: Plain name of the photo folder, `.` for the scene's own.
+        images: Photo folder relative to the scene, `.` for the scene's own folder.
         views: The posed photos.
-        points: In the same frame.
-        notes: What the reader did.
+        points: Points in the same frame as the poses.
+        notes: Notes on what the reader did.
     """
     return RawScene(
         root=inside.scene,
@@ -46,7 +46,7 @@ def raw_scene(
 def raw_view(
     name: str, calibration: Calibration, pose: NDArray[np.float64], mask: Path | None = None
 ) -> RawView:
-    """A view that observes no points; see `RawView` for the rest."""
+    """Return a view that observes no points. `RawView` describes the arguments."""
     seen = np.zeros(0, dtype=np.int64)
     return RawView(name, calibration, pose, seen, mask, place_of(name))
 
@@ -59,18 +59,18 @@ def find_points(
     frame: Frame3D = SAME,
     base: str = "",
 ) -> PointCloud:
-    """The points of a scene: of the named file, else of a PLY with a usual name, else none.
+    """Return the points of the named file, else of a PLY with a usual name, else no points.
 
     Args:
         inside: The scene.
-        options: Where they name a file of points, that file takes the place of these.
-        named: File that was asked for, relative to `base`.
+        options: If they name a file of points, no points are read here.
+        named: Requested file, relative to `base`.
         where: Place of the name, for errors.
-        frame: From the file's frame to the world.
-        base: Folder of the file that names it.
+        frame: Transform from the file's frame to the world.
+        base: Folder of the file that names the points.
 
     Raises:
-        UserError: The named file leads out of the scene, is not there or cannot be read.
+        UserError: The named file leads out of the scene, is missing or cannot be read.
     """
     if options.points is not None:
         return NO_POINTS
@@ -91,23 +91,23 @@ def _placed(points: PointCloud, frame: Frame3D) -> PointCloud:
 
 @dataclass(frozen=True)
 class PhotoNames:
-    """Names that a file of poses gives to the photos of a folder.
+    """The names that a pose file uses for the photos of a folder.
 
     Attributes:
-        files: Such a name -> the one photo below the folder that it stands for.
+        files: Name in the pose file -> the only photo in the folder that matches the name.
     """
 
     files: Mapping[str, str]
 
     @classmethod
     def of(cls, folder: Path, names: Iterable[str]) -> "PhotoNames":
-        """The photos below a folder; none where it is not there."""
+        """Return the photos in a folder, or no photos if the folder is missing."""
         return cls(PhotoFolder(folder).pair(frozenset(names)).files)
 
     def full(self, name: str, inside: Inside, where: object) -> str:
-        """The photo that a name stands for; the plain name itself where there is none, or several.
+        """Return the photo of a name, or the name itself if no photo or several photos match.
 
         Raises:
-            UserError: There is none, and the name leads out of the scene.
+            UserError: No photo matches, and the name leads out of the scene.
         """
         return self.files.get(name) or inside.name(name, where)

@@ -1,7 +1,7 @@
-"""Files of the family of `transforms.json`: frames with a pose in OpenGL's axes, and their lenses.
+"""Files like `transforms.json`: frames with a pose in OpenGL's axes, and their lenses.
 
-Sources: https://docs.nerf.studio/quickstart/data_conventions.html (fields, axes; pixel centres at
-+0.5, as the principal points of COLMAP are taken over), https://github.com/NVlabs/instant-ngp,
+Sources: https://docs.nerf.studio/quickstart/data_conventions.html (fields and axes; pixel centres
+are at +0.5, because COLMAP's principal points are copied), https://github.com/NVlabs/instant-ngp,
 `docs/nerf_dataset_tips.md` (`camera_angle_x`, `rolling_shutter`).
 """
 
@@ -30,7 +30,7 @@ _PERSPECTIVE: Final = frozenset(
     {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 )
 _FISHEYE: Final = frozenset({"OPENCV_FISHEYE", "FISHEYE"})
-#: Fields that tell the same in two ways.
+#: Pairs of field groups that give the same quantity in two ways.
 _WAYS: Final = (
     (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y")),
     ((*_RADIAL, *_TANGENTIAL), ("distortion_params",)),
@@ -39,13 +39,13 @@ _WAYS: Final = (
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A frame of a file: its photo and where it was taken.
+    """A frame of a file: a photo with its pose.
 
     Attributes:
-        photo: Plain name of the photo below the scene.
+        photo: Name of the photo, relative to the scene.
         calibration: Its lens.
         pose: [4, 4] world to camera.
-        mask: Its mask file, if the frame names one.
+        mask: Its mask file, if the frame names a mask.
     """
 
     photo: str
@@ -55,16 +55,16 @@ class Posed:
 
 
 def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
-    """The photo that a file names; a name without a suffix is that of a PNG file, as in NeRF's.
+    """Return the photo that a file names. A name without a suffix means a PNG file, as in NeRF.
 
     Args:
         inside: The scene.
         text: The name.
-        where: The field that has it.
-        base: Folder of the file below the scene.
+        where: The field that contains the name.
+        base: Folder of the file, relative to the scene.
 
     Raises:
-        UserError: It leads out of the scene.
+        UserError: The name leads out of the scene.
     """
     name = inside.found(text, where, base, inside.photos)
     bare = not PurePosixPath(name).suffix
@@ -76,17 +76,17 @@ def photo_name(inside: Inside, text: str, where: str, base: str) -> str:
 def read_frame(
     inside: Inside, frame: Fields, whole: Fields, base: str = "", world: Frame3D = SAME
 ) -> Posed:
-    """A frame with `file_path` and `transform_matrix`.
+    """Return a frame that has `file_path` and `transform_matrix`.
 
     Args:
         inside: The scene.
         frame: The frame.
-        whole: The file, with the fields that all frames share; a frame's own come first.
-        base: Folder of the file below the scene.
-        world: From the file's frame of the world to the scene's.
+        whole: The file, with the fields that all frames share. Fields of the frame come first.
+        base: Folder of the file, relative to the scene.
+        world: Transform from the file's world frame to the scene's world frame.
 
     Raises:
-        UserError: A field is missing or not what it should be.
+        UserError: A field is missing or wrong.
     """
     photo = photo_name(inside, frame.text("file_path"), frame.where("file_path"), base)
     mask = None
@@ -103,17 +103,18 @@ def read_frame(
 
 
 def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
-    """[3, 4] the first rows of a matrix, which may have its last one or not."""
+    """Return the first three rows [3, 4] of a matrix with three or four rows."""
     rows = fields.value.get(key)
     count = 4 if isinstance(rows, list) and len(rows) == 4 else 3  # noqa: PLR2004 - homogeneous
     return fields.numbers(key, count, 4)[:3]
 
 
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
-    """The lens of a frame; the photo's own size where the file does not tell it.
+    """Return the lens of a frame. If the file gives no size, the photo's size is used.
 
-    A frame's field comes before the file's of the same name. What a frame tells in one way, the
-    file's fields of the other way do not complete: they are of another lens.
+    A field of the frame comes before the file's field with the same name. If the frame gives a
+    quantity in one way, the file's fields for the other way are ignored: they describe another
+    lens.
 
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.
@@ -144,7 +145,7 @@ def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calib
 
 
 def _completing(frame: Fields, whole: Fields) -> Fields:
-    """The fields of a file that complete those of a frame."""
+    """Return the file with only the fields that may complete the fields of a frame."""
     others = [other for both in _WAYS for way, other in (both, both[::-1])
               if any(key in frame for key in way)]  # fmt: skip
     own = _says_fisheye(frame)
@@ -155,7 +156,7 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
 
 
 def _says_fisheye(fields: Fields) -> bool | None:
-    """Whether a frame or a file says that its lens is a fisheye; None where it says nothing."""
+    """Return whether a frame or file declares a fisheye lens, or None if it declares no lens."""
     if "camera_model" not in fields and "is_fisheye" not in fields:
         return None
     model = fields.text("camera_model", "PERSPECTIVE").upper()
@@ -175,12 +176,12 @@ def _frame(
     holder: Callable[[str], Fields],
     number: Callable[[str, float | None], float],
 ) -> Frame:
-    """Focal lengths in pixels, or from angles of view; the principal point, or the middle."""
+    """Return focal lengths (in pixels or from angles of view) and principal point (or middle)."""
     width, height = size
     across = _focal(holder, "fl_x", "camera_angle_x", width)
     down = _focal(holder, "fl_y", "camera_angle_y", height)
     if across is None:
-        # Where the other one is told, this one is missing.
+        # The error names the horizontal focal length as missing.
         other = "camera_angle_y" if "camera_angle_y" in holder("camera_angle_y") else "fl_y"
         holder(other).wrong("fl_x", "a focal length in pixels, or camera_angle_x in radians")
     return Frame(
@@ -203,7 +204,7 @@ def _focal(holder: Callable[[str], Fields], name: str, angle_name: str, side: in
 def _terms(
     holder: Callable[[str], Fields], number: Callable[[str, float | None], float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """k1 to k4 and p1, p2, one by one or in one list of that order."""
+    """Return k1 to k4 and p1, p2, from single fields or from one list in this order."""
     fields = holder("distortion_params")
     if "distortion_params" in fields:
         terms = fields.numbers("distortion_params", 6).tolist()
@@ -212,7 +213,7 @@ def _terms(
 
 
 def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
-    """The folder of the photos, `.` for the scene's own, and the views by their names in it."""
+    """Return the photo folder (`.` for the scene's own) and the views named relative to it."""
     images = shared_folder(frame.photo for frame in frames)
     start = 0 if images == "." else len(images) + 1
     return images, tuple(

@@ -1,9 +1,9 @@
-"""XML files of scenes, read with expat behind a guard, and numbers in their elements.
+"""XML files of scenes, read with expat under limits, and numbers in their elements.
 
-Entities are what makes XML dangerous: they expand without bound and can name other files. They can
-only be declared in a document type, so a file that has one is refused before anything in it is
-read; the formats have none. Size, depth and number are bounded too, so that a file takes at most
-some ten times its size in memory. That needs no further package.
+Entities make XML dangerous: they expand without a bound and can name other files. Entities can only
+be declared in a document type. The supported formats use no document type, so a file with a
+document type is refused before its content is read. Size, depth and number of elements are bounded
+too, so that a file needs at most about ten times its size in memory. No further package is needed.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from crossgrad_core.plugin import UserError, open_file, size_text
 from crossgrad_plugins.readers._json import Fields
 
-#: Bytes of a file and of one tag or comment; elements within each other; elements and attributes.
+#: Limits: bytes of a file, bytes of a tag or comment, nesting depth, elements and attributes.
 LARGEST: Final = 128 << 20
 _LONGEST: Final = 4 << 20
 _DEEPEST: Final = 64
@@ -27,11 +27,11 @@ _AGAIN = "export the file again"
 
 
 class _RefusedError(Exception):
-    """The file holds something that is not read."""
+    """The file contains something that this reader refuses."""
 
 
 class _Builder:
-    """Builds a tree from expat's events and refuses what formats of scenes do not need."""
+    """Builds a tree from expat's events and refuses XML features that scene formats do not need."""
 
     def __init__(self) -> None:
         self.tree = TreeBuilder()
@@ -56,7 +56,7 @@ class _Builder:
 
 
 def read_xml(path: Path) -> Element:
-    """The root element of an XML file.
+    """Return the root element of an XML file.
 
     Raises:
         UserError: The file is missing, too large or too deep, is not XML, or has a document type.
@@ -92,10 +92,10 @@ def _parsed(path: Path) -> Element:
 
 
 def numbers(element: Element | None, count: int, file: Path, place: str) -> NDArray[np.float64]:
-    """[count] numbers in the text of an element.
+    """Return the numbers [count] in the text of an element.
 
     Raises:
-        UserError: The element is missing, or holds something else.
+        UserError: The element is missing or has another content.
     """
     words = (element.text or "").split() if element is not None else []
     values: list[object] = []

@@ -1,4 +1,4 @@
-"""Reads scenes of NeRF synthetic, rendered by Blender: `transforms_train.json` and its siblings."""
+"""Reader of NeRF synthetic scenes, rendered by Blender: `transforms_train.json` and the like."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from crossgrad_plugins.readers._raw import find_points, raw_scene
 from crossgrad_plugins.readers._transforms import Posed, raw_views, read_frame
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 
-#: The first one that is there is held out; validation views are left out where there are others.
+#: The views of the first existing file are held out. Validation views are unused if test exists.
 _HELD_OUT: Final = ("transforms_test.json", "transforms_val.json")
 _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": None}
 
@@ -26,9 +26,9 @@ _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": No
 class BlenderReader(Reader):
     """NeRF synthetic scenes: `transforms_train.json`, `transforms_test.json` and their photos.
 
-    Fields are those of nerfstudio's format; mostly `camera_angle_x` alone. The alpha channel of a
-    photo is how much of a pixel the object covers: photos are blended over `reader.background`,
-    white as in NeRF, and `--background` should name the same colour.
+    The fields are those of nerfstudio's format, mostly only `camera_angle_x`. The alpha channel
+    of a photo is the fraction of a pixel that the object covers. Photos are blended over
+    `reader.background` (white, as in NeRF). `--background` should name the same colour.
     """
 
     folder: str = Field(".", description="folder of the transforms files within the scene")
@@ -49,7 +49,7 @@ class BlenderReader(Reader):
     def read(self, path: Path, options: SceneOptions) -> Scene:
         check_scene_folder(path)
         inside = Inside(path)
-        # A scene's own folder has no name within it.
+        # The scene's own folder has no name within the scene.
         file = inside.name(_accepts.BLENDER_FILE, "reader.folder", self.folder)
         base = file[: -len(_accepts.BLENDER_FILE)]
         train = _read(inside, file, base)

@@ -1,4 +1,4 @@
-"""Reads COLMAP scenes: `images/` and `sparse/0/`, binary or text."""
+"""Reader of COLMAP scenes: `images/` and `sparse/0/`, binary or text."""
 
 import os
 from pathlib import Path
@@ -26,17 +26,17 @@ from crossgrad_plugins.readers.colmap_files.folder import (
 from crossgrad_plugins.readers.colmap_files.model import model_files, read_model
 from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
-#: The place on Earth, beside a model or in the scene's folder.
+#: The file with the place on Earth, in the model's folder or in the scene's folder.
 _GEOREF = "georef.json"
-#: A rotation shorter than this, or longer than its inverse, has no length that can be squared.
+#: Below this length, or above its inverse, the square of a quaternion's length is not accurate.
 _SHORTEST = 1e-100
 
 
 class ColmapReader(Reader):
     """COLMAP scenes (https://colmap.github.io/format.html), with any perspective camera model.
 
-    Photos are paired with poses by their path below the image folder. Where several models are
-    there, the one with most registered images is taken.
+    Photos are paired with poses by their path in the image folder. If there are several models,
+    the model with the most registered images is read.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -62,10 +62,10 @@ class ColmapReader(Reader):
         return self.placed(build_scene(raw, options), raw)
 
     def placed(self, scene: Scene, raw: RawScene) -> Scene:
-        """The scene, made from `raw`, with its place on Earth where that is known.
+        """Return the scene with its place on Earth, if the place is known.
 
         Raises:
-            UserError: What an option names, or a `georef.json`, is not there or cannot be read.
+            UserError: A file named by an option, or a `georef.json`, is missing or unreadable.
         """
         if self.crs is not None and self.gps is not None:
             raise UserError(
@@ -83,18 +83,19 @@ class ColmapReader(Reader):
 
 
 def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions) -> RawScene:
-    """A COLMAP scene as it is in its files.
+    """Return a COLMAP scene as stored in its files.
 
-    Points that the model lacks come from a PLY beside it, or in a folder above within the scene.
+    If the model has no points, they come from a PLY in the model's folder, or in a folder above it
+    within the scene.
 
     Args:
         path: The scene's folder.
-        images: Folder of the photos within it.
-        wanted: Folder of the model within it; None for the one with most images.
-        options: Where they name a file of points, no PLY is looked for.
+        images: Folder of the photos within the scene.
+        wanted: Folder of the model within the scene, or None for the model with most images.
+        options: If they name a file of points, no PLY is searched.
 
     Raises:
-        UserError: There is no model, or a file of it cannot be read.
+        UserError: There is no model, or a file of the model cannot be read.
     """
     check_scene_folder(path)
     folder, notes = choose_model(path, wanted)
@@ -128,7 +129,7 @@ def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions)
 def _beside(
     scene: Path, model: Path, views: tuple[RawView, ...], options: SceneOptions
 ) -> PointCloud:
-    """The points of a PLY in the folder of the model, or in a folder above it within the scene."""
+    """Return the points of a PLY in the model's folder, or in a folder above it in the scene."""
     from crossgrad_plugins.readers._raw import find_points
 
     inside, base = Inside(scene), Path(os.path.relpath(model, scene))
@@ -170,17 +171,17 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
 def _find_rows(
     points: NDArray[np.uint64], ids: NDArray[np.uint64], order: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Rows of the points with these ids; ids that the model has no point for are left out."""
+    """Return the rows of the points with these ids, without ids that the model does not contain."""
     if not len(ids):
         return np.zeros(0, dtype=np.int64)
-    # Sorted needles are found many times faster than scattered ones.
+    # searchsorted is many times faster with sorted queries.
     points = np.sort(points)
     place = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
     return np.asarray(order[place[ids[place] == points]], dtype=np.int64)
 
 
 def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
-    """[4, 4] world to camera."""
+    """Return the pose [4, 4], world to camera."""
     largest = np.abs(image.quaternion).max()
     if not (_SHORTEST < largest < 1 / _SHORTEST) or not np.isfinite(image.translation).all():
         raise UserError(

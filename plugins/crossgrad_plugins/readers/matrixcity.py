@@ -1,4 +1,4 @@
-"""Reads scenes of MatrixCity as they are distributed: blocks of `transforms.json` and `rgb/`.
+"""Reader of MatrixCity scenes as they are distributed: blocks of `transforms.json` and `rgb/`.
 
 Source of the format: https://github.com/city-super/MatrixCity, README (NeRF's axes; positions in
 metres; the rotation in `rot_mat` is to be multiplied by 100).
@@ -31,8 +31,9 @@ _PHOTOS: Final = "rgb"
 class MatrixCityReader(Reader):
     """Blocks of MatrixCity: `transforms.json` with `rot_mat` and `frame_index`, and photos.
 
-    Photos lie in `rgb/`, or beside the poses. A scene is one block or a folder of several. Blocks
-    below a folder `test`, or whose name ends with `_test`, are held out.
+    Photos are in `rgb/`, or in the folder of the poses. A scene is one block or a folder of
+    several blocks. Blocks are held out if they are in a folder `test`, or if their name ends with
+    `_test`.
     """
 
     points: str | None = Field(

@@ -1,9 +1,10 @@
-"""Reads scenes of Agisoft Metashape: its XML of cameras.
+"""Reader of Agisoft Metashape scenes: Metashape's XML of cameras.
 
 Sources of the format: Metashape Professional, user manual, appendix on camera models (p1 and p2
-stand where OpenCV has p2 and p1; b1 is fx - fy, b2 the skew; principal point from the middle of the
-photo); https://agisoft.freshdesk.com/support/solutions/articles/31000158119. Poses are camera to
-chunk with OpenCV's axes.
+are swapped compared with OpenCV; b1 is fx - fy, b2 the skew; the principal point is measured from
+the middle of the photo);
+https://agisoft.freshdesk.com/support/solutions/articles/31000158119. Poses are camera to chunk
+with OpenCV's axes.
 """
 
 from collections import Counter
@@ -39,22 +40,22 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps
 
 _TERMS: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-#: The compensation of a rolling shutter, and what is told where there is none.
+#: The field for rolling shutter compensation, and its values that mean no compensation.
 _ROLLING: Final = "rolling_shutter"
 _OFF: Final = frozenset({"false", "0", "no", "off", "none", "disabled"})
 _GLOBAL: Final = (
     "set its rolling shutter compensation to Disabled (Tools > Camera Calibration), optimize the "
     "cameras, and export them again"
 )
-#: Coordinate systems whose chunk transform leads to geocentric coordinates.
+#: Coordinate systems in which the chunk transform gives geocentric coordinates.
 _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
 
 
 class MetashapeReader(Reader):
-    """Agisoft Metashape's XML of cameras, and photos beside it; points come from a PLY.
+    """Agisoft Metashape's XML of cameras, with photos in a folder and points from a PLY.
 
-    The chunk's transform is applied. Where it leads to geocentric coordinates, cameras come into
-    the local frame at their middle: x east, y north, z up, in metres.
+    The chunk's transform is applied. If it gives geocentric coordinates, cameras are moved to the
+    local frame at their middle: x east, y north, z up, in metres.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -100,7 +101,7 @@ class MetashapeReader(Reader):
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """A posed camera: label, sensor's id, group's label, component's id, pose and attributes."""
+    """A posed camera: label, sensor id, group label, component id, pose and XML attributes."""
 
     label: str
     sensor: str
@@ -129,7 +130,7 @@ def _missing(file: Path, what: str) -> UserError:
 
 
 def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
-    """The posed cameras of the largest component, and notes on those that are left out."""
+    """Return the posed cameras of the largest component, and notes on the omitted cameras."""
     holder = chunk.find("cameras")
     if holder is None:
         raise _missing(file, "cameras")
@@ -181,7 +182,7 @@ def _camera(fields: Fields, group: str, component: str, pose: NDArray[np.float64
 def _world(
     chunk: Element, file: Path, cameras: list[_Camera], wanted: str
 ) -> tuple[Frame3D, list[str], OnEarth | None]:
-    """From the chunk's own coordinates to those of the scene, a note on it, and the place."""
+    """Return the transform from chunk to scene coordinates, notes on it, and the place on Earth."""
     frame, name = _transform(chunk, file, cameras[0].component if cameras else "")
     if name is None or not cameras:
         return SAME, [], None
@@ -200,7 +201,7 @@ def _world(
 
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
-    """The similarity of a component, or of the chunk, and what has it; None where none has."""
+    """Return the similarity of the component or else of the chunk, and its source, or None."""
     places = [(each, "component") for each in chunk.iterfind("components/component")
               if each.get("id", "") == component]  # fmt: skip
     for holder, name in (*places, (chunk, "chunk")):
@@ -227,7 +228,7 @@ def _similarity(element: Element, file: Path, place: str) -> Frame3D:
 
 
 def _sensors(chunk: Element, file: Path, used: set[str]) -> dict[str, Calibration]:
-    """The calibrations of the sensors of some ids."""
+    """Return the calibrations of the sensors in use, by sensor id."""
     return {
         name: _sensor(each, file, f"sensors.sensor[{i}]")
         for i, each in enumerate(chunk.iterfind("sensors/sensor"))
@@ -243,7 +244,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
     if _is_rolling(element):
         what = f"a camera with a rolling shutter ({element.get('label') or 'without a label'})"
         raise refuse_lens(what, fields.where("rolling_shutter"), _GLOBAL)
-    # An adjusted calibration comes behind the initial one.
+    # In the XML, an adjusted calibration follows the initial calibration.
     calibrations = element.findall("calibration")
     adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
     chosen = next(reversed(adjusted or calibrations), None)
@@ -256,7 +257,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
 
 
 def _is_rolling(element: Element) -> bool:
-    """Whether the rolling shutter of a sensor is compensated: its poses are those of a moment."""
+    """Return whether Metashape compensates the rolling shutter of a sensor."""
     told = [each.get("value") for each in element.iterfind("property")
             if each.get("name") == _ROLLING]  # fmt: skip
     told += [each.get("value", each.text) for each in element.iterfind(_ROLLING)]
@@ -294,7 +295,7 @@ def _names(
     sensors: dict[str, Calibration],
     images: Path,
 ) -> tuple[list[str], list[str]]:
-    """The photo of each camera below a folder, and notes on how they were found."""
+    """Return the photo of each camera, relative to the photo folder, and notes on the pairing."""
     labels = {
         each.get("id", ""): each.get("label", "") for each in chunk.iterfind("sensors/sensor")
     }

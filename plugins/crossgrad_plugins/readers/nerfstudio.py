@@ -1,4 +1,4 @@
-"""Reads scenes of nerfstudio: `transforms.json` with photos, lenses, masks and points."""
+"""Reader of nerfstudio scenes: `transforms.json` with photos, lenses, masks and points."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,17 +27,17 @@ from crossgrad_plugins.readers._transforms import (
 from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import by_gps
 
-#: The views that are trained on, and the held-out ones: those of the first list that has any.
+#: The lists of training views and held-out views. The first held-out list with views is used.
 _TRAIN, *_HELD_OUT = "train_filenames", "test_filenames", "val_filenames"
 
 
 class NerfstudioReader(Reader):
     """nerfstudio's and instant-ngp's `transforms.json`, with any lens that can be undistorted.
 
-    Format: https://docs.nerf.studio/quickstart/data_conventions.html. What `applied_transform` and
-    `applied_scale` say was done to the world is undone, so that cameras and points stand where they
-    were posed. `train_filenames` and `test_filenames` (else `val_filenames`) are the split where no
-    train_list.txt or test_list.txt is.
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html. `applied_transform` and
+    `applied_scale` are undone, so that cameras and points are in the coordinates in which they
+    were posed. `train_filenames` and `test_filenames` (else `val_filenames`) give the split,
+    unless there is a train_list.txt or test_list.txt.
     """
 
     file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
@@ -73,7 +73,7 @@ class NerfstudioReader(Reader):
         return by_gps(build_scene(raw, options), raw)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
-        """The file of points that was asked for, and where."""
+        """Return the requested file of points, and the place that names the file."""
         if self.points is not None:
             return self.points, "reader.points"
         if "ply_file_path" in whole:
@@ -84,7 +84,7 @@ class NerfstudioReader(Reader):
 
 
 def _applied(whole: Fields) -> Frame3D:
-    """From the world as it was posed to the world of the file."""
+    """Return the transform from the world as it was posed to the world of the file."""
     scale = whole.positive("applied_scale") if "applied_scale" in whole else 1.0
     if "applied_transform" not in whole:
         return Frame3D(np.eye(3), np.zeros(3), scale)
@@ -98,10 +98,10 @@ def _applied(whole: Fields) -> Frame3D:
 def _split(
     inside: Inside, whole: Fields, base: str, images: str, posed: Sequence[str]
 ) -> tuple[frozenset[str], frozenset[str]] | None:
-    """The names of training and held-out views below the photo folder; None without lists.
+    """Return the names of training and held-out views in the photo folder, or None without lists.
 
     Raises:
-        UserError: A list names no photo of any frame, or a name is in two lists.
+        UserError: A list contains no photo of any frame, or a name is in two lists.
     """
     if _TRAIN not in whole:
         return None

@@ -1,8 +1,8 @@
-"""Reads scenes of OpenSfM and OpenDroneMap: `reconstruction.json`.
+"""Reader of OpenSfM and OpenDroneMap scenes: `reconstruction.json`.
 
 Sources of the format: https://opensfm.org/docs/geometry.html (axes, camera models, pixels),
 https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates have
-their origin in the middle of the photo and its longer side as their unit.
+their origin in the middle of the photo. Their unit is the longer side of the photo.
 """
 
 from collections.abc import Sequence
@@ -33,15 +33,15 @@ from crossgrad_plugins.readers.colmap_files.folder import check_scene_folder
 from crossgrad_plugins.readers.place.place import at, by_gps, origin_of
 
 _BYTE: Final = 255
-#: Below this many radians a rotation is its own sine.
+#: Smallest divisor for a rotation angle in radians. Below it, the sine equals the angle.
 _SMALL: Final = 1e-12
 
 
 class OpenSfmReader(Reader):
     """OpenSfM's `reconstruction.json`, by itself or in a project of OpenDroneMap.
 
-    Where there are several reconstructions, the one with most photos is taken. Perspective, radial,
-    Brown's and fisheye cameras are undistorted; others are refused.
+    If there are several reconstructions, the reconstruction with the most photos is read.
+    Perspective, radial, Brown's and fisheye cameras are undistorted. Other cameras are refused.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -93,7 +93,7 @@ class OpenSfmReader(Reader):
 
 
 def _choose(file: Path) -> tuple[Fields, list[str]]:
-    """The reconstruction with most photos, and a note on the others, if any."""
+    """Return the reconstruction with the most photos, and a note on the others, if any."""
     whole = Fields({"reconstructions": read_json(file)}, file)
     models = whole.items("reconstructions")
     if not models:
@@ -108,9 +108,9 @@ def _choose(file: Path) -> tuple[Fields, list[str]]:
 
 
 def _place(chosen: Fields) -> OnEarth | None:
-    """The place that the reconstruction was brought to; None where there was no GPS.
+    """Return the place on Earth of the reconstruction, or None if there was no GPS.
 
-    Its coordinates are metres east, north and up from its reference.
+    Coordinates of the reconstruction are metres east, north and up from its reference.
     """
     if "reference_lla" not in chosen:
         return None
@@ -119,17 +119,17 @@ def _place(chosen: Fields) -> OnEarth | None:
         return None
     shots = [shot for shot in chosen.members("shots").values() if "gps_position" in shot]
     off = [_center(shot) - shot.numbers("gps_position", 3) for shot in shots]
-    # OpenSfM does not take altitudes from photos unless it is told to.
+    # By default OpenSfM does not read altitudes from photos, so compare only x and y.
     level = np.array(off).reshape(-1, 3)[:, :2]
     rms = {"rms_horizontal": float(np.sqrt((level**2).sum(axis=1).mean()))} if off else {}
     return OnEarth(origin, SAME, f"reference_lla of {chosen.file.name}", rms)
 
 
 def _camera(fields: Fields) -> Calibration:
-    """The calibration of a camera, in pixels.
+    """Return the calibration of a camera, in pixels.
 
     Raises:
-        UserError: A field is missing or wrong, or the camera is none that can be undistorted.
+        UserError: A field is missing or wrong, or the camera cannot be undistorted.
     """
     kind = fields.text("projection_type", "perspective")
     if kind not in {
@@ -167,7 +167,7 @@ def _view(
 
 
 def _pose(shot: Fields) -> NDArray[np.float64]:
-    """[4, 4] world to camera."""
+    """Return the pose [4, 4], world to camera."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_by(shot.numbers("rotation", 3))
     pose[:3, 3] = shot.numbers("translation", 3)
@@ -175,13 +175,13 @@ def _pose(shot: Fields) -> NDArray[np.float64]:
 
 
 def _center(shot: Fields) -> NDArray[np.float64]:
-    """[3] of the camera."""
+    """Return the camera centre [3]."""
     pose = _pose(shot)
     return np.asarray(np.linalg.solve(pose[:3, :3], -pose[:3, 3]))
 
 
 def rotation_by(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] rotation about a vector [3] by its length in radians (Rodrigues)."""
+    """Return the rotation [3, 3] about a vector [3] by its length in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / max(angle, _SMALL)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -195,9 +195,10 @@ def _points(chosen: Fields) -> PointCloud:
 
 
 def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:
-    """[P, 3] of a field of all points.
+    """Return one field [P, 3] of all points.
 
-    All at once, since there may be millions; where a number is wrong one by one, which names it.
+    All points are converted at once, because there may be millions. If a number is wrong, they are
+    converted one by one, so that the error names the field.
     """
     stored = [each.value.get(key) for each in points]
     lists = [each for each in stored if isinstance(each, list) and len(each) == 3]  # noqa: PLR2004

@@ -1,4 +1,4 @@
-"""Reads folders of photos alone: finds their cameras first, as `crossgrad prepare` does."""
+"""Reader of folders that contain only photos: cameras are found as by `crossgrad prepare`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +13,9 @@ from crossgrad_plugins.readers.colmap import ColmapReader
 class PhotosAloneReader(Reader):
     """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
 
-    The prepared scene stays in a folder beside the photos, where `crossgrad prepare` finds it
-    again, and so does a run that is resumed; once it is ready, photos and `prepare/` in it may be
-    gone. By itself no folder is read this way.
+    The prepared scene is stored in a folder next to the photos. Later calls of `crossgrad prepare`
+    and resumed runs use it again. When it is complete, the photos and its folder `prepare/` may be
+    deleted. This reader is never chosen automatically.
     """
 
     scene: Path | None = Field(

@@ -1,9 +1,9 @@
-"""Reads scenes of RealityCapture (RealityScan): its CSV of internal and external parameters.
+"""Reader of RealityCapture (RealityScan) scenes: a CSV of internal and external parameters.
 
 Sources of the format: https://dev.epicgames.com/documentation/realityscan (camera geometry, XMP
-camera math): `f` in millimetres of a 36 mm sensor, principal point in units of the longer side from
-the middle of the photo. Angles as nerfstudio's converter reads them: heading clockwise from north,
-pitch 0 looking down, in degrees; x east, y north, alt up.
+camera math): `f` is in millimetres for a 36 mm sensor. The principal point is measured from the
+middle of the photo, in units of the longer side. Angles are in degrees and follow nerfstudio's
+converter: heading clockwise from north, pitch 0 looks down. Axes: x east, y north, alt up.
 """
 
 from collections.abc import Mapping
@@ -41,9 +41,9 @@ _TODO: Final = (
 
 
 class RealityCaptureReader(Reader):
-    """RealityCapture's CSV of internal and external camera parameters, and photos beside it.
+    """RealityCapture's CSV of internal and external camera parameters, with a photo folder.
 
-    Points come from a PLY; the CSV has none.
+    Points come from a PLY, because the CSV contains no points.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -82,17 +82,17 @@ class RealityCaptureReader(Reader):
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the file: the photo's name and its numbers by column."""
+    """A row of the file: the photo's name, and the numbers by column."""
 
     name: str
     fields: Fields
 
 
 def _rows(file: Path) -> list[_Row]:
-    """The rows with photos; empty ones and comments are passed over.
+    """Return the rows with photos, without empty rows and comments.
 
     Raises:
-        UserError: The file cannot be read, lacks a column, or a row has another number of cells.
+        UserError: The file cannot be read, a column is missing, or a row has a wrong cell count.
     """
     columns = Columns.of(file, COLUMNS)
     rows = read_rows(file, "the CSV of RealityCapture", _TODO, delimiter=columns.delimiter)
@@ -121,9 +121,9 @@ def _rows(file: Path) -> list[_Row]:
 
 
 def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
-    """The cells of a row with what is a number as one; others are refused when they are used.
+    """Return the cells of a row, with numbers converted. Other text is refused when it is used.
 
-    Numbers may have a comma in place of the decimal point.
+    Numbers may use a comma instead of the decimal point.
     """
     values: dict[str, object] = {}
     for name, cell in cells.items():
@@ -153,10 +153,10 @@ def _view(inside: Inside, images: str, row: _Row, photos: PhotoNames) -> RawView
 
 
 def _lens(fields: Fields, photo: Path) -> Calibration:
-    """The lens of a photo that is there; the size of others cannot be told.
+    """Return the lens of a photo. If the photo is missing, its size is set to 1 x 1 pixel.
 
     Raises:
-        UserError: A number is wrong, or a term has no counterpart.
+        UserError: A number is wrong, or a term has no counterpart in COLMAP's models.
     """
     focal = fields.positive("f")
     px, py, k1, k2, k3, k4, t1, t2 = (fields.number(key, 0.0) for key in _LENS)
@@ -173,7 +173,10 @@ def _lens(fields: Fields, photo: Path) -> Calibration:
 
 
 def rotation_of_angles(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """[3, 3] camera (x right, y up, z backward) to east, north, up, from angles in degrees."""
+    """Return the rotation [3, 3] from camera (x right, y up, z backward) to east, north, up.
+
+    The angles are in degrees.
+    """
     (sh, ch), (sp, cp), (sr, cr) = (
         (np.sin(angle), np.cos(angle)) for angle in np.deg2rad([-heading, pitch, roll])
     )

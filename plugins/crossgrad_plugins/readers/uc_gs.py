@@ -1,4 +1,4 @@
-"""Reads scenes in the manner of UC-GS: a COLMAP model whose names tell what is held out."""
+"""Reader of UC-GS scenes: a COLMAP model with names that mark held-out photos."""
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -11,16 +11,16 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers import _accepts
 from crossgrad_plugins.readers.colmap import ColmapReader, read_raw
 
-#: How folders of photos begin.
+#: Prefixes of photo folders.
 _TRAIN, _TEST = "train", "test"
 
 
 class UcGsReader(ColmapReader):
-    """COLMAP scenes whose photo folders begin with `train` and `test`, as those of UC-GS.
+    """COLMAP scenes whose photo folders begin with `train` and `test`, as in UC-GS.
 
-    Held out are photos below a folder that begins with `test`, and those with the word `eval` in
-    their name; all others are trained on. Regimes are told by further folders (`aerial`,
-    `street`), else by footprint.
+    A photo is held out if a folder in its path begins with `test`, or if its name contains the
+    word `eval`. All other photos are trained on. Further folders (`aerial`, `street`) give the
+    regimes. Without such folders, the footprint gives the regimes.
     """
 
     @override
@@ -40,7 +40,7 @@ class UcGsReader(ColmapReader):
 
 
 def _place(name: str) -> str:
-    """A name without the folders that tell training from held-out photos."""
+    """Return a name without the folders that separate training from held-out photos."""
     *folders, file = PurePosixPath(name).parts
     kept = [each for each in folders if not each.lower().startswith((_TRAIN, _TEST))]
     return "/".join((*kept, file))

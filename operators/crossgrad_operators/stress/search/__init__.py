@@ -1,1 +1,1 @@
-"""The search for the worst gradients: random families, quick references, local search."""
+"""The search for the worst gradients: random families, fast references, local search."""

@@ -1,4 +1,4 @@
-"""Examines an operator's results on a batch."""
+"""Examination of an operator's results on a batch."""
 
 from dataclasses import replace
 from typing import Final
@@ -18,16 +18,16 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding, by_law, facts
 
 Floats = NDArray[np.float64]
 
-#: Power of two by which gradients are scaled to see whether results scale with them.
+#: Power of two by which gradients are scaled, to check that results scale equally.
 _SCALE: Final = 2.0**20
-#: Relative amount by which gradients are moved to see whether results move with them.
+#: Relative change of gradients, to check that results change continuously.
 _NUDGE: Final = 1e-12
-#: Cases that moved most and that are tested for continuity, which takes 50 digits.
+#: Number of cases with the largest changes that are tested for continuity in 50 digits.
 _CANDIDATES: Final = 16
 
 
 def examine(subject: Subject, batch: Batch) -> list[Finding]:
-    """Runs an operator on a batch and judges every result."""
+    """Run an operator on a batch and judge every result."""
     with np.errstate(all="ignore"):
         found = results(subject.operator, batch)
         return [
@@ -45,21 +45,21 @@ def _judged(subject: Subject, exact: ExactCase, result: Tensor, apart: float | N
 
 
 def exact_case(batch: Batch, place: int) -> ExactCase:
-    """A case of a batch with its exact Gramian."""
+    """Return a case of a batch with its exact Gramian."""
     return ExactCase(short(batch.family, batch.rows[place], batch.dtype))
 
 
 def _from_laws(subject: Subject, batch: Batch, found: Floats) -> list[float] | list[None]:
-    """[B] how far results are from scaling with the gradients and from following their order.
+    """Return [B] errors of scaling with the gradients, and of the order of two views.
 
-    None for operators that have a reference.
+    The result is None for operators that have a reference.
     """
     if subject.reference.oracle is not None or subject.reference.rule is not None:
         return [None] * len(found)
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
     apart = np.linalg.norm(scaled - found, axis=1)
-    # Near singular Gramians the order may matter; usual gradients are far from them.
+    # At nearly singular Gramians the order may matter. Usual gradients are far from singular.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)
@@ -70,11 +70,11 @@ def _from_laws(subject: Subject, batch: Batch, found: Floats) -> list[float] | l
 def largest_jump(
     subject: Subject, batch: Batch, rng: np.random.Generator
 ) -> tuple[int, float] | None:
-    """The case whose result moves most where gradients do by 1e-12, and how far it moves.
+    """Return the case whose result changes most if gradients change by 1e-12, and the change.
 
-    The distance is divided by the length of the longest gradient. Cases at which the method is not
-    continuous do not count; None if all of the cases that moved most are such. Gradients are
-    float64, in which so small a change is exact enough.
+    The change is divided by the length of the longest gradient. Cases at which the method is not
+    continuous are skipped. None is returned if all cases with the largest changes are skipped.
+    Gradients are float64, in which such a small change is exact enough.
     """
     wide = replace(batch, dtype=torch.float64)
     noise = _NUDGE * rng.standard_normal(batch.rows.shape)

@@ -1,4 +1,4 @@
-"""Many short gradients at once, of the kinds that small solvers get wrong."""
+"""Batches of short gradients, of kinds for which small solvers often fail."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,33 +15,33 @@ from crossgrad_operators.stress.runner import context_of
 Rows = NDArray[np.float64]
 #: (generator, B, K, P) -> [B, K, P] gradients.
 Family = Callable[[np.random.Generator, int, int, int], Rows]
-#: Largest number of views and of elements.
+#: Greatest number of views and of elements.
 VIEWS, ELEMENTS = 20, 50
-#: The distribution that shares of gradients outside a set are stated for.
+#: The distribution for which the share of gradients outside a set is stated.
 USUAL: Final = "random"
-#: Numbers of views, and how often each is drawn: 50 digits take 1 ms for two views, 1 s for 20.
+#: Numbers of views, and their probabilities. 50 digits take 1 ms for two views, 1 s for 20.
 _VIEWS: Final = np.arange(2, VIEWS + 1)
 _SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
-#: Cases of a batch, times K^2.
+#: Number of cases in a batch, times K^2.
 _CASES: Final = 256
-#: The block whose rows are gradients of their own.
+#: The block whose rows are separate gradients.
 BLOCK = Block("means", ("means",), True, "geometry", LearningRate(1.0))
 
 
 def cases_of(views: int) -> int:
-    """The number of cases of a batch: fewer for more views, which take longer in 50 digits."""
+    """Return the number of cases of a batch: fewer for more views, which take longer."""
     return max(1, _CASES // views**2)
 
 
 def rounded(rows: Rows, dtype: torch.dtype) -> Rows:
-    """The rows in a type of gradients, as float64 numbers."""
-    # Adding zero leaves no zero with a sign.
+    """Return the rows rounded to a type of gradients, as float64 numbers."""
+    # Adding zero removes the sign of zeros.
     result: Rows = torch.from_numpy(rows).to(dtype).double().numpy() + 0.0
     return result
 
 
 def sizes(rng: np.random.Generator, family: str) -> tuple[int, int]:
-    """K from 2 to 20, mostly few, and P: from 1 to 50 for `USUAL`, else at most about twice K."""
+    """Draw K from 2 to 20, mostly small, and P from 1 to 50 for `USUAL`, else at most 2 K + 3."""
     views = int(rng.choice(_VIEWS, p=_SHARES))
     elements = ELEMENTS if family == USUAL else 2 * views + 3
     return views, int(rng.integers(1, elements + 1))
@@ -52,24 +52,24 @@ def _normal(rng: np.random.Generator, blocks: int, views: int, elements: int) ->
 
 
 def _powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> Rows:
-    """10 to random powers."""
+    """Return random powers of 10."""
     return np.asarray(10.0 ** rng.uniform(low, high, shape))
 
 
 def usual(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Normal rows, their norms over seven decades."""
+    """Return normal random rows with norms over seven decades."""
     rows = _normal(rng, blocks, views, elements)
     return rows * _powers(rng, (blocks, views, 1), -3.5, 3.5)
 
 
 def integers(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Small integers: exact ties, exact singularity."""
+    """Return small integers, which give exact ties and exactly singular Gramians."""
     bounds = rng.choice([1, 2, 9], (blocks, 1, 1))
     return np.rint(bounds * rng.uniform(-1, 1, (blocks, views, elements)))
 
 
 def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Rank 1 to 3; of integers half of the time, so that rounding leaves the rank as it is."""
+    """Return rows of rank 1 to 3, half of them integers, for which rounding keeps the rank."""
     rank = int(rng.integers(1, 4))
     factors = _normal(rng, blocks, views, rank)
     basis = _normal(rng, blocks, rank, elements)
@@ -79,7 +79,7 @@ def low_rank(rng: np.random.Generator, blocks: int, views: int, elements: int) -
 
 
 def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Some rows are (opposite) multiples of another one, at distances from 1 to 1e-16."""
+    """Return rows near (opposite) multiples of another row, at distances from 1 to 1e-16."""
     rows = _normal(rng, blocks, views, elements)
     source = rows[:, :1] * _apart(rng, blocks, elements)
     copied = rng.random((blocks, views, 1)) < rng.choice([0.3, 0.7, 1.0], (blocks, 1, 1))
@@ -91,14 +91,14 @@ def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int
 
 
 def _apart(rng: np.random.Generator, blocks: int, elements: int) -> Rows:
-    """[B, 1, P] masks: where the source is zero, small distances survive rounding."""
+    """Return masks [B, 1, P]. At elements that they set to zero, small distances stay exact."""
     kept = rng.random((blocks, 1, elements)) < 0.6  # noqa: PLR2004
     kept[:, :, 0] = True
     return np.where(rng.random((blocks, 1, 1)) < 0.5, 1.0, kept)  # noqa: PLR2004
 
 
 def vanishing(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """A convex combination nearly vanishes, up to distances from 1 to 1e-16."""
+    """Return rows with a convex combination near zero, at distances from 1 to 1e-16."""
     rows = _normal(rng, blocks, views, elements) * _apart(rng, blocks, elements)
     chosen = rng.random((blocks, views)) < rng.choice([0.3, 0.6, 1.0], (blocks, 1))
     chosen[:, 0] = True
@@ -111,19 +111,19 @@ def vanishing(rng: np.random.Generator, blocks: int, views: int, elements: int) 
 
 
 def ratios(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Norm ratios to 1e12."""
+    """Return rows with norm ratios up to 1e12."""
     return _normal(rng, blocks, views, elements) * _powers(rng, (blocks, views, 1), -6, 6)
 
 
 def zeros(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Rows and elements that are exactly zero."""
+    """Return rows with exact zeros: whole rows and single elements."""
     rows = _normal(rng, blocks, views, elements)
     rows *= rng.random((blocks, views, 1)) < 0.7  # noqa: PLR2004
     return np.asarray(rows * (rng.random(rows.shape) < rng.uniform(0.2, 1, (blocks, 1, 1))))
 
 
 def mixed(rng: np.random.Generator, blocks: int, views: int, elements: int) -> Rows:
-    """Copies or vanishing combinations with norm ratios to 1e12 on top."""
+    """Return near copies or vanishing combinations with norm ratios up to 1e12."""
     first = near_copies if rng.random() < 0.5 else vanishing  # noqa: PLR2004
     rows = first(rng, blocks, views, elements)
     return rows * _powers(rng, (blocks, views, 1), -6, 6)
@@ -146,9 +146,9 @@ class Batch:
     """B cases of equal size.
 
     Attributes:
-        rows: [B, K, P] gradients, exact in their type.
+        rows: [B, K, P] gradients that are exact in their type.
         dtype: Type of the gradients.
-        family: Where they come from.
+        family: Name of the family.
     """
 
     rows: Rows
@@ -157,18 +157,18 @@ class Batch:
 
     @property
     def views(self) -> int:
-        """K."""
+        """The number of views K."""
         return int(self.rows.shape[1])
 
 
 def search_views(count: int, seed: int = 0) -> Views:
-    """Near and far views in turn, at distances whose powers multiply gradients without error."""
+    """Return alternating near and far views. Powers of their distances multiply without error."""
     labels = tuple(("near", "far")[k % 2] for k in range(count))
     return Views(labels, tuple(2.0 ** (k % 6 - 2) for k in range(count)), seed)
 
 
 def results(operator: Operator, batch: Batch, views: Views | None = None) -> Rows:
-    """[B, P] what an operator makes of each case; NaN where it raises an error."""
+    """Return the results [B, P] of an operator for each case, NaN for cases that raise."""
     if isinstance(operator, GramianOperator):
         operator = operator.model_copy(update={"granularity": "gaussian"})
     return _results(operator, batch.rows, batch.dtype, views or search_views(batch.views))
@@ -192,7 +192,7 @@ def _results(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -
 
 
 def _halved(operator: Operator, rows: Rows, dtype: torch.dtype, views: Views) -> Rows:
-    """The cases that raise the error found by halves, so that the others keep their results."""
+    """Split the batch to find the cases that raise, so that other cases keep their results."""
     if len(rows) == 1:
         return np.full(rows[:, 0].shape, np.nan)
     half = len(rows) // 2

@@ -1,4 +1,4 @@
-"""Whether results are finite, over very many short gradients."""
+"""Check that results are finite, for a large number of short gradients."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from crossgrad_operators.stress.suite import Subject
 
 #: Types of gradients.
 BOTH: Final = (torch.float32, torch.float64)
-#: Cases of a batch, and their largest number of elements.
+#: Number of cases in a batch, and greatest number of elements.
 BATCH, ELEMENTS = 1000, 20
 
 
@@ -26,12 +26,12 @@ class Finite:
     """The findings for one operator.
 
     Attributes:
-        operator: Its name.
-        matrices: Cases that were run.
-        not_finite: Of these, those with a result that is not finite.
-        longest: Largest |u| over the longest gradient.
-        seconds: What it took.
-        example: A case whose result is not finite.
+        operator: Name of the operator.
+        matrices: Number of cases that were run.
+        not_finite: Number of cases with a result that is not finite.
+        longest: Largest |u| divided by the longest gradient.
+        seconds: Duration.
+        example: A case whose result is not finite, or None.
     """
 
     operator: str
@@ -46,7 +46,7 @@ class Finite:
 def run_finite(
     subject: Subject, matrices: int, seed: int = 0, dtypes: Sequence[torch.dtype] = BOTH
 ) -> Finite:
-    """Runs an operator on `matrices` cases of K 2 to 20, of the types in turn."""
+    """Run an operator on `matrices` cases with K from 2 to 20, of alternating types."""
     start = perf_counter()
     bad, longest, example = 0, 0.0, None
     for turn, first in enumerate(range(0, matrices, BATCH)):
@@ -64,7 +64,7 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two batches of a family at a time: one of each type.
+    # Two successive batches have the same family, one batch of each type.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):
@@ -74,14 +74,14 @@ def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, in
 
 
 def _longest(batch: Batch, found: np.ndarray) -> float:
-    """The largest |u| over the longest gradient."""
+    """Return the largest |u| divided by the longest gradient."""
     length = np.linalg.norm(batch.rows, axis=2).max(axis=1)
     ratio = np.linalg.norm(found, axis=1) / np.where(length > 0, length, 1.0)
     return float(ratio.max(initial=0.0))
 
 
 def as_text(found: Sequence[Finite]) -> str:
-    """One line per operator, and the rows of what is not finite."""
+    """Return one line per operator, and the rows of an example that is not finite."""
     head = f"{'operator':<16}{'matrices':>10}{'not finite':>12}{'longest |u|':>13}{'seconds':>9}"
     lines = [
         f"{each.operator:<16}{each.matrices:>10}{each.not_finite:>12}{each.longest:>13.3g}"
@@ -99,7 +99,7 @@ def as_text(found: Sequence[Finite]) -> str:
 
 
 def write_csv(found: Sequence[Finite], path: Path) -> None:
-    """One row per operator."""
+    """Write one row per operator."""
     rows: list[dict[str, str | int | float]] = [
         {
             "operator": each.operator,

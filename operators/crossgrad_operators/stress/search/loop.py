@@ -1,4 +1,4 @@
-"""Rounds of the search: fresh gradients, then mutants of each operator's worst, shrunk."""
+"""Rounds of the search: new gradients, then mutants of each operator's worst cases."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,23 +25,23 @@ from crossgrad_operators.stress.search.samples import Sample, mutants
 from crossgrad_operators.stress.search.worst_cases import WorstCases, severity, specimen
 from crossgrad_operators.stress.suite import Subject
 
-#: Cases of a round that are moved by a little, which needs no exact arithmetic.
+#: Number of cases in a round that are changed slightly, which needs no exact arithmetic.
 JUMPS = 64
-#: What a smaller case must keep of the value.
+#: Share of the value that a smaller case must keep.
 KEPT = 0.7
-#: Significant digits that elements are rounded to.
+#: Numbers of significant digits to which elements are rounded.
 FEW_DIGITS = (1, 2, 4)
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How far a search goes, and from where.
+    """The start and the extent of a search.
 
     Attributes:
-        seed: Of all its random numbers; a longer search begins with the cases of a shorter one.
-        seconds: Rounds begin until then.
-        rounds: Their largest number, None for any.
-        dtypes: Types of gradients, in turn.
+        seed: Seed of all random numbers. A longer search begins with the cases of a shorter one.
+        seconds: No round begins after this duration.
+        rounds: Greatest number of rounds, or None.
+        dtypes: Types of gradients, used in turn.
     """
 
     seed: int = 0
@@ -55,7 +55,7 @@ def search(
     extent: Extent,
     progress: Callable[[int, Sequence[WorstCases]], None] = lambda _turn, _tallies: None,
 ) -> list[WorstCases]:
-    """Looks for the worst gradients of every operator.
+    """Search for the worst gradients of every operator.
 
     Raises:
         UserError: mpmath is not installed.
@@ -79,14 +79,14 @@ def search(
 
 
 def _simplify(subject: Subject, tally: WorstCases) -> None:
-    """Leaves out of the worst cases what they do not need."""
+    """Remove unnecessary parts from the worst cases."""
     for pool, inside in ((tally.inside_pool, True), (tally.outside_pool, False)):
         if pool and np.isfinite(pool[0].value):
             pool[0] = shrunk(subject, pool[0], inside=inside)
 
 
 def fresh(extent: Extent, turn: int) -> Batch:
-    """The gradients of a round."""
+    """Return the gradients of a round."""
     place, index = turn % len(extent.dtypes), turn // len(extent.dtypes)
     rng = np.random.default_rng([extent.seed, turn])
     family = list(FAMILIES)[index % len(FAMILIES)]
@@ -99,7 +99,7 @@ def fresh(extent: Extent, turn: int) -> Batch:
 def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int]) -> None:
     admitted = subject.operator.views
     if not admitted.admits(batch.views):
-        # Pairs of the same kind instead, for operators that take no more.
+        # Operators that take only pairs receive pairs of the same kind.
         batch = Batch(batch.rows[:, :2], batch.dtype, batch.family)
     if not admitted.admits(batch.views):
         return
@@ -119,19 +119,19 @@ def _round(subject: Subject, tally: WorstCases, batch: Batch, at: tuple[int, int
 
 
 def _over_steps(subject: Subject, tally: WorstCases, batch: Batch, turn: int) -> None:
-    """Runs one case over several steps, for operators that remember."""
+    """Run one case over several steps, for operators with memory."""
     finding, _ = judged(subject.operator, exact_case(batch, 0), subject.reference, search_views)
     if finding.verdict == "failed" and finding.reason != UNPROVEN:
         tally.fail(specimen(batch, 0, turn), f"over several steps: {finding.reason}")
 
 
 def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
-    """The case without the rows, elements and digits that it does not need.
+    """Return the case without unnecessary rows, elements and digits.
 
     Args:
         subject: The operator.
-        specimen: A case of a large error inside the set, or of a long result outside.
-        inside: Which of the two.
+        specimen: A case with a large error inside the set, or with a long result outside.
+        inside: True for an error inside the set.
     """
     least = KEPT * specimen.value
     while True:
@@ -146,7 +146,7 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
 
 
 def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]:
-    """Cases with fewer rows or elements (half of them, a quarter, ... one), then fewer digits."""
+    """Yield cases with fewer rows or elements (half, a quarter, ... one), then fewer digits."""
     for part in _parts(len(rows), least=2):
         if subject.operator.views.admits(len(rows) - len(part)):
             yield np.delete(rows, part, axis=0)
@@ -159,7 +159,7 @@ def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]
 
 
 def _parts(count: int, least: int) -> Iterator[range]:
-    """Ranges of places to leave out, the longest first; at least `least` places are left."""
+    """Yield index ranges to leave out, the longest first, so that at least `least` remain."""
     size = count // 2
     while size:
         for first in range(0, count, size):

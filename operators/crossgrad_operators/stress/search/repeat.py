@@ -1,4 +1,4 @@
-"""One case that the user gives, held against 50 digits."""
+"""Comparison of operators with 50 digits on a case given by the user."""
 
 import json
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ from crossgrad_operators.stress.verdict import ExactCase, Finding
 
 
 def read_rows(text: str, dtype: torch.dtype) -> Case:
-    """The case that a text such as [[1,2],[3,4]] describes: a row per view.
+    """Return the case in a text such as [[1,2],[3,4]], with one row per view.
 
     Raises:
-        UserError: It is no matrix of finite numbers.
+        UserError: The text is not a matrix of finite numbers.
     """
     try:
         rows = np.array(json.loads(text), np.float64)
@@ -30,13 +30,13 @@ def read_rows(text: str, dtype: torch.dtype) -> Case:
     with np.errstate(over="ignore"):
         case = short(str(dtype).removeprefix("torch."), rows, dtype)
         finite = np.isfinite(case.exact_head).all()
-    if not finite:  # as that type rounds them
+    if not finite:  # after rounding to the type
         raise _no_matrix(text)
     return case
 
 
 def run_rows(subjects: Sequence[Subject], case: Case) -> list[Cell]:
-    """Every operator on one case, as the search ran it."""
+    """Run every operator on one case, as the search does."""
     mpmath = require_mpmath()
     with mpmath.mp.workdps(DIGITS):
         exact = ExactCase(case)

@@ -7,10 +7,10 @@ from crossgrad_core.commands import write_table
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Share of usual gradients that may lie outside a set, and gradients from which it is judged.
+#: Greatest allowed share of usual gradients outside a set, and the least number for this check.
 SHARE, ENOUGH = 0.01, 2000
 
-#: Counts of a tally, as a CSV file has them.
+#: Counts that are columns of the CSV file.
 COUNTS = (
     "matrices",
     "outside",
@@ -36,7 +36,7 @@ LEGEND = (
 
 
 def as_text(tallies: Sequence[WorstCases]) -> str:
-    """The table, the worst case of each operator, and what broke a promise."""
+    """Return the table, the worst cases of each operator, and the broken promises."""
     used = [tally for tally in tallies if tally.matrices]
     worst = [line for tally in used for line in _worst(tally)]
     parts = ["\n".join([_HEAD, *map(_line, used)]), LEGEND, "\n".join(["worst cases:", *worst])]
@@ -44,7 +44,7 @@ def as_text(tallies: Sequence[WorstCases]) -> str:
 
 
 def write_csv(tallies: Sequence[WorstCases], path: Path) -> None:
-    """One row per operator and type."""
+    """Write one row per operator and type."""
     write_table(path, [_row(tally) for tally in tallies])
 
 
@@ -60,7 +60,7 @@ def _row(tally: WorstCases) -> dict[str, str | int | float]:
 
 
 def failed(tally: WorstCases) -> bool:
-    """Whether a promise was broken."""
+    """Return whether a promise was broken."""
     return tally.broken > 0 or _too_often_outside(tally)
 
 

@@ -1,4 +1,4 @@
-"""Single cases worth keeping, and what they are mutated into."""
+"""Single cases that are stored, and their mutations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from crossgrad_operators.stress.search.families import (
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One case and how bad it is.
+    """A case and its value, which measures how bad the case is.
 
     Attributes:
-        rows: [K, P] gradients, exact in their type.
+        rows: [K, P] gradients that are exact in their type.
         dtype: Type of the gradients.
-        family: Where they come from.
-        turn: The round in which they were found.
-        value: How bad it is: an error or a ratio.
+        family: Name of the family.
+        turn: The round in which the case was found.
+        value: An error or a ratio.
     """
 
     rows: Rows
@@ -37,11 +37,11 @@ class Sample:
 
     @property
     def precision(self) -> str:
-        """Name of the type."""
+        """The name of the type."""
         return str(self.dtype).removeprefix("torch.")
 
     def text(self) -> str:
-        """The rows, so that they can be read again exactly."""
+        """Return the rows as text that can be read back exactly."""
         number = np.float32 if self.dtype == torch.float32 else np.float64
         rows = [[_shortest(number(value)) for value in row] for row in self.rows]
         return "[" + ",".join("[" + ",".join(row) + "]" for row in rows) + "]"
@@ -53,7 +53,7 @@ def _shortest(value: np.floating) -> str:
     return min(text, plain, key=len) if float(plain) == float(text) else text
 
 
-#: Families of mutants.
+#: Suffix of the family names of mutants.
 MUTATED = ", mutated"
 
 #: (generator, [B, K, P]) -> [B, K, P].
@@ -61,7 +61,7 @@ Mutation = Callable[[np.random.Generator, Rows], Rows]
 
 
 def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewCounts) -> Batch:
-    """Variants of one of the parents, with a row or element less or more now and then."""
+    """Return variants of one of the parents, sometimes with one row or element more or less."""
     parent = parents[int(rng.integers(len(parents)))]
     rows = parent.rows
     if rng.random() < 0.2:  # noqa: PLR2004
@@ -69,7 +69,7 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
         rows = reshaped if admitted.admits(len(reshaped)) else rows
     batch = np.repeat(rows[None], cases_of(len(rows)), axis=0)
     pieces = np.array_split(batch, len(MUTATIONS))
-    # In any order, because the last pieces of a small batch are empty.
+    # The order is random because the last pieces of a small batch are empty.
     order = rng.permutation(len(MUTATIONS)).tolist()
     found = [MUTATIONS[place](rng, piece) for place, piece in zip(order, pieces, strict=True)]
     result = rounded(np.nan_to_num(np.concatenate(found)), parent.dtype)
@@ -77,20 +77,20 @@ def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewC
 
 
 def _nudge_elements(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Some elements, by a relative amount from 1 to 1e-16."""
+    """Change some elements by a relative amount from 1 to 1e-16."""
     amount = 10.0 ** rng.uniform(-16, 0, (len(rows), 1, 1))
     chosen = rng.random(rows.shape) < rng.uniform(0, 1, (len(rows), 1, 1)) ** 2
     return np.asarray(rows * (1 + chosen * amount * rng.standard_normal(rows.shape)))
 
 
 def _scale_rows(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Some rows, by factors up to 1e6."""
+    """Multiply some rows by factors up to 1e6."""
     chosen = rng.random((*rows.shape[:2], 1)) < 0.3  # noqa: PLR2004
     return np.asarray(rows * np.where(chosen, 10.0 ** rng.uniform(-6, 6, chosen.shape), 1.0))
 
 
 def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
-    """A row becomes another one, or its opposite, and a share of itself."""
+    """Replace a row by plus or minus another row plus a share of itself."""
     blocks, views, _ = rows.shape
     one, other = rng.integers(views, size=(2, blocks))
     place = np.arange(blocks)
@@ -102,7 +102,7 @@ def _approach(rng: np.random.Generator, rows: Rows) -> Rows:
 
 
 def _replace_elements(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Some elements become zero or normal."""
+    """Replace some elements by zero or normal random numbers."""
     chosen = rng.random(rows.shape) < rng.uniform(0, 0.3, (len(rows), 1, 1))
     size = np.abs(rows).max(axis=2, keepdims=True)
     fresh = size * rng.standard_normal(rows.shape) * (rng.random(rows.shape) < 0.5)  # noqa: PLR2004
@@ -110,13 +110,13 @@ def _replace_elements(rng: np.random.Generator, rows: Rows) -> Rows:
 
 
 def _turn_rows(rng: np.random.Generator, rows: Rows) -> Rows:
-    """Signs of rows, and their order."""
+    """Change the signs and the order of rows."""
     signs = np.where(rng.random((*rows.shape[:2], 1)) < 0.2, -1.0, 1.0)  # noqa: PLR2004
     order = rng.permuted(np.tile(np.arange(rows.shape[1]), (len(rows), 1)), axis=1)
     return np.asarray(np.take_along_axis(rows * signs, order[:, :, None], axis=1))
 
 
-#: (generator, [K, P]) -> one row or column more or less.
+#: (generator, [K, P]) -> rows with one row or column more or less.
 Reshaping = Callable[[np.random.Generator, Rows], Rows]
 
 

@@ -1,4 +1,4 @@
-"""Findings of a search for one operator in one precision."""
+"""Findings of a search for one operator and one type of gradients."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,33 +11,33 @@ from crossgrad_operators.stress.search.families import USUAL, Batch
 from crossgrad_operators.stress.search.samples import Sample
 from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 
-#: Cases that mutants are made from, of either kind.
+#: Number of stored cases, of either kind, from which mutants are made.
 POOL = 8
-#: Views of these cases at most: 50 digits take long for more.
+#: Greatest number of views of these cases, because 50 digits take long for more views.
 MUTATED_VIEWS = 8
-#: Share of the longest gradient by which a continuous method moves at most.
+#: Greatest change of a continuous method's result, as a share of the longest gradient.
 JUMP = 1e-3
-#: Cases that break a promise, kept for the report.
+#: Number of cases with a broken promise that are stored for the report.
 KEPT = 5
 
 
 @dataclass
 class WorstCases:
-    """Counts and worst cases; grows with every batch.
+    """Counts and worst cases, updated with every batch.
 
     Attributes:
         operator: Name of the operator.
         dtype: Type of the gradients.
-        matrices: Cases that were run.
-        outside: Of these, cases outside the operator's set.
-        usual: Cases of the family that shares are stated for.
-        ordinary_outside: Of these, cases outside the set.
-        unproven: Cases without a proven reference.
-        not_finite: Cases with a result that is not finite.
-        broken: Cases that break a promise.
-        inside_pool: Cases of the largest error inside the set, the worst first.
-        outside_pool: Cases of the largest |u| outside it, over the longest gradient.
-        jump: The case whose result moves most where the method is continuous.
+        matrices: Number of cases that were run.
+        outside: Number of cases outside the operator's set.
+        usual: Number of cases of the usual family.
+        ordinary_outside: Number of usual cases outside the set.
+        unproven: Number of cases without a proven reference.
+        not_finite: Number of cases with a result that is not finite.
+        broken: Number of cases that break a promise.
+        inside_pool: Cases with the largest error inside the set, the worst first.
+        outside_pool: Cases with the largest |u| outside the set, divided by the longest gradient.
+        jump: The case whose result changes most although the method is continuous.
         failures: Some of the cases that break a promise, with the reason.
     """
 
@@ -57,22 +57,22 @@ class WorstCases:
 
     @property
     def pool(self) -> list[Sample]:
-        """The cases that mutants are made from."""
+        """The cases from which mutants are made."""
         worst = [*self.inside_pool, *self.outside_pool]
         return [sample for sample in worst if len(sample.rows) <= MUTATED_VIEWS]
 
     @property
     def precision(self) -> str:
-        """Name of the type of the gradients."""
+        """The name of the gradients' type."""
         return str(self.dtype).removeprefix("torch.")
 
     @property
     def ordinary_share(self) -> float:
-        """Share of usual cases outside the set."""
+        """The share of usual cases outside the set."""
         return self.ordinary_outside / max(self.usual, 1)
 
     def add(self, batch: Batch, findings: Sequence[Finding], turn: int) -> None:
-        """Counts a batch and keeps its worst cases."""
+        """Count a batch and store its worst cases."""
         outside = sum(finding.is_outside for finding in findings)
         self.matrices += len(findings)
         self.outside += outside
@@ -90,25 +90,25 @@ class WorstCases:
                 self.fail(specimen(batch, place, turn), finding.reason)
 
     def fail(self, sample: Sample, reason: str) -> None:
-        """Counts a case that breaks a promise; the first ones are kept for the report."""
+        """Count a case that breaks a promise. The first such cases are stored for the report."""
         self.broken += 1
         if len(self.failures) < KEPT:
             self.failures.append((sample, reason))
 
     def jumped(self, found: Sample) -> None:
-        """Counts a result that moves too much, and keeps the worst."""
+        """Count a result that changes too much, and store the largest change."""
         if self.jump is None or found.value > self.jump.value:
             self.jump = found
         if found.value > JUMP:
             self.broken += 1
             moved = f"moves by {found.value:.3g} of the longest gradient"
-            # Before the others, which are many more and would leave no place.
+            # Insert at the front, because other failures are numerous and would fill the list.
             jump = (found, f"{moved} where the gradients do by 1e-12")
             self.failures = [jump, *self.failures][:KEPT]
 
 
 def severity(finding: Finding, *, inside: bool) -> float:
-    """The error inside the set, or |u| over the longest gradient outside; 0 if there is none."""
+    """Return the error inside the set, or |u| / longest gradient outside, or 0 without either."""
     if not inside:
         return finding.ratio if finding.is_outside else 0.0
     excused = finding.is_outside or finding.verdict == "undetermined"
@@ -117,12 +117,12 @@ def severity(finding: Finding, *, inside: bool) -> float:
 
 
 def specimen(batch: Batch, place: int, turn: int, value: float = 0.0) -> Sample:
-    """A case of a batch by itself."""
+    """Return a case of a batch as a sample."""
     return Sample(batch.rows[place].copy(), batch.dtype, batch.family, turn, value)
 
 
 def _worst(pool: list[Sample], batch: Batch, values: Sequence[float], turn: int) -> list[Sample]:
-    """The worst cases of a pool and a batch together."""
+    """Return the worst cases of a pool and a batch together."""
     last = pool[-1].value if len(pool) == POOL else 0.0
     ranked = sorted(range(len(values)), key=lambda place: -values[place])
     places = [place for place in ranked[:2] if values[place] > last]

@@ -1,1 +1,1 @@
-"""The files of a COLMAP model: which folder holds them, and their contents."""
+"""The files of a COLMAP model: the folder that holds them, and their contents."""

@@ -1,7 +1,7 @@
-"""COLMAP models: their contents, and their binary files, walked record by record.
+"""COLMAP models: their contents, and a reader of their binary files, record by record.
 
-Given files that are cut short, pycolmap 4.2.1 reads arbitrary cameras without a word, or loops
-without an end and fills the memory.
+pycolmap 4.2.1 is not used, because for truncated files it returns arbitrary cameras without an
+error, or loops without end and fills the memory.
 
 Source of the format: https://colmap.github.io/format.html (`cameras.bin`, `images.bin`,
 `points3D.bin`; little-endian).
@@ -37,11 +37,11 @@ class ColmapImage:
     """A registered image.
 
     Attributes:
-        name: As written in the model.
-        camera: Id of its camera.
+        name: Name as written in the model.
+        camera: Id of the image's camera.
         quaternion: [4] wxyz, world to camera, not necessarily normalised.
-        translation: [3].
-        points: [S] uint64 ids of the points that it observes.
+        translation: [3], world to camera.
+        points: [S] uint64 ids of the points that the image observes.
     """
 
     name: str
@@ -53,7 +53,7 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A model as it is in its files.
+    """A model as stored in its files.
 
     Attributes:
         cameras: Camera id -> calibration.
@@ -72,7 +72,7 @@ class ColmapModel:
 
 @cache
 def camera_models() -> dict[int, tuple[str, int]]:
-    """Number of a camera model -> its name and how many parameters it has."""
+    """Return the name and number of parameters of each camera model, by its number in COLMAP."""
     guard_pycolmap()
     import pycolmap
 
@@ -88,10 +88,10 @@ def camera_models() -> dict[int, tuple[str, int]]:
 
 
 def by_id(cameras: Iterable[tuple[int, Calibration]], path: Path) -> dict[int, Calibration]:
-    """The cameras by their ids.
+    """Return the cameras by their ids.
 
     Raises:
-        UserError: Two cameras have one id.
+        UserError: Two cameras have the same id.
     """
     found: dict[int, Calibration] = {}
     for camera, calibration in cameras:
@@ -102,7 +102,7 @@ def by_id(cameras: Iterable[tuple[int, Calibration]], path: Path) -> dict[int, C
 
 
 def check_point_ids(ids: NDArray[np.uint64], path: Path) -> None:
-    """Refuses two points of one id.
+    """Refuse two points with the same id.
 
     Raises:
         UserError: There are such points.
@@ -123,10 +123,10 @@ def _twice(what: str, number: int, path: Path) -> UserError:
 
 
 def read_binary(folder: Path) -> ColmapModel:
-    """Reads `cameras.bin`, `images.bin` and, where it is there, `points3D.bin`.
+    """Read `cameras.bin`, `images.bin` and, if it exists, `points3D.bin`.
 
     Raises:
-        UserError: A file is cut short, goes on behind its end or is not what its name says.
+        UserError: A file is truncated, too long, or has another content than its name says.
     """
     with _open(folder / "cameras.bin") as file:
         cameras = by_id(_read_cameras(file), file.path)
@@ -142,7 +142,7 @@ def read_binary(folder: Path) -> ColmapModel:
 
 
 class _Walk:
-    """A position in a binary file; refuses to pass its end."""
+    """A position in a binary file. It cannot move past the end of the file."""
 
     def __init__(self, path: Path, data: mmap.mmap | bytes) -> None:
         self.path = path
@@ -150,7 +150,7 @@ class _Walk:
         self.at = 0
 
     def skip(self, size: int) -> int:
-        """Passes `size` bytes; returns where they start."""
+        """Move on by `size` bytes and return the position of the first."""
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise UserError(
@@ -163,11 +163,11 @@ class _Walk:
         return start
 
     def unpack(self, layout: struct.Struct) -> tuple[int | float, ...]:
-        """The next values."""
+        """Return the next values."""
         return layout.unpack_from(self.data, self.skip(layout.size))
 
     def count(self, least: int) -> int:
-        """The next number of records, of `least` bytes each at least."""
+        """Return the next number of records, each at least `least` bytes long."""
         number = int(self.unpack(_COUNT)[0])
         here = self.at
         self.skip(number * least)
@@ -175,7 +175,7 @@ class _Walk:
         return number
 
     def text(self) -> str:
-        """The next zero-terminated string."""
+        """Return the next zero-terminated string."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             end = len(self.data)
@@ -183,7 +183,7 @@ class _Walk:
         return os.fsdecode(self.data[start:end])
 
     def end(self) -> None:
-        """Makes sure that everything was read."""
+        """Refuse a file that was not read to its end."""
         if self.at != len(self.data):
             raise UserError(
                 "the file goes on behind its last record",
@@ -203,7 +203,7 @@ def _open(path: Path) -> Iterator[_Walk]:
             "the file cannot be read", where=path, found=str(error), todo="check its permissions"
         ) from error
     with file:
-        # An empty file cannot be mapped. The map closes with the last array that looks into it.
+        # An empty file cannot be mapped. The map is closed with the last array that uses it.
         empty = path.stat().st_size == 0
         yield _Walk(path, b"" if empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
@@ -238,16 +238,16 @@ def _read_images(file: _Walk) -> Iterator[ColmapImage]:
 
 
 def _read_points(file: _Walk) -> NDArray[np.void]:
-    """[P] records `_POINT`; tracks, of any length, are passed over."""
+    """Return the records [P] of type `_POINT`. Tracks, of any length, are skipped."""
     number = file.count(_POINT.itemsize + _COUNT.size)
     data, at, starts = file.data, file.at, []
-    # Millions of records: no call of our own for each.
+    # There may be millions of records, so this loop calls no function of ours.
     track_length, fixed = _COUNT.unpack_from, _POINT.itemsize + _COUNT.size
     try:
         for _ in range(number):
             starts.append(at)
             at += fixed + _TRACK_ELEMENT * track_length(data, at + _POINT.itemsize)[0]
-    except (struct.error, OverflowError):  # behind the end, or further than can be counted
+    except (struct.error, OverflowError):  # past the end, or too large an offset
         at += fixed
     file.skip(at - file.at)
     file.end()

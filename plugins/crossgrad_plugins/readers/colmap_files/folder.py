@@ -1,4 +1,4 @@
-"""Where a scene folder keeps its COLMAP model."""
+"""Search for the COLMAP model in a scene folder."""
 
 import difflib
 import re
@@ -11,9 +11,9 @@ _PARENTS = ("sparse", "colmap/sparse")
 
 
 def find_models(scene: Path) -> list[Path]:
-    """Folders of the models of a scene: `sparse/0`, `sparse/1` ..., `sparse`, or the scene's own.
+    """Return the model folders of a scene: `sparse/0`, `sparse/1` ..., `sparse`, or the scene.
 
-    Also those in `colmap/sparse`. In the order of their numbers.
+    Models in `colmap/sparse` are included. The models are sorted by number.
     """
     found = []
     for parent in (scene / name for name in _PARENTS):
@@ -24,14 +24,14 @@ def find_models(scene: Path) -> list[Path]:
 
 
 def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
-    """The model to read and a note on the others, if any.
+    """Return the model to read, and a note on the other models, if any.
 
     Args:
         scene: The scene's folder.
-        wanted: Folder of the model within the scene; None for the one with most images.
+        wanted: Folder of the model within the scene, or None for the model with most images.
 
     Raises:
-        UserError: There is no model, or not the wanted one.
+        UserError: There is no model, or the wanted model is missing.
     """
     if wanted is not None:
         if has_model(scene / wanted):
@@ -58,10 +58,10 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
 
 def check_scene_folder(scene: Path) -> None:
-    """Refuses what is not a readable folder, and the model's folder in place of the scene's.
+    """Refuse an unreadable folder, and the model's folder in place of the scene's folder.
 
     Raises:
-        UserError: The path is not there, is a file, may not be listed or lies within `sparse`.
+        UserError: The path is missing, is a file, is not readable, or is inside `sparse`.
     """
     try:
         if scene.is_dir():
@@ -121,5 +121,5 @@ def _no_model(scene: Path) -> UserError:
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Sorts 10 behind 9."""
+    """Return a sort key that places 10 after 9."""
     return [(int(part or 0), part) for part in re.split(r"\D+", path.name)]

@@ -32,12 +32,12 @@ _MOST = 2**64 - 1
 
 
 def read_text(folder: Path) -> ColmapModel:
-    """Reads `cameras.txt`, `images.txt` and, where it is there, `points3D.txt`.
+    """Read `cameras.txt`, `images.txt` and, if it exists, `points3D.txt`.
 
-    Images and points come in the order of their ids.
+    Images and points are sorted by their ids.
 
     Raises:
-        UserError: A line is not what it should be; names it.
+        UserError: A line is wrong. The error names the line.
     """
     cameras = _Lines(folder / "cameras.txt")
     calibrations = by_id(_read_cameras(cameras), cameras.path)
@@ -54,7 +54,7 @@ def read_text(folder: Path) -> ColmapModel:
 
 
 class _Lines:
-    """The lines of a text file that hold data; says where one is wrong.
+    """The lines of a text file that contain data. Errors name the line.
 
     Args:
         path: The file.
@@ -76,19 +76,19 @@ class _Lines:
         self._lines = iter(content.removeprefix(_BYTE_ORDER_MARK).splitlines())
 
     def __iter__(self) -> Iterator[bytes]:
-        """The lines that are neither empty nor comments."""
+        """Iterate over the lines that are neither empty nor comments."""
         while (line := self.next()) is not None:
             if line and not line.startswith(b"#"):
                 yield line
 
     def next(self) -> bytes | None:
-        """The next line, whatever it is; None at the end."""
+        """Return the next line, of any kind, or None at the end."""
         self._number += 1
         line = next(self._lines, None)
         return None if line is None else line.strip()
 
     def wrong(self, line: bytes, expected: str) -> NoReturn:
-        """Refuses the line that was read last."""
+        """Refuse the line that was read last."""
         raise UserError(
             "a line of the COLMAP text model cannot be read",
             where=f"{self.path}, line {self._number}",
@@ -99,10 +99,10 @@ class _Lines:
 
 
 def _integer(word: bytes, most: int = _MOST) -> int:
-    """A number without a sign.
+    """Return a whole number without a sign.
 
     Raises:
-        ValueError: It is none, or too large.
+        ValueError: The word is not such a number, or the number is too large.
     """
     if not _INTEGER.fullmatch(word) or int(word) > most:
         raise ValueError(word)
@@ -110,10 +110,10 @@ def _integer(word: bytes, most: int = _MOST) -> int:
 
 
 def _number(word: bytes) -> float:
-    """A number in C's way of writing it.
+    """Return a number in C notation.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The word is not a number.
     """
     if b"_" in word:  # Python's digit groups
         raise ValueError(word)
@@ -155,7 +155,7 @@ def _read_images(lines: _Lines) -> Iterator[tuple[int, ColmapImage]]:
 
 
 def _read_observations(lines: _Lines) -> NDArray[np.uint64]:
-    """Ids of the points that the line after an image's names; it may be empty."""
+    """Return the ids of the points in the line after an image. The line may be empty."""
     line = lines.next() or b""
     try:
         return np.array(_observed(line), dtype=np.uint64)
@@ -172,7 +172,7 @@ def _observed(line: bytes) -> list[int]:
 
 
 def _read_points(lines: _Lines) -> Iterator[tuple[int, list[float], list[int]]]:
-    """Id, position and colour of every point; tracks, of any length, are passed over."""
+    """Yield id, position and colour of every point. Tracks, of any length, are skipped."""
     for line in lines:
         words = line.split(maxsplit=8)
         try:
@@ -189,28 +189,28 @@ _COUNT = struct.Struct("<Q")
 
 
 def has_model(folder: Path) -> bool:
-    """Whether a folder holds the cameras and images of a COLMAP model."""
+    """Return whether a folder contains the cameras and images of a COLMAP model."""
     return _has(folder, "bin") or _has(folder, "txt")
 
 
 def count_images(folder: Path) -> int:
-    """Number of registered images of a model, from the head of its files; 0 if unreadable."""
+    """Return the number of registered images of a model, or 0 if its files are unreadable."""
     try:
         if _has(folder, "bin"):
             with (folder / "images.bin").open("rb") as file:
                 return int(_COUNT.unpack(file.read(_COUNT.size))[0])
         with (folder / "images.txt").open(encoding="utf-8", errors="replace") as lines:
-            # Two lines for each image, of which the second may be empty.
+            # Each image has two lines, and the second line may be empty.
             return sum(not line.startswith("#") for line in lines) // 2
     except (OSError, struct.error):
         return 0
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model; where it is there in both forms, the binary one, as COLMAP does.
+    """Read a model. If binary and text files exist, the binary files are read, as in COLMAP.
 
     Raises:
-        UserError: A file is missing, cut short or not what its name says.
+        UserError: A file is missing, truncated, or has another content than its name says.
     """
     return read_binary(folder) if _has(folder, "bin") else read_text(folder)
 

@@ -1,1 +1,1 @@
-"""The place of a scene on Earth, and where its photos were taken."""
+"""The place of a scene on Earth, and the places where its photos were taken."""

@@ -1,4 +1,4 @@
-"""Where photos were taken, by a file: OpenDroneMap's geo.txt, or a database of COLMAP."""
+"""Places of photos from a file: OpenDroneMap's geo.txt, or a COLMAP database."""
 
 import math
 import re
@@ -20,7 +20,7 @@ from crossgrad_plugins.georeference.gps_tags import Numbers, number
 from crossgrad_plugins.georeference.projection import Projection
 from crossgrad_plugins.readers.place.headers import Measured, measured
 
-#: Bytes that a word takes in a list.
+#: Bytes of memory for each word in a list.
 _WORD: Final = 64
 _DEGREES: Final = re.compile(r"epsg:4326|wgs ?84|\+proj=(longlat|latlong)\b.*", re.IGNORECASE)
 _ZONE: Final = "(0?[1-9]|[1-5][0-9]|60)"
@@ -33,23 +33,23 @@ _SHOWN: Final = 80
 _POSITION: Final = struct.Struct("<3d")
 _LONGEST: Final = 1 << 20  # bytes of a text, a blob or a row
 _WGS84: Final = 0  # of COLMAP's PosePriorCoordinateSystem
-#: The column of the photo, in COLMAP 4 and before.
+#: The column of the photo's id: in COLMAP 4, and in older versions.
 _COLUMNS: Final = ("corr_data_id", "image_id")
 
 
 def of_list(path: Path, names: Collection[str]) -> Measured:
-    """The places in a list.
+    """Return the places in a list.
 
-    Its first line is the coordinate system, `EPSG:4326` for longitude and latitude; the others have
-    the name of a photo, x, y and altitude, and what follows is passed over.
+    The first line is the coordinate system, `EPSG:4326` for longitude and latitude. Each other line
+    contains the name of a photo, x, y and altitude. Further words in a line are ignored.
 
     Args:
         path: The file.
-        names: The photos of the scene; the list may leave out their folders, and have another
-            suffix or case.
+        names: The photos of the scene. In the list, names may lack their folders, and may differ
+            in suffix or case.
 
     Raises:
-        UserError: The file cannot be read, a line lacks numbers, or the system is not known.
+        UserError: The file cannot be read, a line lacks numbers, or the system is unknown.
     """
     first, *lines = [line.split() for line in _text(path).splitlines()] or [[]]
     rows = {words[0]: _row(path, i, words) for i, words in enumerate(lines, 2) if words}
@@ -58,7 +58,7 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
     loose, others = _by_file(names, _folded), [name for name in rows if name not in known]
     times = Counter(map(_folded, others))
     for name in others:
-        # Of two that could be meant none is, and the photo's own row comes first.
+        # An ambiguous name is ignored, and an exact name of the same photo takes precedence.
         photo = loose.get(_folded(name)) if times[_folded(name)] == 1 else None
         if photo is not None and photo not in photos.values():
             photos[name] = photo
@@ -75,7 +75,7 @@ def _text(path: Path) -> str:
 
 
 def _row(path: Path, line: int, words: list[str]) -> Numbers:
-    """x, y and altitude, which is NaN where it is missing."""
+    """Return x, y and altitude. A missing altitude is NaN."""
     x, y, z = [*map(number, words[1:4]), *[math.nan] * 3][:3]
     if not math.isfinite(x) or not math.isfinite(y):
         shown = " ".join(words)[:_SHOWN]
@@ -99,7 +99,7 @@ def _folded(name: str) -> str:
 
 
 def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[str, str]:
-    """Photos by what is said of their names and, where only one has it, of the file's alone."""
+    """Return the photos by `said` of their whole name, or of their file name if it is unique."""
     files = {name: said(PurePosixPath(name).name) for name in names}
     whole = {name: said(name) for name in names}
     found: dict[str, str] = {}
@@ -110,10 +110,10 @@ def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[s
 
 
 def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
-    """From coordinates in a system to degrees.
+    """Return a function that converts coordinates of a system to degrees.
 
     Raises:
-        UserError: There is no such system, or pyproj is not installed.
+        UserError: The system does not exist, or pyproj is not installed.
     """
     if _DEGREES.fullmatch(text):
         return lambda xyz: (xyz[1], xyz[0], xyz[2])
@@ -135,17 +135,17 @@ def _system(text: str, path: Path) -> Callable[[Numbers], Numbers | None]:
 
 
 def of_priors(path: Path, names: Collection[str]) -> Measured:
-    """The GPS positions that COLMAP's feature extraction left in its database.
+    """Return the GPS positions that COLMAP's feature extraction stored in its database.
 
     Args:
         path: The database.
         names: The photos of the scene.
 
     Raises:
-        UserError: The file is no database, or none of COLMAP.
+        UserError: The file is not a database of COLMAP.
     """
     try:
-        # By `immutable` SQLite writes no file of its own beside it.
+        # With `immutable`, SQLite writes no file of its own next to the database.
         place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(place, uri=True)) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST)
@@ -164,12 +164,12 @@ def of_priors(path: Path, names: Collection[str]) -> Measured:
 def _positions(
     database: sqlite3.Connection, names: frozenset[str], most: int
 ) -> Iterator[tuple[str, object]]:
-    """Names and positions of photos of the scene; none where the database is older than priors.
+    """Yield names and positions of photos of the scene, or nothing if the database has no priors.
 
     Args:
-        database: To be read.
+        database: The database.
         names: The photos.
-        most: Rows of a table that are read; pages that lead to themselves would have no end.
+        most: Greatest number of rows read from a table. Damaged pages can form an endless cycle.
     """
     found = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(found, most)}

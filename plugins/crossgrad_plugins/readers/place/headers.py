@@ -1,4 +1,4 @@
-"""Where photos were taken, by the GPS in their EXIF headers."""
+"""Places of photos from the GPS positions in their EXIF headers."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Measured:
-    """Where photos were taken.
+    """Places where photos were taken.
 
     Attributes:
-        source: What tells it.
+        source: Source of the places, for messages.
         places: Name of a photo -> its place.
-        flat: Number of photos of which all but the altitude is known, beside those.
-        strangers: Names that are those of no photo.
+        flat: Number of further photos with a place but without an altitude.
+        strangers: Names that match no photo.
     """
 
     source: str
@@ -32,17 +32,17 @@ class Measured:
 
 
 def of_headers(files: Mapping[str, Path], source: str) -> Measured:
-    """The places in the EXIF headers of photos; those that have none are left out.
+    """Return the places in the EXIF headers of photos. Photos without a place are omitted.
 
     Args:
-        files: Name -> file; one that is not there, or is no photo, tells nothing.
-        source: What the photos are called.
+        files: Name -> file. A missing file, or a file that is not a photo, is ignored.
+        source: Description of the photos, for messages.
     """
     return measured(((name, _header(path)) for name, path in files.items()), source)
 
 
 def measured(found: Iterable[tuple[str, Numbers | None]], source: str) -> Measured:
-    """What is a place on Earth among numbers of photos."""
+    """Return the valid places among the GPS numbers of photos."""
     known: dict[str, Numbers] = {}
     flat = 0
     for name, numbers in found:
@@ -65,5 +65,5 @@ def _header(path: Path) -> Numbers | None:
     try:
         with opened(path, "the photo's EXIF header cannot be read") as image:
             return gps_of(image)
-    except UserError:  # Decoding the photo raises it again, if it is one of the photo.
+    except UserError:  # If the photo is used, decoding raises the error again.
         return None

@@ -1,4 +1,4 @@
-"""The place of a scene on Earth, from whatever tells it."""
+"""The place of a scene on Earth, from any available source."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,33 +24,33 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers.place.headers import Measured, of_headers
 
-# Most scenes have no place: what computes with places is imported where one is found.
+# Most scenes have no place, so modules that compute with places are imported only when needed.
 if TYPE_CHECKING:
     from crossgrad_plugins.georeference.ellipsoid import Place
     from crossgrad_plugins.georeference.frames import Fit
     from crossgrad_plugins.georeference.on_earth import OnEarth
 
-#: In the scene's folder: places of photos as OpenDroneMap takes them, and COLMAP's databases.
+#: Files in the scene's folder: OpenDroneMap's list of photo places, and COLMAP's databases.
 _LIST: Final = "geo.txt"
 _DATABASES: Final = ("database.db", "colmap/database.db")
 
 
 def at(scene: Scene, place: Georeference) -> Scene:
-    """The scene at a place, or at none, which a note tells."""
+    """Return the scene with a georeference and with the note of the georeference."""
     return replace(scene, georeference=place, notes=(*scene.notes, place.note))
 
 
 def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
-    """The scene at the place that GPS of its photos tells, where that is enough for one.
+    """Return the scene at the place given by the GPS of its photos, if they are sufficient.
 
     Args:
         scene: The scene.
-        raw: What it was made from.
-        named: A list of places, or a folder with the photos as they were taken, which are asked
-            alone.
+        raw: The raw scene from which `scene` was made.
+        named: A list of places, or a folder with the original photos. If given, it is the only
+            source.
 
     Raises:
-        UserError: What was named is not there or cannot be read.
+        UserError: The named source is missing or cannot be read.
     """
     notes: list[str] = []
     for measured in _sources(scene, raw, named, notes):
@@ -76,7 +76,7 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
 def _sources(
     scene: Scene, raw: RawScene, named: Path | None, notes: list[str]
 ) -> Iterator[Measured]:
-    """Where photos were taken, by one source after the other."""
+    """Yield the places where photos were taken, one source after the other."""
     names = [view.name for view in scene.views]
     if named is not None:
         yield _named(named, names)
@@ -91,7 +91,7 @@ def _sources(
 
 
 def _listed(path: Path, names: list[str]) -> Measured:
-    """The places in a list, or in a database of COLMAP."""
+    """Return the places in a list, or in a COLMAP database."""
     if path.suffix == ".db":
         from crossgrad_plugins.readers.place.files import of_priors
 
@@ -102,7 +102,7 @@ def _listed(path: Path, names: list[str]) -> Measured:
 
 
 def _file_of(view: View, raw: RawScene) -> Path:
-    """The photo's file, not a smaller copy of it, which may have lost its header."""
+    """Return the photo's own file, because a smaller copy may lack the EXIF header."""
     path = raw.images / view.name
     if isinstance(view.photo, FilePhoto) and not is_file(path):
         return view.photo.source.path  # Found by another suffix.
@@ -125,7 +125,7 @@ def _named(path: Path, names: list[str]) -> Measured:
 
 
 def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | str":
-    """The place by photos whose own places were measured, or why it cannot be told."""
+    """Return the place fitted to photos with a measured place, or the reason why it failed."""
     from crossgrad_plugins.georeference.ellipsoid import geocentric, place_at
     from crossgrad_plugins.georeference.frames import fit_similarity
     from crossgrad_plugins.georeference.on_earth import OnEarth
@@ -145,7 +145,7 @@ def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | s
 
 
 def _residuals(fit: "Fit") -> dict[str, float]:
-    """Metres, of the photos that were kept."""
+    """Return the residuals of the photos that were kept, in metres."""
     errors = fit.errors[fit.kept]
     return {
         "rms_horizontal": float(np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean())),
@@ -155,19 +155,20 @@ def _residuals(fit: "Fit") -> dict[str, float]:
 
 
 def _centers(scene: Scene, views: list[View]) -> NDArray[np.float64]:
-    """[N, 3] camera centres in the coordinates of the input."""
+    """Return the camera centres [N, 3] in the coordinates of the input."""
     return scene.similarity.to_input(centers_of(views))
 
 
 def by_code(scene: Scene, code: str) -> Scene:
-    """The scene in coordinates of a map, or geocentric ones.
+    """Return the scene with its place, for poses in map coordinates or geocentric coordinates.
 
     Args:
         scene: The scene.
-        code: Such as `epsg:32633`; `epsg:4978` are geocentric ones of WGS 84.
+        code: Such as `epsg:32633`. `epsg:4978` means geocentric coordinates of WGS 84.
 
     Raises:
-        UserError: There is no such system, the scene lies outside of it, or it stretches unevenly.
+        UserError: The system does not exist, the scene is outside of it, or the system stretches
+            unevenly.
     """
     from crossgrad_plugins.georeference.ellipsoid import place_at
     from crossgrad_plugins.georeference.on_earth import OnEarth
@@ -192,10 +193,10 @@ def by_code(scene: Scene, code: str) -> Scene:
 
 
 def by_file(scene: Scene, file: Path) -> Scene:
-    """The scene at the place that a `georef.json` tells (docs/coordinates.md).
+    """Return the scene at the place in a `georef.json` (docs/coordinates.md).
 
     Raises:
-        UserError: The file cannot be read, or its transform is no similarity.
+        UserError: The file cannot be read, or its transform is not a similarity.
     """
     from crossgrad_plugins.georeference.frames import similarity_of
     from crossgrad_plugins.georeference.on_earth import RESIDUALS, OnEarth
@@ -212,10 +213,10 @@ def by_file(scene: Scene, file: Path) -> Scene:
 
 
 def origin_of(fields: Fields) -> "Place":
-    """The place of an object with latitude, longitude and altitude.
+    """Return the place of an object with latitude, longitude and altitude.
 
     Raises:
-        UserError: A number is missing, or is none on Earth.
+        UserError: A number is missing, or is not a position on Earth.
     """
     from crossgrad_plugins.georeference.ellipsoid import Place
 
