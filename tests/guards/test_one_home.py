@@ -65,7 +65,7 @@ HOMES = {
 
 
 @pytest.mark.parametrize("concept", HOMES)
-def test_a_concept_has_one_home(concept):
+def test_a_concept_is_defined_in_one_module(concept):
     pattern, homes = HOMES[concept]
     found = {path for path, text in SOURCES.items() if re.search(pattern, text, re.MULTILINE)}
     assert found == homes
