@@ -228,7 +228,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     assert "drawn on black" in printed
 
 
-def test_the_user_is_reported_what_a_background_costs_the_file(scene, tmp_path, capsys):
+def test_a_message_reports_what_a_background_costs_the_ply(scene, tmp_path, capsys):
     settings = {"scene": str(scene), "steps": STEPS, "threads": 1}
     for name in ("white", "black", "random"):
         out = tmp_path / name

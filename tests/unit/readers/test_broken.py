@@ -227,7 +227,7 @@ def test_photos_may_be_links_and_a_note_says_where_they_lie(reader, what, make):
 
 @pytest.mark.parametrize("reader", [*FILES, "colmap"])
 @pytest.mark.parametrize("what", ["a text", "a pipe", "a device", "a folder", "nothing", "itself"])
-def test_a_pipe_or_device_in_place_of_a_photo_is_refused_at_once(reader, what, make):
+def test_anything_else_in_place_of_a_photo_is_refused_at_once(reader, what, make):
     path = make(reader)
     for photo in path.rglob("*.png"):
         photo.unlink()
