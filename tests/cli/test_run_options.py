@@ -1,4 +1,4 @@
-"""The options of `crossgrad run` are the settings of RunConfig, each said once."""
+"""The options of `crossgrad run` are the settings of RunConfig, each defined once."""
 
 import inspect
 

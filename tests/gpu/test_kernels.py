@@ -1,4 +1,4 @@
-"""What only a GPU can show: the kernels themselves, what a step waits for, and whole runs.
+"""Tests that need a GPU: kernels, synchronisation within a step, and whole runs.
 
 Skipped where there is no CUDA device, as in CI; `docs/rasterizers.md` says how to run them on one.
 """

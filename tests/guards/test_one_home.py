@@ -1,4 +1,4 @@
-"""One concept, one home: what was once written in several places stands in one.
+"""Each concept is defined in one module only.
 
 Each row is a pattern of the sources and the files that may hold it; one line of each guard is
 enough to see that the concept has been written again elsewhere.

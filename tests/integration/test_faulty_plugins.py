@@ -1,4 +1,4 @@
-"""What plugins of other packages do wrong outside a step: one message, and nobody else suffers."""
+"""Faults of third-party plugins outside a step end in one message and affect no other plugin."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""What a run starts from, through the whole of it."""
+"""Initializers in whole runs."""
 
 import json
 

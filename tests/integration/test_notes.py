@@ -1,4 +1,4 @@
-"""What a run noted at its start, and why, is told again however it goes on."""
+"""The notes a run makes at its start are repeated when the run is resumed."""
 
 import json
 

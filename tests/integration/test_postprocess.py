@@ -1,4 +1,4 @@
-"""What is done with a run afterwards: nothing that its summary describes is replaced."""
+"""Postprocessing of a run does not replace results that its summary describes."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Before the first step all that training needs is compiled, with a second process beside."""
+"""All kernels are compiled before the first step, with the help of a second process."""
 
 import json
 import subprocess

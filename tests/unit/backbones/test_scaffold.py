@@ -1,4 +1,4 @@
-"""Where anchors start, what they learn with, and what is baked of them."""
+"""Initial anchors, learning rates and baking of backbone scaffold."""
 
 from dataclasses import replace
 

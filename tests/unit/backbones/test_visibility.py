@@ -1,4 +1,4 @@
-"""Who is seen, and how finely, against loops over cameras and means in float64."""
+"""Visibility and finest pixel of means, compared with loops over cameras and means in float64."""
 
 from dataclasses import replace
 

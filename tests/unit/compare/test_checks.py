@@ -1,4 +1,4 @@
-"""What does not compare is refused, with the reason and the way out."""
+"""Runs that cannot be compared are refused with the reason and a remedy."""
 
 import json
 from html import unescape

@@ -1,4 +1,4 @@
-"""How the one error that users see is worded."""
+"""The wording of UserError."""
 
 from crossgrad_core.errors import LONGEST, LONGEST_PLACE, UserError
 

@@ -1,4 +1,4 @@
-"""Whether tensors are finite and whether anything is in them."""
+"""Checks for finite and for non-zero tensors."""
 
 import numpy as np
 import pytest

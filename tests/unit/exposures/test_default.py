@@ -1,4 +1,4 @@
-"""Which exposure a run has that names none."""
+"""The default exposure of a run."""
 
 import pytest
 from support.grey_scene import grey_scene

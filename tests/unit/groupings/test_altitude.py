@@ -1,4 +1,4 @@
-"""Which way is up, and where heights are cut."""
+"""The up axis and the threshold between heights."""
 
 import numpy as np
 import pytest

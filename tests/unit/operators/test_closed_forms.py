@@ -1,4 +1,4 @@
-"""What each operator gives for two or three gradients, from the formulas of the papers."""
+"""The result of each operator for two or three gradients, from the formulas of the papers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the planner decides, on which evidence: scenes that were measured, and made-up ones."""
+"""Decisions of the planner and their evidence, on measured and on synthetic scenes."""
 
 import csv
 import json

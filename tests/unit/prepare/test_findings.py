@@ -1,4 +1,4 @@
-"""What the report concludes: bridges that are missing, and why photos were lost."""
+"""Conclusions of the report: missing bridges, and the reasons why photos were lost."""
 
 import itertools
 

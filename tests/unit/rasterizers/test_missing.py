@@ -1,4 +1,4 @@
-"""What a rasterizer of another package lacks is told before training, with a way out."""
+"""Missing requirements of a third-party rasterizer are reported before training with a remedy."""
 
 import sys
 from types import SimpleNamespace

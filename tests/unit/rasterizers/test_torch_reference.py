@@ -1,4 +1,4 @@
-"""What the reference draws: closed forms, culling, and agreement with brute force."""
+"""Renders of the reference: closed forms, culling, and agreement with brute force."""
 
 from dataclasses import replace
 from math import ceil, erf, exp, log, pi, sqrt

@@ -1,4 +1,4 @@
-"""What EXIF headers say about exposure."""
+"""Exposure values from EXIF headers."""
 
 from dataclasses import replace
 from math import log2

@@ -1,4 +1,4 @@
-"""How many steps fit into a budget of training seconds."""
+"""The number of steps that fit into a budget of training seconds."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,4 +1,4 @@
-"""Devices that are not there: what is missing is told apart."""
+"""Errors for missing devices distinguish the possible causes."""
 
 import pytest
 import torch
