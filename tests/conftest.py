@@ -1,4 +1,4 @@
-"""What all tests share.
+"""Fixtures that all tests share.
 
 Runs do not draw their curve. Threads that wait do not spin: the processes of the tests share the
 cores, and spinning took as much time as the work. Ctrl-C is not ignored, as it is in what a script

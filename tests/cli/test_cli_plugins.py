@@ -130,7 +130,9 @@ def test_a_name_offered_twice_is_marked_in_the_list(ran, third_party, monkeypatc
     assert all("offered twice" in row for row in rows)
 
 
-def test_what_is_never_read_is_in_the_list_and_in_the_check(ran, tmp_path, monkeypatch, capsys):
+def test_the_list_and_the_check_report_an_entry_point_in_an_unknown_group(
+    ran, tmp_path, monkeypatch, capsys
+):
     lost = {"operator": {"lost": "made_up_cli:Halving"}}
     write_distribution(tmp_path / "site", "lost-package", lost)
     monkeypatch.syspath_prepend(tmp_path / "site")
@@ -144,7 +146,9 @@ def test_what_is_never_read_is_in_the_list_and_in_the_check(ran, tmp_path, monke
     assert code == 2 and "there is no entry-point group crossgrad.operator" in err
 
 
-def test_a_check_of_a_package_counts_what_is_never_read(ran, third_party, monkeypatch):
+def test_the_check_of_a_package_fails_for_an_entry_point_in_an_unknown_group(
+    ran, third_party, monkeypatch
+):
     both = {"operators": {"halving": "made_up_cli:Halving"}, "operator": {"lost": "made_up_cli:A"}}
     write_distribution(third_party, "both-package", both)
     monkeypatch.syspath_prepend(third_party)
@@ -168,7 +172,7 @@ def test_an_unknown_slot_is_refused(ran):
     assert "did you mean 'operators'?" in err
 
 
-def test_show_tells_options_bounds_docstring_and_package(ran, third_party):
+def test_show_prints_options_bounds_docstring_and_package(ran, third_party):
     code, out, _ = ran("plugins", "show", "halving")
     assert code == 0
     for words in (
@@ -255,7 +259,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("broken", BROKEN)
-def test_check_tells_the_file_and_the_line(ran, tmp_path, monkeypatch, broken):
+def test_check_reports_the_file_and_the_line_of_a_defect(ran, tmp_path, monkeypatch, broken):
     source, line = BROKEN[broken]
     plugins = {"operators": {"halving": "made_up_broken:Halving"}}
     write_distribution(tmp_path, "broken-package", plugins, {"made_up_broken": source})
@@ -284,7 +288,7 @@ def test_a_plugin_that_fails_to_import_is_refused_with_the_line(ran, tmp_path, m
         ("..", "there is no installed package"),
     ],
 )
-def test_check_refuses_what_offers_nothing(ran, package, words):
+def test_check_refuses_a_package_without_plugins(ran, package, words):
     code, out, err = ran("plugins", "check", package)
     assert (code, out) == (2, "")
     assert words in err
@@ -332,7 +336,7 @@ def test_our_own_mistakes_keep_their_traceback(monkeypatch):
     assert sys.excepthook is before
 
 
-def test_a_plugin_of_another_slot_is_pointed_to(ran):
+def test_show_names_the_slot_in_which_the_plugin_exists(ran):
     code, _, err = ran("plugins", "show", "near-far", "--slot", "operators")
     assert code == 2
     assert "no plugin named 'near-far' among the operators" in err

@@ -46,7 +46,7 @@ def test_the_function_gets_what_was_given(ran, arguments, given):
 
 
 @pytest.mark.parametrize("arguments", [(), ("a", "--seed", "-1"), ("a", "--seeds", "1")])
-def test_what_is_missing_out_of_bounds_or_unknown_is_refused(ran, arguments):
+def test_missing_unknown_and_out_of_bounds_options_are_refused(ran, arguments):
     assert ran(*arguments)[0] == 2
 
 

@@ -70,7 +70,7 @@ LOADING = "loading libraries"
         (signal.SIGINT, "reading scene", "interrupted"),
     ],
 )
-def test_before_a_run_begins(number, moment, last, tmp_path):
+def test_a_signal_before_a_run_begins_ends_with_one_message(number, moment, last, tmp_path):
     code, lines = ended(number, moment, "run", cwd=tmp_path)
     assert code == 128 + number
     assert lines[-1] == last
@@ -78,7 +78,7 @@ def test_before_a_run_begins(number, moment, last, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_ignored_stays_ignored():
+def test_an_ignored_signal_stays_ignored():
     ignoring = "signal.signal(number, signal.SIG_IGN)\nfor each in ():\n   "
     program = PROGRAM.replace("for each in ALL:", ignoring)
     command = [sys.executable, "-c", program, str(int(signal.SIGHUP)), "typer", "--version"]
@@ -86,7 +86,7 @@ def test_what_is_ignored_stays_ignored():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_files_that_are_being_written_do_not_stay(tmp_path):
+def test_a_signal_leaves_no_partly_written_file(tmp_path):
     program = (
         "import os, pathlib, signal, sys\n"
         "from crossgrad_core.system.files import atomic_file\n"
@@ -103,7 +103,7 @@ def test_files_that_are_being_written_do_not_stay(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_reader_that_is_gone_changes_neither_end_nor_code(tmp_path):
+def test_a_closed_stderr_does_not_change_the_exit_code(tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
     command = [sys.executable, "-c", PROGRAM, str(int(signal.SIGINT)), "typer", "run"]
@@ -205,7 +205,7 @@ def runs(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_in_a_run(runs, case):
+def test_a_signal_in_a_run_gives_the_expected_messages_and_exit_code(runs, case):
     number, _, words, step, results = CASES[case]
     folder, code = runs[case]
     lines = (folder / "err.txt").read_text().splitlines()

@@ -59,7 +59,7 @@ def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
 
 
 @pytest.mark.parametrize("slot", OFFERED)
-def test_it_imports_the_core_through_its_doors(ran, tmp_path, slot):
+def test_a_new_plugin_imports_public_modules_only(ran, tmp_path, slot):
     ran("plugins", "new", "made-new", "--slot", slot)
     own = {"readers": "crossgrad_core.scene", COMMANDS: "crossgrad_core.commands"}
     public = (*PUBLIC, own.get(slot, PUBLIC[0]))
@@ -82,7 +82,7 @@ def test_its_own_test_runs(ran, tmp_path, monkeypatch):
         names["test_contract"](check)
 
 
-def test_the_begun_reader_reads(ran, tmp_path, monkeypatch):
+def test_a_new_reader_plugin_reads_a_scene(ran, tmp_path, monkeypatch):
     ran("plugins", "new", "made-new", "--slot", "readers")
     monkeypatch.syspath_prepend(tmp_path / "made-new")
     (tmp_path / "images").mkdir()
@@ -101,11 +101,11 @@ def test_the_begun_reader_reads(ran, tmp_path, monkeypatch):
     assert (scene.views[0].camera.width, scene.views[0].camera.height) == (20, 16)
 
 
-def test_every_slot_can_be_begun():
+def test_every_slot_has_a_template_for_a_new_plugin():
     assert set(examples()) == set(OFFERED)
 
 
-def test_the_singular_will_do(ran, tmp_path):
+def test_the_slot_may_be_given_in_the_singular(ran, tmp_path):
     assert ran("plugins", "new", "made-new", "--slot", "operator", "--out", "elsewhere")[0] == 0
     assert (tmp_path / "elsewhere" / "made_new.py").is_file()
 
@@ -129,7 +129,7 @@ def test_nothing_is_overwritten(ran, tmp_path):
         ("pcgrad", "crossgrad_operators.projection"),
     ],
 )
-def test_a_name_that_cannot_be_one_is_refused(ran, tmp_path, name, words):
+def test_an_invalid_plugin_name_is_refused(ran, tmp_path, name, words):
     code, _, err = ran("plugins", "new", name, "--slot", "operators")
     assert code == 2
     assert words in " ".join(err.split())

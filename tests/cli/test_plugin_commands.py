@@ -99,7 +99,7 @@ def rows(out):
 
 
 @pytest.mark.usefixtures("installed")
-def test_help_lists_all_of_them_and_imports_none(ran):
+def test_help_lists_all_plugin_commands_without_importing_them(ran):
     code, out, err = ran("--help")
     found = rows(out)
     assert (code, err) == (0, "")
@@ -134,13 +134,13 @@ def test_an_app_brings_its_own_commands(ran):
 
 
 @pytest.mark.usefixtures("installed")
-def test_bad_input_is_said_as_the_core_says_it(ran):
+def test_bad_input_of_a_plugin_command_is_reported_like_that_of_the_core(ran):
     assert ran("hello", "nobody") == (2, "", "error: there is nobody\n  to do:    name somebody\n")
 
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("arguments", [("hello", "ctrl-c"), ("compares", "stopped")])
-def test_an_interrupt_ends_it_as_shells_expect(ran, arguments):
+def test_an_interrupt_ends_a_plugin_command_with_130(ran, arguments):
     assert ran(*arguments) == (130, "", "interrupted\n")
 
 
@@ -154,7 +154,7 @@ def test_an_interrupt_ends_it_as_shells_expect(ran, arguments):
         ("seven", "a typer.Typer, or a function"),
     ],
 )
-def test_a_broken_one_is_one_error_when_it_is_called(ran, name, words):
+def test_a_broken_command_is_one_error_when_it_is_called(ran, name, words):
     code, out, err = ran(name)
     assert (code, out) == (2, "")
     assert err.startswith(f"error: command {name} cannot be ")
@@ -172,14 +172,14 @@ def test_a_name_of_two_packages_is_refused(ran, installed, monkeypatch):
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_misspelt_one_is_suggested(ran):
+def test_the_right_name_is_suggested_for_a_misspelt_command(ran):
     code, _, err = ran("helo")
     assert code == 2
     assert "Did you mean 'hello'?" in err
 
 
 @pytest.mark.usefixtures("installed")
-def test_the_list_of_plugins_has_them(ran):
+def test_the_list_of_plugins_includes_commands(ran):
     out = ran("plugins", "list")[1]
     assert "\ncommands\n" in out
     assert "  hello     made-up 1.0\n" in out
@@ -219,7 +219,7 @@ def test_check_finds_what_is_slow_or_without_help(ran, tmp_path, monkeypatch):
     assert "importing made_up_slow imports numpy" in flat
 
 
-def test_ours_are_commands_of_plugins():
+def test_the_bundled_commands_are_entry_points_of_crossgrad():
     ours = {name for name, entry in registry.entries(COMMANDS).items()
             if entry.distribution == "crossgrad"}  # fmt: skip
     assert {"diagnose", "plugins", "stress"} <= ours

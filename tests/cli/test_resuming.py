@@ -25,7 +25,7 @@ from crossgrad_core.run.load_run import _config
     ],
     ids=lambda words: words[0] if isinstance(words, list) else "",
 )
-def test_what_the_run_would_not_heed_is_named_as_it_was_typed(arguments, named, capsys):
+def test_options_that_a_resumed_run_ignores_are_named_as_they_were_typed(arguments, named, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["run", *arguments, "--resume", "runs/one", "-q"])
     rows = dict(line.split(":", 1) for line in capsys.readouterr().err.splitlines())
@@ -34,7 +34,7 @@ def test_what_the_run_would_not_heed_is_named_as_it_was_typed(arguments, named, 
     assert "continue runs/one" in rows["  to do"] and "--resume out" in rows["  to do"]
 
 
-def test_what_may_change_passes():
+def test_settings_that_may_change_on_resume_are_accepted():
     given = dict.fromkeys(("scene", "config", "steps")) | {"assignments": ["threads=2"]}
     given |= {"device": "cpu", "threads": 2, "stop_after": 9, "quiet": True, "dry_run": False}
     refuse_beside_resume(Path("run"), given)

@@ -1,4 +1,4 @@
-"""The options of `crossgrad run` are the settings of RunConfig, each said once."""
+"""The options of `crossgrad run` are the settings of RunConfig, each defined once."""
 
 import inspect
 
@@ -36,7 +36,7 @@ def test_type_help_and_heading_are_the_field_s(option):
     assert parameter.default is None  # What the user does not give is left to the schema.
 
 
-def test_each_flag_is_the_setting_s_name_but_three():
+def test_each_flag_has_the_name_of_its_setting_with_four_exceptions():
     renamed = {option.name: option.path for option in OPTIONS if option.name != option.path[-1]}
     assert renamed == {
         "views": ("views_per_step",),

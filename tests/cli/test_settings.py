@@ -65,7 +65,7 @@ def test_options_win_over_the_file_and_assignments_over_both(config):
         ({"seed": 5}, [], "cpu"),
     ],
 )
-def test_seconds_that_are_replaced_take_their_clock_with_them(
+def test_replacing_the_seconds_of_a_file_also_replaces_its_clock(
     tmp_path, options, assignments, clock
 ):
     path = tmp_path / "config.yaml"
@@ -73,7 +73,7 @@ def test_seconds_that_are_replaced_take_their_clock_with_them(
     assert merged(path, options, assignments).get("clock") == clock
 
 
-def test_a_step_to_stop_at_is_that_of_its_length(tmp_path):
+def test_stop_after_of_a_file_is_dropped_with_its_length(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("steps: 40\nstop_after: 20\n")
     assert merged(path, {"seed": 5}, [])["stop_after"] == 20
@@ -84,7 +84,7 @@ def test_a_step_to_stop_at_is_that_of_its_length(tmp_path):
 @pytest.mark.parametrize(
     ("options", "assignments"), [({"seconds": 5.0}, []), ({}, ["seconds=5.0"])]
 )
-def test_a_new_length_replaces_that_of_the_file(tmp_path, options, assignments):
+def test_a_new_length_replaces_the_length_of_the_file(tmp_path, options, assignments):
     path = tmp_path / "config.yaml"
     path.write_text("steps: 40\nrevisions: [[10, 60]]\nplanned_seconds: 3.0\nseed: 1\n")
     expected = {"seconds": 5.0, "seed": 1}
@@ -172,7 +172,7 @@ def test_options_alone_belong_to_the_component_that_is_taken_by_default():
     }
 
 
-def test_options_alone_in_a_file_belong_to_what_is_chosen_later(tmp_path):
+def test_options_in_a_file_without_a_name_belong_to_the_component_chosen_later(tmp_path):
     path = written(tmp_path, "operator: {c: 0.3}")
     assert merged(path, {"operator": "cagrad"}, [])["operator"] == {"name": "cagrad", "c": 0.3}
 
@@ -227,7 +227,7 @@ def option_of(slot):
 
 @pytest.mark.parametrize("wrong", [42, object(), True, {"name", "other"}, NotInstalled])
 @pytest.mark.parametrize("slot", sorted(GROUPS))
-def test_what_is_no_component_is_refused_in_every_slot(slot, wrong):
+def test_a_value_that_is_not_a_component_is_refused_in_every_slot(slot, wrong):
     for value in (wrong, [wrong], ["first", wrong]):
         with pytest.raises(UserError) as caught:
             settled(**{option_of(slot): value})
@@ -236,7 +236,7 @@ def test_what_is_no_component_is_refused_in_every_slot(slot, wrong):
 
 
 @pytest.mark.parametrize("assignment", ["metrics=[42]", "observers=7", "operator=[1.5]"])
-def test_what_is_no_component_is_refused_after_set(assignment):
+def test_a_value_that_is_not_a_component_is_refused_after_set(assignment):
     with pytest.raises(UserError, match="the name of a component"):
         parsed(merged(None, {}, [assignment]))
 

@@ -51,7 +51,7 @@ def announced(monkeypatch):
     startup.finish()
 
 
-def test_stages_are_lines_and_kernels_are_told_only_when_they_are_compiled(announced, capsys):
+def test_stages_are_lines_and_kernels_are_reported_only_when_they_are_compiled(announced, capsys):
     announced()
     STAGES.info("loading kernels")
     STAGES.debug("loaded")
@@ -119,7 +119,7 @@ def test_quiet_shows_warnings_only(announced, capsys):
     assert capsys.readouterr().err == "note: kernels cannot be kept\n"
 
 
-def test_an_error_stands_behind_the_last_stage(announced, capsys, tmp_path):
+def test_an_error_is_printed_after_the_last_stage(announced, capsys, tmp_path):
     from crossgrad_core.cli.main import main
 
     with pytest.raises(SystemExit, match="2"):

@@ -27,7 +27,7 @@ def pipe():
         yield reader, stdout
 
 
-def test_what_is_written_arrives(pipe):
+def test_written_text_reaches_the_reader(pipe):
     reader, stdout = pipe
     stream = streams._lasting(stdout)
     stream.write("Łódź\n")
@@ -35,7 +35,7 @@ def test_what_is_written_arrives(pipe):
     assert reader.readline() == "Łódź\n".encode()
 
 
-def test_what_nobody_reads_is_swallowed(pipe):
+def test_writing_to_a_closed_pipe_raises_nothing(pipe):
     reader, stdout = pipe
     stream = streams._lasting(stdout)
     reader.close()
@@ -59,7 +59,7 @@ def test_a_reader_that_is_slow_gets_everything_even_if_writes_do_not_wait(pipe):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-def test_a_full_disk_below_the_terminal_is_swallowed(monkeypatch):
+def test_writing_to_a_full_disk_raises_nothing(monkeypatch):
     with open("/dev/full", "w", encoding="utf-8", buffering=1) as full:
         monkeypatch.setattr(sys, "stderr", streams._lasting(full))
         sys.stderr.write("x" * 100_000 + "\n")
@@ -67,7 +67,7 @@ def test_a_full_disk_below_the_terminal_is_swallowed(monkeypatch):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
-def test_what_the_encoding_lacks_and_what_controls_a_terminal_is_escaped(encoding):
+def test_control_characters_and_characters_outside_the_encoding_are_escaped(encoding):
     read, write = os.pipe()
     with open(read, "rb") as reader, open(write, "w", encoding=encoding) as stdout:
         stream = streams._lasting(stdout)

@@ -83,7 +83,9 @@ COMMANDS = ["run", "render", "export", "diagnose", "stress"]
     ("obstacle", "command"),
     [*product((forbidden, below_a_file), COMMANDS), (below_a_file, "signature")],
 )
-def test_it_is_found_at_once(obstacle, command, request, tmp_path, monkeypatch, capsys):
+def test_an_unwritable_place_is_found_before_anything_is_written(
+    obstacle, command, request, tmp_path, monkeypatch, capsys
+):
     place = obstacle(monkeypatch, tmp_path)
     scene, trained = map(request.getfixturevalue, ("scene", "trained"))
     before = sorted(path for path in tmp_path.rglob("*"))
@@ -94,7 +96,9 @@ def test_it_is_found_at_once(obstacle, command, request, tmp_path, monkeypatch, 
     assert sorted(path for path in tmp_path.rglob("*")) == before
 
 
-def test_so_is_the_default_place_of_runs(scene, tmp_path, monkeypatch, capsys):
+def test_an_unwritable_default_folder_of_runs_is_found_at_once(
+    scene, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     Path("runs").touch()
     with pytest.raises(SystemExit, match="2"):

@@ -12,7 +12,7 @@ WORDS = {"full": "not enough disk space", "readonly": "cannot write here"}
 
 
 @pytest.mark.parametrize("what", WORDS)
-def test_from_some_write_on(reference, thorough, tmp_path, what):
+def test_a_run_survives_writes_that_fail_from_some_write_on(reference, thorough, tmp_path, what):
     writes = range(1, reference.writes + 1)
     for at in random.Random(3).sample(writes, min(thorough, len(writes))):
         folder = tmp_path / str(at)

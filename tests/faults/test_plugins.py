@@ -20,7 +20,9 @@ def fails(reference, folder, hook, call, error="RuntimeError"):
 
 
 @pytest.mark.parametrize("hook", [name for name in HOOKS if name not in UNUSED])
-def test_in_each_hook(reference, thorough, tmp_path, hook):
+def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_is_kept(
+    reference, thorough, tmp_path, hook
+):
     if thorough < 10 and hook not in {"crossgrad_densify", "crossgrad_evaluation"}:
         pytest.skip("only by `make faults`")
     folder = tmp_path / "run"
@@ -35,7 +37,7 @@ def test_in_each_hook(reference, thorough, tmp_path, hook):
 
 
 @pytest.mark.parametrize("error", ["MemoryError", "OSError"])
-def test_other_errors(reference, tmp_path, error):
+def test_errors_of_other_types_in_a_plugin_keep_the_run(reference, tmp_path, error):
     folder = tmp_path / "run"
     end = fails(reference, folder, "crossgrad_aggregate_gradients", 25, error)
     assert end.code == 1, end.said

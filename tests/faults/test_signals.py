@@ -10,7 +10,9 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
 @pytest.mark.parametrize("number", CODES)
-def test_at_any_phase(reference, thorough, tmp_path, number):
+def test_a_signal_at_any_instant_leaves_a_run_that_can_be_resumed(
+    reference, thorough, tmp_path, number
+):
     draw = random.Random(4)
     for index in range(max(2, thorough // 4)):
         folder = tmp_path / str(index)
@@ -26,7 +28,7 @@ def _finished(folder):
     return summary.is_file() and json.loads(summary.read_text())["status"] == "finished"
 
 
-def test_twice(reference, thorough, tmp_path):
+def test_two_signals_in_short_order_end_the_run(reference, thorough, tmp_path):
     draw = random.Random(5)
     for index in range(max(2, thorough // 10)):
         folder = tmp_path / str(index)

@@ -40,7 +40,7 @@ def test_a_short_search_finds_nothing(name, tmp_path):
 @pytest.mark.parametrize(
     ("target", "name"), [(target, name) for target, cases in REGRESSIONS.items() for name in cases]
 )
-def test_what_once_failed_ends_well(target, name, tmp_path):
+def test_inputs_that_once_failed_pass(target, name, tmp_path):
     seeds = TARGETS[target].seeds()
     bench = Bench(TARGETS[target], tmp_path / "bench")
     bench.warm_up(seeds)

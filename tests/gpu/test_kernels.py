@@ -1,4 +1,4 @@
-"""What only a GPU can show: the kernels themselves, what a step waits for, and whole runs.
+"""Tests that need a GPU: kernels, synchronisation within a step, and whole runs.
 
 Skipped where there is no CUDA device, as in CI; `docs/rasterizers.md` says how to run them on one.
 """
@@ -93,7 +93,7 @@ def same_gradients(found, expected, share):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-def test_images_and_gradients_are_those_of_float64(name, seed, sh_degree, camera):
+def test_images_and_gradients_agree_with_the_float64_reference(name, seed, sh_degree, camera):
     scene = random_gaussians(400, camera, seed=seed, sh_degree=sh_degree, opacities=(0.05, 0.95))
     image, gradients, _ = drawn(RASTERIZERS[name](), leaves(scene, "cuda", torch.float32), camera)
     # What is rounded the other way at a threshold is rounded so before the oracle draws it.
@@ -116,7 +116,7 @@ def test_antialiased_gaussians_are_those_of_the_rules(gsplat, sh_degree):
 
 
 @pytest.mark.parametrize(("stride", "corner"), [(2, (0, 0)), (2, (1, 0)), (3, (2, 1)), (8, (5, 7))])
-def test_interlaced_views_have_the_pixels_of_the_full_image(gsplat, stride, corner):
+def test_strided_views_have_the_pixels_of_the_full_image(gsplat, stride, corner):
     camera, behind = CAMERAS["middle"], torch.zeros(3, device="cuda")
     # Nobody stands beyond the border, where positions are clamped by the size of the image.
     scene = leaves(random_gaussians(400, camera, border=0.0), "cuda", torch.float32)
@@ -167,7 +167,7 @@ def test_extreme_gaussians_give_nearly_what_they_give_in_float64(name, case):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_views_together_are_views_one_by_one(gsplat, seed):
+def test_views_rendered_together_equal_views_rendered_one_by_one(gsplat, seed):
     camera = CAMERAS["middle"]
     scenes = [random_gaussians(200, camera, seed=10 * seed + k, sh_degree=2) for k in range(3)]
     together = [leaves(scene, "cuda", torch.float32) for scene in scenes]
@@ -238,7 +238,7 @@ def test_adam_is_that_of_the_cpu():
         torch.testing.assert_close(states["cuda"][name], expected, rtol=0, atol=2e-5)
 
 
-def test_what_a_view_is_drawn_without_is_drawn_on_the_device_and_repeatable():
+def test_dropout_of_gaussians_is_sampled_on_the_device_and_repeatable():
     scene = random_gaussians(100_000, CAMERAS["middle"], opacities=(0.1, 0.2))
     rule = Dropout(share=0.3)
     found = []

@@ -68,7 +68,7 @@ def test_each_grid_is_one_and_has_settings_that_there_are(path):
                 build(slot, part.name, part.options)
 
 
-def test_a_made_up_case_is_seen_by_its_camera(tmp_path, ran):
+def test_a_generated_case_is_inside_the_view_of_its_camera(tmp_path, ran):
     case = tmp_path / "case.npz"
     ran("make_case.py", case, "--gaussians", 300)
     with np.load(case) as made:

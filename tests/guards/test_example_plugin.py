@@ -43,7 +43,7 @@ def test_a_rule_has_30_lines_and_with_a_recipe_and_their_documentation_40():
 
 
 @pytest.mark.parametrize("file", sorted((EXAMPLE / "crossgrad_example").glob("*.py")), ids=str)
-def test_it_comes_through_the_doors(file):
+def test_the_example_package_imports_public_modules_only(file):
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module.startswith("crossgrad_"):
             package, *rest = node.module.split(".")

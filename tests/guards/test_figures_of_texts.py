@@ -66,7 +66,7 @@ def test_the_other_experiment_at_equal_seconds_is_stated(name):
 
 
 @pytest.mark.parametrize("name", ["README.md", "crossgrad plan"])
-def test_every_figure_is_one_of_a_results_table(name):
+def test_every_number_in_the_texts_is_in_a_results_table(name):
     text = re.sub(r"\s+", " ", TEXTS[name]())
     tables = "\n".join(ROWS)
     assert found_in(text)

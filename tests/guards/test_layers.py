@@ -61,11 +61,11 @@ def package(module):
     return [*module.split("."), "__init__"][1]
 
 
-def test_there_is_no_circle(graph):
+def test_there_is_no_import_cycle(graph):
     assert not circle(graph)
 
 
-def test_a_circle_would_be_found(tmp_path):
+def test_an_import_cycle_would_be_found(tmp_path):
     (tmp_path / "a.py").write_text(
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from p.b import B\n"
     )
@@ -75,7 +75,7 @@ def test_a_circle_would_be_found(tmp_path):
     assert set(circle(graph)) == {"p.a", "p.b"}
 
 
-def test_every_room_has_a_floor():
+def test_every_package_of_the_core_has_a_layer():
     inside = {package(name) for name in modules() if name.split(".")[0] == CORE}
     assert inside == set(LAYER)
 

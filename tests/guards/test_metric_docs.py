@@ -28,6 +28,6 @@ def test_the_row_has_the_key_and_the_default(name):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_page_tells_every_option(name):
+def test_the_page_documents_every_option(name):
     for option in type(build("metrics", name, {})).model_fields:
         assert f"- `{option}`: " in PAGE

@@ -1,4 +1,4 @@
-"""One concept, one home: what was once written in several places stands in one.
+"""Each concept is defined in one module only.
 
 Each row is a pattern of the sources and the files that may hold it; one line of each guard is
 enough to see that the concept has been written again elsewhere.
@@ -65,7 +65,7 @@ HOMES = {
 
 
 @pytest.mark.parametrize("concept", HOMES)
-def test_a_concept_has_one_home(concept):
+def test_a_concept_is_defined_in_one_module(concept):
     pattern, homes = HOMES[concept]
     found = {path for path, text in SOURCES.items() if re.search(pattern, text, re.MULTILINE)}
     assert found == homes

@@ -18,6 +18,6 @@ def test_no_plugin_decodes_photos_itself(folder):
     assert not [path.name for path in sources if DECODES.search(path.read_text(encoding="utf-8"))]
 
 
-def test_the_pattern_finds_what_decodes():
+def test_the_pattern_finds_code_that_decodes_photos():
     source = ROOT / "crossgrad_core" / "training" / "views.py"
     assert DECODES.search(source.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""What docs/plugins.md and the example's README show, works."""
+"""The code shown in docs/plugins.md and in the README of the example works."""
 
 import re
 import tomllib

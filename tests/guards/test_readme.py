@@ -1,4 +1,4 @@
-"""The plugin that README.md shows is installed from there, as it stands, and used."""
+"""The plugin shown in README.md is installed from there without changes, and used."""
 
 import re
 import sys

@@ -48,7 +48,7 @@ def measured(out):
     return [{name: row[name] for name in MEASURED} for row in read_metrics(out)]
 
 
-def test_it_begins_again_and_says_so(whole, killed):
+def test_a_run_without_a_checkpoint_begins_again_and_says_so(whole, killed):
     assert app.run({}, resume=killed, verbosity=-1) == 0
     ours, theirs = load(latest(killed)), load(latest(whole))
     assert all(torch.equal(ours.parameters[name], theirs.parameters[name])
@@ -83,7 +83,7 @@ def test_its_settings_stay(killed):
         app.run({"seed": 4}, resume=killed, verbosity=-1)
 
 
-def test_until_then_there_is_nothing_to_look_at(killed):
+def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
     for look in (
         evaluate.evaluate,
         lambda run: export.export(run, file_format="ply", out=None),

@@ -67,7 +67,9 @@ def test_a_budget_counts_the_clock_that_it_is_in(kind, steps):
         ({"seconds": 1.0, "clock": "cpu", "device": "cuda"}, 1, "what a GPU does"),
     ],
 )
-def test_cpu_time_that_is_no_work_is_refused(settings, threads, why, monkeypatch):
+def test_the_cpu_clock_is_refused_if_cpu_time_does_not_measure_work(
+    settings, threads, why, monkeypatch
+):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     with pytest.raises(UserError, match=why):
         check_clock(RunConfig(**settings))

@@ -129,7 +129,7 @@ PASSES = 360
         ({"steps": 2_000, "beta2": 0.999}, 0),
     ],
 )
-def test_harmonics_come_when_half_of_a_short_run_of_few_passes_is_over(settings, wait, monkeypatch):
+def test_sh_bands_start_at_half_of_a_short_run_with_few_passes(settings, wait, monkeypatch):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(**settings)
     schedule = setup.schedule
@@ -143,7 +143,7 @@ def test_harmonics_come_when_half_of_a_short_run_of_few_passes_is_over(settings,
     assert len(rows) == (wait > 0 and "sh_start" not in settings)
 
 
-def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
+def test_sh_bands_start_one_by_one_in_runs_with_many_passes():
     assert assembled(steps=PASSES, views=1).schedule.sh_wait == 0
     assert assembled(steps=PASSES - 2, views=1).schedule.sh_wait == (PASSES - 2) // 2
     # As it was planned, whatever the clock makes of it.
@@ -155,7 +155,7 @@ def test_harmonics_come_band_by_band_where_photos_are_shown_many_times():
 
 
 @pytest.mark.parametrize("settings", [{"backbone": {"name": "scaffold"}}, {"sh_from": 3}])
-def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
+def test_sh_start_is_refused_if_no_sh_bands_are_left_to_add(settings, monkeypatch):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(sh_start=0.5, steps=2_000, **settings)
     with pytest.raises(UserError, match="sh_start"):
@@ -165,7 +165,7 @@ def test_where_no_harmonics_are_left_none_wait(settings, monkeypatch):
     assert "sh_start" in late and "sh_start" not in none
 
 
-def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
+def test_distance_weights_learn_at_a_tenth_of_the_rate_of_their_parameter():
     setup = assembled(backbone={"name": "distance"}, steps=5)
     found = {name: rate for name, rate in rates_at(setup, 1).items() if "distance_" in name}
     assert len(found) == 3
@@ -189,7 +189,7 @@ def test_weights_of_distance_learn_at_shares_of_the_rates_of_what_they_add_to():
         (PASSES - 2, {"rate_factor": 1.0}, 0.98),
     ],
 )
-def test_a_run_that_shows_photos_a_few_times_forgets_sooner(length, settings, beta2, views):
+def test_runs_with_few_passes_use_smaller_adam_betas(length, settings, beta2, views):
     setup = assembled(max_views=length, steps=None, views=views, **settings)
     assert len(setup.train_views) == 9
     first = 0.9 if {"recipe", "schedule"} & settings.keys() else 0.7
@@ -238,7 +238,7 @@ def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, be
 
 @pytest.mark.parametrize("steps", [60, 5_000])
 @pytest.mark.parametrize("views", [2, 5, 10])
-def test_under_the_batch_rule_the_second_moment_averages_over_as_many_steps(
+def test_under_the_batch_rule_beta2_averages_over_the_same_number_of_steps(
     steps, views, monkeypatch
 ):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
@@ -253,9 +253,7 @@ def test_under_the_batch_rule_the_second_moment_averages_over_as_many_steps(
 
 @pytest.mark.parametrize(("planned", "beta2"), [(PASSES - 1, 0.98), (PASSES, 0.999)])
 @pytest.mark.parametrize("steps", [PASSES // 2, PASSES * 2])
-def test_the_rule_that_a_run_was_planned_with_stays_when_the_clock_changes_it(
-    planned, beta2, steps
-):
+def test_the_planned_adam_rule_stays_when_the_clock_changes_the_length(planned, beta2, steps):
     setup = assembled(steps=planned)
     setup = replace(setup, schedule=replace(setup.schedule, total=steps)).at_length(steps, None)
     assert rule_at(setup, 1) == AdamRule((0.7, beta2))
@@ -271,7 +269,7 @@ def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(mo
         assert setup.numbers.rate_factor == pytest.approx(min(6.3, (30_000 / steps) ** 0.65))
 
 
-def test_where_the_clock_decides_the_rates_follow_its_plan():
+def test_in_runs_within_seconds_learning_rates_follow_the_planned_length():
     setup = assembled(steps=None, seconds=60.0)
     for name in ("rate_factor", "beta1", "beta2"):
         (row,) = (row for row in setup.decisions if row.setting == name)
@@ -284,7 +282,7 @@ def test_where_the_clock_decides_the_rates_follow_its_plan():
     assert own.numbers.rate_factor == 2.0 and not messages_about(own, "rate_factor")
 
 
-def test_a_first_step_goes_as_much_farther():
+def test_rate_factor_multiplies_the_first_step():
     start = first_state(assembled()).parameters
     one, three = (trained(1, rate_factor=f)[1].parameters for f in (1.0, 3.0))
     for name in ("scales", "opacities", "f_dc"):
@@ -306,7 +304,7 @@ def test_the_batch_rule_follows_the_views(views):
         assert rates_at(setup, step) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_adam_by_the_rule_is_torch_s():
+def test_adam_under_the_batch_rule_agrees_with_torch():
     rng = torch.Generator().manual_seed(3)
     start = torch.randn(50, generator=rng)
     rule, rate = AdamRule.for_views(4), 1e-2 * 2.0
@@ -321,7 +319,7 @@ def test_adam_by_the_rule_is_torch_s():
 
 
 @pytest.mark.parametrize("plan", ["1..2@0.5", "4..1@0.3"])
-def test_where_k_changes_the_bias_is_that_of_all_steps_so_far(plan):
+def test_bias_correction_counts_all_steps_so_far_when_k_changes(plan):
     setup = assembled(views=plan, steps=600, batch_rule="sqrt")
     for step in (100, 310, 600):
         rule = rule_at(setup, step)
@@ -341,13 +339,13 @@ def test_where_k_changes_the_bias_is_that_of_all_steps_so_far(plan):
         ({"schedule_length": 600}, "schedule_length"),
     ],
 )
-def test_a_control_that_would_do_nothing_is_refused(settings, name):
+def test_a_training_setting_without_effect_is_refused(settings, name):
     config = parsed({"steps": 40, **settings})
     with pytest.raises(UserError, match=f"do nothing(.|\n)*{name}"):
         refuse_settings_for_nothing(config, assembled(**settings))
 
 
-def test_the_batch_rule_has_a_meaning_for_ten_views():
+def test_the_batch_rule_is_refused_for_more_than_ten_views():
     with pytest.raises(IncompatibleSelectionError, match="K <= 10; K is 11"):
         assembled(views=11, batch_rule="sqrt")
 
@@ -372,7 +370,7 @@ class Observed:
         return (yield)
 
 
-def test_statistics_of_one_view_are_those_of_each_place_in_turn():
+def test_densify_views_one_takes_each_position_of_a_step_in_turn():
     seen = Observed()
     _, state = trained(12, seen, views=3, densify_views="one")
     assert seen.got == [(views[(k + 1) % 3],) for k, views in enumerate(seen.drawn)]
@@ -396,7 +394,7 @@ def test_an_extra_view_is_rendered_while_density_control_lasts(views):
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_no_further_view_is_rendered_where_no_edit_will_come(views):
+def test_no_extra_view_is_rendered_if_no_edit_follows(views):
     setup, state = trained(12, views=views, densify_views="extra")
     assert setup.schedule.collects(12) and not setup.schedule.grows
     assert state.counters.views == 12 * views
@@ -443,7 +441,7 @@ def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
 
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 @pytest.mark.parametrize("choice", ["one", "extra"])
-def test_before_the_first_edit_they_change_no_bit(choice, operator):
+def test_densify_views_changes_no_bit_before_the_first_edit(choice, operator):
     settings = {"views": 2, "steps": 400, "operator": {"name": operator}, "min_refinements": 6}
     (setup, state), (_, other) = (
         trained(8, Weighing(), densify_views=each, background="random", **settings)
@@ -460,7 +458,7 @@ def test_before_the_first_edit_they_change_no_bit(choice, operator):
 
 
 @pytest.mark.parametrize("choice", ["one", "extra"])
-def test_other_statistics_are_other_edits(choice):
+def test_densify_views_changes_the_edits(choice):
     asked = {"views": 2, "min_refinements": 6}
     edited = [trained(40, densify_views=each, **asked)[1] for each in ("all", choice)]
     shapes = [state.parameters["means"].shape[0] for state in edited]

@@ -65,7 +65,9 @@ def moved(matrix, points):
 
 
 @pytest.mark.parametrize("coordinates", COORDINATES)
-def test_a_file_lies_where_maps_say_and_its_matrices_lead_back(scene, tmp_path, coordinates):
+def test_an_exported_file_is_georeferenced_and_its_matrices_invert_the_export(
+    scene, tmp_path, coordinates
+):
     setup, state = started(scene)
     path = tmp_path / "a.ply"
     exported = export_scene(setup, state, path, coordinates=coordinates)
@@ -115,7 +117,7 @@ def _float64(setup, state, coordinates):
 
 
 @pytest.mark.parametrize("scale", [1.0, 40.0, 3000.0])
-def test_in_utm_the_file_lies_on_the_moved_points_to_a_millionth_of_the_extent(tmp_path, scale):
+def test_a_file_in_utm_matches_the_shifted_points_to_a_millionth_of_the_extent(tmp_path, scale):
     """In input coordinates, from a house to a city of 10 km."""
     offset = (5e5, 5e6, 120.0)
     size = {"views": 6, "width": 24, "height": 16, "points": 300}
@@ -134,7 +136,7 @@ def test_in_utm_the_file_lies_on_the_moved_points_to_a_millionth_of_the_extent(t
     np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").means, positions)
 
 
-def test_a_run_leaves_the_file_beside_its_own(trained):
+def test_a_run_writes_a_georeference_file_next_to_its_ply(trained):
     positions, beside = file_of(trained / "point_cloud.ply")
     assert beside["coordinates"] == "input"
     assert beside["residuals_m"]["max"] < 1e-3
@@ -143,7 +145,7 @@ def test_a_run_leaves_the_file_beside_its_own(trained):
     assert "georeferenced by GPS of the photos, 10 of 10" in log
 
 
-def test_a_scene_without_place_or_offset_leaves_none(tmp_path):
+def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
     setup, state = started(write_tiny_scene(tmp_path / "scene", views=4, width=24, height=16))
     export_scene(setup, state, tmp_path / "a.ply")
     assert not (tmp_path / "a.georef.json").exists()
@@ -172,14 +174,14 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
         export.exported(trained, file_format=None, out=None, coordinates="gauss")
 
 
-def test_what_stands_beside_a_named_file_is_not_replaced(trained, tmp_path):
+def test_an_existing_georef_file_next_to_a_named_output_is_not_replaced(trained, tmp_path):
     (tmp_path / "a.georef.json").write_text("mine")
     with pytest.raises(UserError, match="the file exists"):
         export.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
     assert (tmp_path / "a.georef.json").read_text() == "mine"
 
 
-def test_a_file_in_other_coordinates_is_not_taken_for_one_in_those_of_the_scene(trained, tmp_path):
+def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
     path = tmp_path / "a.ply"
     export.exported(trained, file_format=None, out=path, coordinates="enu")
     with pytest.raises(UserError, match=r"in other coordinates(?s:.*)--coordinates input"):

@@ -54,7 +54,7 @@ def per_view(path):
         return {row["name"]: row for row in csv.DictReader(file)}
 
 
-def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures(
+def test_cross_capture_leaves_training_photos_out_and_repeats_held_out_metrics(
     trained, scene, capsys
 ):
     result, there = evaluate.evaluated_on(trained, scene)
@@ -70,7 +70,7 @@ def test_photos_of_training_are_left_out_and_held_out_ones_have_the_same_figures
     assert "street" in printed and "left out: 7 of its views" in printed
 
 
-def test_a_file_is_drawn_there_as_the_model_is(trained, scene, capsys):
+def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, capsys):
     model, _ = evaluate.evaluated_on(trained, scene)
     before = sorted(trained.rglob("*"))
     file, gaussians, there = evaluate.evaluated_file(trained, trained / "point_cloud.ply", on=scene)
@@ -85,7 +85,7 @@ def test_a_file_is_drawn_there_as_the_model_is(trained, scene, capsys):
     assert sorted(trained.rglob("*")) == before
 
 
-def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
+def test_views_of_the_other_capture_are_rendered_into_their_own_folder(trained, scene, tmp_path):
     render.render(trained, split="test", out=None, on=scene)
     (folder,) = (trained / "renders").glob("*/on_place")
     assert len(list(folder.glob("*.png"))) == 11
@@ -93,7 +93,7 @@ def test_its_views_are_drawn_beside_their_photos(trained, scene, tmp_path):
     assert len(list((tmp_path / "own").iterdir())) == 11
 
 
-def test_a_ladder_is_drawn_as_frames_and_a_video(trained, tmp_path, capsys):
+def test_a_zoom_path_is_rendered_as_frames_and_a_video(trained, tmp_path, capsys):
     folder = tmp_path / "zoom"
     render.render_path(trained, "zoom", frames=3, out=folder)
     assert len(list(folder.glob("*.png"))) == 3
@@ -160,7 +160,7 @@ def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
     assert not (trained / "per_view_on_place-3.csv").exists()
 
 
-def test_a_scene_that_two_readers_take_is_read_as_the_run_s_own(trained, scene, tmp_path):
+def test_a_scene_that_two_readers_accept_is_read_by_the_reader_of_the_run(trained, scene, tmp_path):
     both = shutil.copytree(scene, tmp_path / "place")
     (both / "transforms.json").write_text('{"frames": []}')
     result, _ = evaluate.evaluated_on(trained, both)
@@ -176,7 +176,7 @@ def surface(seed, count):
     return np.column_stack([flat, waves]) @ turn.T
 
 
-def test_captures_of_one_place_are_told_from_those_of_another():
+def test_captures_of_one_place_are_distinguished_from_captures_of_another_place():
     whole = surface(1, 6000)
     own, other = whole[:4000], whole[4000:]
     # Another capture shows a part of it, from nearby or with much around.

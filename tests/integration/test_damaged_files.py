@@ -85,7 +85,7 @@ def damaged(whole, place, file, damage):
 
 
 @THOROUGH
-def test_a_run_goes_on_as_if_nothing_had_happened_or_not_at_all(
+def test_resuming_a_damaged_run_gives_the_same_results_or_is_refused(
     stopped, finished, tmp_path, capsys, thorough
 ):
     wanted = results(finished)
@@ -105,7 +105,9 @@ def test_a_run_goes_on_as_if_nothing_had_happened_or_not_at_all(
 @pytest.mark.parametrize(
     "name", ["eval", pytest.param("export", marks=SLOW), pytest.param("render", marks=SLOW)]
 )
-def test_a_look_at_a_run_shows_what_it_is_or_nothing(finished, tmp_path, capsys, name, thorough):
+def test_using_a_damaged_run_gives_the_same_output_or_is_refused(
+    finished, tmp_path, capsys, name, thorough
+):
     def looked(run):
         out = tmp_path / "out"
         shutil.rmtree(out, ignore_errors=True)

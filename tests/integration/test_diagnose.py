@@ -82,7 +82,7 @@ def test_a_probe_uses_the_run_s_own_groups(scene, tmp_path):
     assert {row["grouping"] for row in table(tmp_path / "run")} == {"of the run"}
 
 
-def test_each_probe_tells_how_long_it_took(scene, tmp_path):
+def test_each_probe_records_its_duration(scene, tmp_path):
     run(scene, tmp_path / "run", steps=4, observers=[{**OBSERVER, "every": 1}])
     probing = {row["step"]: float(row["probe_seconds"]) for row in table(tmp_path / "run")}
     assert len(probing) == 4

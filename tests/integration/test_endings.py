@@ -150,7 +150,7 @@ def test_a_photo_that_cannot_be_read_at_an_evaluation(scene, whole, tmp_path, mo
         ("export_scene", "point_cloud.ply"), ("write_summary", "summary.json"),
     ],
 )  # fmt: skip
-def test_no_part_of_the_end_that_fails_costs_another(
+def test_one_failing_result_at_the_end_of_a_run_does_not_prevent_the_others(
     scene, whole, tmp_path, monkeypatch, capsys, case
 ):
     function, missing = case
@@ -254,7 +254,7 @@ def test_a_signal_stops_the_run_after_its_step(scene, whole, tmp_path, with_plug
 
 
 @pytest.mark.parametrize("evaluation", [False, True])
-def test_a_second_signal_leaves_out_what_takes_time(
+def test_a_second_signal_skips_evaluation_but_saves_a_checkpoint(
     scene, whole, tmp_path, with_plugin, capsys, evaluation
 ):
     out = tmp_path / "run"
@@ -382,7 +382,7 @@ class Leaves:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("by zero")])
-def test_what_ends_the_removal_of_floaters_loses_nothing(
+def test_an_error_in_the_removal_of_floaters_loses_no_results(
     scene, tmp_path, with_plugin, monkeypatch, error
 ):
     with_plugin["leaves"] = Leaves()

@@ -79,7 +79,7 @@ def test_auto_is_off_where_photos_agree_and_changes_no_bit(scene, tmp_path):
     assert not (tmp_path / "none" / "exposure.json").exists()
 
 
-def test_auto_is_a_gain_where_photos_differ_and_none_names_it(varied, tmp_path):
+def test_auto_is_a_gain_if_photos_differ_and_none_suggests_the_gain(varied, tmp_path):
     assert run(varied, tmp_path / "auto") == 0
     assert run(varied, tmp_path / "gain", exposure={"name": "gain"}) == 0
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
@@ -128,7 +128,7 @@ def test_rates_fall_to_a_hundredth_and_zero_keeps_the_start(varied, tmp_path):
     assert "exposure.decay" in caught.value.where
 
 
-def test_values_of_another_run_are_where_this_one_starts(varied, tmp_path):
+def test_exposure_from_starts_at_the_values_of_another_run(varied, tmp_path):
     fast = {"name": "gain", "rate": 0.05}
     assert run(varied, tmp_path / "first", exposure=fast) == 0
     values = tmp_path / "first" / "exposure.json"
@@ -309,7 +309,7 @@ def with_exif(path, stops):
 
 
 @pytest.mark.parametrize("model", with_long("gain"))
-def test_exif_starts_photos_and_tells_of_unseen_ones(varied, tmp_path, model):
+def test_exif_gives_initial_exposures_and_predicts_unseen_photos(varied, tmp_path, model):
     folder = tmp_path / "scene"
     shutil.copytree(varied, folder)
     for number, path in enumerate(sorted(folder.glob("images/*.png"))):

@@ -1,4 +1,4 @@
-"""What plugins of other packages do wrong outside a step: one message, and nobody else suffers."""
+"""Faults of third-party plugins outside a step end in one message and affect no other plugin."""
 
 import csv
 import json
@@ -228,7 +228,7 @@ def test_a_hook_that_fails_in_training_is_named_with_its_plugin(
     assert whose in capsys.readouterr().err
 
 
-def test_what_fails_when_it_is_asked_keeps_nobody_from_the_others(
+def test_a_plugin_that_fails_during_selection_does_not_block_the_others(
     scene, tmp_path, monkeypatch, capsys
 ):
     # They are asked by every run that leaves the choice to crossgrad.

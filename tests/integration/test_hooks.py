@@ -208,7 +208,7 @@ def test_the_hook_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
     assert load(latest(tmp_path / "run")).scalars["last"]["scales"] == [0.25, 0.25]
 
 
-def test_a_metric_has_its_column_and_no_regime_is_made_of_its_name(scene, tmp_path):
+def test_a_plugin_metric_has_columns_and_its_name_creates_no_regime(scene, tmp_path):
     assert run(scene, tmp_path / "run", **ALTOGETHER) == 0
     columns = list(rows(tmp_path / "run")[0])
     assert columns[5:11] == [

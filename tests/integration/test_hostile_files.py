@@ -30,9 +30,9 @@ def found(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_it_ends_in_one_error_within_the_memory(name, found):
+def test_a_hostile_file_ends_in_one_error_within_the_memory_limit(name, found):
     assert found[name] in {"UserError", "ValueError"}
 
 
-def test_the_memory_would_not_do_without_the_bound(found):
+def test_without_the_bound_a_hostile_file_exhausts_the_memory(found):
     assert found["lists without a bound"] == "MemoryError"

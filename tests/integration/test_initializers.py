@@ -1,4 +1,4 @@
-"""What a run starts from, through the whole of it."""
+"""Initializers in whole runs."""
 
 import json
 
@@ -48,7 +48,7 @@ def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
 
 
 @pytest.mark.parametrize("options", [("--init", "random"), ("--recipe", "published")], ids=str)
-def test_these_runs_start_bare(scene, tmp_path, options):
+def test_runs_with_these_options_use_the_points_initializer(scene, tmp_path, options):
     """Their configuration says so, and repeats the run."""
     assert run(scene, tmp_path / "run", *options) == 0
     stored = read_config(tmp_path / "run")
@@ -85,7 +85,7 @@ def test_every_initializer_trains_a_scene_with_no_points_or_few_of_them(
         assert "the scene has no SfM points to start from" in capsys.readouterr().err
 
 
-def test_points_of_its_own_make_an_initializer_do_nothing(scene, tmp_path, capsys):
+def test_an_initializer_with_init_random_is_refused(scene, tmp_path, capsys):
     assert run(scene, tmp_path / "run", "--init", "random", "--initializer", "fill-gaps") == 2
     assert "initializer: --init random has points of its own" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -70,7 +70,9 @@ def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
 
 
 @pytest.mark.parametrize(("margin", "told"), [(-100.0, True), (100.0, False)])
-def test_a_run_says_where_it_was_better(scene, tmp_path, monkeypatch, capsys, margin, told):
+def test_a_run_that_ends_worse_than_an_earlier_step_reports_it(
+    scene, tmp_path, monkeypatch, capsys, margin, told
+):
     monkeypatch.setattr("crossgrad_core.run.finish.WORSE", margin)
     settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 4, "eval_every": 2}
     assert app.run(settings, verbosity=0) == 0
@@ -128,7 +130,7 @@ def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
     assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
 
 
-def test_views_within_seconds_go_on_to_the_bound(scene, tmp_path):
+def test_a_resumed_run_with_seconds_and_max_views_ends_at_max_views(scene, tmp_path):
     out = tmp_path / "run"
     run(scene, tmp_path / "whole", seconds=60.0, max_views=12, rasterizer={"name": "torch"})
     rows = run(
@@ -177,7 +179,7 @@ def test_a_run_has_one_length(lengths):
         ({"max_views": 7}, None, 7),
     ],
 )
-def test_the_bundled_scene_has_a_length_of_its_own_where_none_is_asked_for(asked, seconds, views):
+def test_the_bundled_scene_has_its_own_default_length(asked, seconds, views):
     config = app.with_defaults(RunConfig(**asked))
     assert (config.seconds, config.max_views, config.steps) == (seconds, views, None)
 
@@ -191,14 +193,14 @@ def test_the_dry_run_of_a_budget_is_a_configuration_of_it(scene, tmp_path, capsy
     assert app.run(again, dry_run=True, verbosity=-1) == 0
 
 
-def test_one_view_and_two_edit_after_as_many_views():
+def test_runs_with_one_and_two_views_per_step_edit_after_the_same_views():
     one, two = (trained(views=k, max_views=144, min_refinements=6)[2] for k in (1, 2))
     assert len(one.edits) == len(two.edits) == 6
     assert [count + count % 2 for count in one.edits] == two.edits
     assert max(one.edits) < 72
 
 
-def test_events_in_steps_are_those_of_before():
+def test_schedule_unit_steps_counts_events_in_steps():
     setup, _, seen = trained(views=2, steps=72, schedule_unit="steps")
     assert seen.edits == [] and setup.schedule.densify_from == 500
     given = {"densify_from": 10, "densify_every": 20, "densify_until": 60}
@@ -238,18 +240,18 @@ def test_operators_that_remember_go_on_when_k_changes(operator):
         ({"operator": {"name": "anchors"}}, "operator anchors needs K = 2 .*; K is 1"),
     ],
 )
-def test_every_k_needs_a_meaning(settings, why):
+def test_every_k_of_a_schedule_must_be_accepted_by_the_components(settings, why):
     with pytest.raises(IncompatibleSelectionError, match=why):
         assembled(views="1..2@0.5", steps=10, **settings)
 
 
 @pytest.mark.parametrize(("text", "form"), [("1..2", "A..B@SHARE"), ("1..1@0.5", "change")])
-def test_what_is_no_k_is_refused_with_its_form(text, form):
+def test_an_invalid_views_value_is_refused_with_the_expected_form(text, form):
     with pytest.raises(UserError, match=form):
         parsed({"views": text})
 
 
-def test_views_that_are_ahead_cost_what_they_cost():
+def test_cost_ahead_counts_the_views_per_step_of_the_coming_steps():
     settings = {"steps": 1000, "densifier": {"name": "none"}}
     plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
     crowd = PrimitiveCounts(start=100, present=100)

@@ -103,13 +103,13 @@ def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkey
     assert app.run({}, resume=tmp_path / "moved", verbosity=-1) == 0
 
 
-def test_of_a_shorter_video_no_longer_one_is_left(run):
+def test_a_shorter_video_leaves_no_frames_of_a_longer_one(run):
     for frames, count in ((4, 4), (3, 3)):
         render.render_path(run, path=ZOOM, frames=frames, out=None)
         assert len(list(run.glob("renders/*/path_zoom/0*.png"))) == count
 
 
-def test_other_users_may_read_a_checkpoint_as_they_may_the_rest(run):
+def test_a_checkpoint_has_the_same_permissions_as_other_files(run):
     files = [path for path in run.rglob("*") if path.is_file() and path.name != "run.lock"]
     assert any(path.name == "tensors.safetensors" for path in files)
     (run / "fresh").touch()
@@ -161,14 +161,14 @@ def test_a_changed_configuration_is_refused(run, old, new, named):
         assert contents(run) == before
 
 
-def test_what_does_not_train_may_be_changed(run):
+def test_settings_that_do_not_affect_training_may_be_changed(run):
     text = (run / "config.yaml").read_text()
     assert "eval_every: 2" in text
     (run / "config.yaml").write_text(text.replace("eval_every: 2", "eval_every: 3"))
     evaluate.evaluate(run)
 
 
-def test_a_video_of_other_frames_does_not_stay(run, monkeypatch, capsys):
+def test_an_outdated_video_is_removed_if_no_new_one_is_made(run, monkeypatch, capsys):
     render.render_path(run, path=ZOOM, frames=3, out=None)
     (made,) = run.glob("renders/*/path_zoom/video.*")
     monkeypatch.setattr(video, "_LARGEST", 100)

@@ -1,4 +1,4 @@
-"""What a run noted at its start, and why, is told again however it goes on."""
+"""The notes a run makes at its start are repeated when the run is resumed."""
 
 import json
 
@@ -31,7 +31,7 @@ def of(found, start):
     return [note for note in found if note.startswith(start)]
 
 
-def test_a_stopped_run_tells_again_what_it_chose(scene, tmp_path):
+def test_a_resumed_run_repeats_the_notes_about_its_choices(scene, tmp_path):
     out = tmp_path / "run"
     before = run(scene, out, steps=6, stop_after=3, exposure={"name": "auto"})
     assert len(of(before, "exposure auto: none")) == len(of(before, GROWTH)) == 1
@@ -40,7 +40,7 @@ def test_a_stopped_run_tells_again_what_it_chose(scene, tmp_path):
     assert all(note in (out / "log.txt").read_text() for note in before)
 
 
-def test_so_does_one_that_was_killed_before_its_first_checkpoint(scene, tmp_path):
+def test_a_run_killed_before_its_first_checkpoint_repeats_its_notes(scene, tmp_path):
     before = run(scene, tmp_path / "run", steps=2, exposure={"name": "auto"})
     (tmp_path / "killed").mkdir()
     (tmp_path / "run" / "config.yaml").rename(tmp_path / "killed" / "config.yaml")
@@ -58,7 +58,7 @@ def test_a_budget_in_seconds_stays_known(scene, tmp_path, monkeypatch):
     assert len(of(notes(out), GROWTH)) == 1
 
 
-def test_they_are_no_settings(scene, tmp_path):
+def test_notes_are_not_settings(scene, tmp_path):
     run(scene, tmp_path / "run", steps=2)
     stored = read_config(tmp_path / "run")
     assert "notes" not in stored

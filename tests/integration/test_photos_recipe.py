@@ -48,7 +48,7 @@ def test_the_error_for_photos_alone_names_the_command(tmp_path, photos):
     assert "crossgrad prepare PHOTOS SCENE" in refused.value.todo
 
 
-def test_the_page_names_what_pycolmap_has():
+def test_every_pycolmap_name_on_the_page_exists():
     for name in re.findall(r"pycolmap\.(\w+)", PAGE):
         assert hasattr(pycolmap, name)
     assert pycolmap.FeatureExtractionOptions(num_threads=2).num_threads == 2

@@ -136,7 +136,7 @@ def test_what_the_user_set_wins(bare, tmp_path):
     assert settings(out)["decided"].keys().isdisjoint({"exposure", "data.init"})
 
 
-def test_a_scene_without_points_gets_some(bare, capsys):
+def test_the_plan_triangulates_points_for_a_scene_without_points(bare, capsys):
     assert ended("plan", bare) == 0
     assert "triangulated" in capsys.readouterr().out
 
@@ -148,7 +148,7 @@ def test_a_single_photo_trains(tmp_path):
     assert settings(out)["data"]["init"] == "random"
 
 
-def test_a_probe_measures_what_cameras_cannot_tell(tmp_path, capsys):
+def test_a_probe_measures_quantities_that_need_gradients(tmp_path, capsys):
     hybrid = write_tiny_scene(tmp_path / "hybrid", views=8, points=120, folders=("low", "high"))
     torch = ("--set", "rasterizer=torch", "--threads", 1, "--max-size", 24)
     assert ended("plan", hybrid, *torch, "--probe", 1, "--json") == 0
@@ -185,7 +185,7 @@ LEFT_OUT = (
 )
 
 
-def test_what_is_left_out_is_not_imported(scene, tmp_path):
+def test_components_that_are_not_used_are_not_imported(scene, tmp_path):
     out = tmp_path / "run"
     arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
     done = subprocess.run(

@@ -126,7 +126,7 @@ def test_another_version_of_crossgrad_is_one_of_a_package(stopped, capsys):
     assert packages(stopped)["crossgrad"]["versions"] == ["0.1.9", cg.__version__]
 
 
-def test_other_versions_are_reported_to_those_who_look(stopped, install, capsys):
+def test_eval_reports_a_changed_package_version(stopped, install, capsys):
     install("1.1")
     assert ended("eval", stopped) == 0
     words = "the run was trained with versioned-package 1.0; installed is versioned-package 1.1"

@@ -1,4 +1,4 @@
-"""What is done with a run afterwards: nothing that its summary describes is replaced."""
+"""Postprocessing of a run does not replace results that its summary describes."""
 
 import json
 import shutil
@@ -157,7 +157,9 @@ def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsy
     assert "3 steps" in said and "memory" not in said
 
 
-def test_what_only_looks_takes_all_threads_and_what_goes_on_those_of_the_run(finished, monkeypatch):
+def test_evaluation_uses_all_threads_and_resuming_uses_the_threads_of_the_run(
+    finished, monkeypatch
+):
     asked = []
     monkeypatch.setattr(load_run, "configure_threads", asked.append)
     evaluate.evaluate(finished)
@@ -226,7 +228,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     assert "drawn on black" in printed
 
 
-def test_the_user_is_reported_what_a_background_costs_the_file(scene, tmp_path, capsys):
+def test_a_message_reports_what_a_background_costs_the_ply(scene, tmp_path, capsys):
     settings = {"scene": str(scene), "steps": STEPS, "threads": 1}
     for name in ("white", "black", "random"):
         out = tmp_path / name
@@ -238,7 +240,7 @@ def test_the_user_is_reported_what_a_background_costs_the_file(scene, tmp_path, 
         assert ("over its background white" in told) == (name == "white")
 
 
-def test_a_ply_of_black_is_as_good_as_the_run(scene, tmp_path, capsys):
+def test_a_ply_trained_on_black_has_the_metrics_of_the_run(scene, tmp_path, capsys):
     out = tmp_path / "black"
     assert run(scene, out) == 0
     capsys.readouterr()

@@ -186,7 +186,7 @@ def test_options_are_not_changed_and_may_be_numbers_of_numpy(scene, tmp_path):
     assert config["data"]["max_size"] == 40
 
 
-def test_what_a_run_answers(reference, tmp_path, capfd):
+def test_an_opened_run_returns_metrics_summary_and_renders(reference, tmp_path, capfd):
     opened = cg.open(reference)
     metrics = opened.metrics
     assert metrics["step"].tolist() == [6, 12] and metrics["step"].dtype == np.int64
@@ -249,7 +249,7 @@ def test_importing_is_light():
     ],
     ids=str,
 )  # fmt: skip
-def test_what_is_no_camera_is_not_drawn(reference, changed):
+def test_rendering_an_invalid_camera_is_refused(reference, changed):
     run = cg.open(reference)
     camera = run.scene.test_views[0].camera
     assert run.render(camera).shape == (camera.height, camera.width, 3)
@@ -262,7 +262,7 @@ def test_what_is_no_camera_is_not_drawn(reference, changed):
 
 
 @pytest.mark.parametrize("view", [5, None, "nobody"])
-def test_what_is_no_view_is_not_drawn(reference, view):
+def test_rendering_an_unknown_view_is_refused(reference, view):
     with pytest.raises(cg.UserError) as error:
         cg.open(reference).render(view)
     assert error.value.where == "Run.render"

@@ -182,7 +182,7 @@ def test_a_further_view_has_the_scale_of_its_own_regime_and_changes_none(views):
     assert streams[0][2] == streams[1][2]
 
 
-def test_what_looks_at_a_view_between_steps_sees_it_in_full_size():
+def test_renders_between_steps_have_the_full_size():
     setup = assembled(resolution=OCTAVES, views=1)
     state = first_state(setup)
     record = timed_step(setup, state)

@@ -150,7 +150,9 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
-def test_what_the_clock_overtakes_stands_nowhere_as_true(scene, tmp_path, monkeypatch, capsys):
+def test_statements_that_a_changed_length_makes_wrong_are_withdrawn(
+    scene, tmp_path, monkeypatch, capsys
+):
     # The plan is too short for density control (it would end in step 14), the run is not.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (28, "few steps", 0.6))
     each_step_takes(monkeypatch, 0.05)
@@ -275,7 +277,7 @@ def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     assert summary["peak_primitives"] == 230
 
 
-def test_a_bound_below_the_points_is_kept_and_told(scene, tmp_path):
+def test_max_gaussians_below_the_number_of_points_is_applied_and_reported(scene, tmp_path):
     run(
         scene,
         tmp_path / "run",
@@ -352,7 +354,7 @@ def test_a_bad_value_right_before_the_length_is_revised_is_rewound(scene, tmp_pa
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 
-def test_a_second_one_stops_the_run_and_names_step_view_and_cause(
+def test_a_second_non_finite_step_stops_the_run_and_names_step_view_and_cause(
     scene, tmp_path, monkeypatch, capsys
 ):
     # Found at the next look at all parameters, in steps 10 and 20.

@@ -95,7 +95,7 @@ def test_another_scene_is_refused_with_the_difference(root, change):
 
 
 @pytest.mark.parametrize("change", ["trained", "split", "another scene"])
-def test_where_parameters_would_be_misplaced_nothing_helps(root, change):
+def test_a_scene_change_that_misplaces_parameters_is_always_refused(root, change):
     words = spoilt(root / "scene", change)
     for look in (lambda how: resume(root, accept_scene=True), *looks(root).values()):
         with pytest.raises(UserError, match=rf"{words}(.|\n)*start a new run"):
@@ -103,7 +103,7 @@ def test_where_parameters_would_be_misplaced_nothing_helps(root, change):
 
 
 @pytest.mark.parametrize("change", ["a photo", "held out"])
-def test_what_only_looks_takes_it_where_the_user_says_so(root, change, capsys):
+def test_read_only_commands_accept_a_changed_scene_with_accept_scene(root, change, capsys):
     spoilt(root / "scene", change)
     run = root / "run"
     before = {path: path.read_bytes() for path in run.rglob("*.*") if path.is_file()}

@@ -154,7 +154,7 @@ def test_a_run_uses_it_by_name(crossgrad, tmp_path):
     assert {"name": "clip", "max_norm": 1e-4} in written["observers"]
 
 
-def test_what_is_not_there_is_refused_by_name(crossgrad, tmp_path):
+def test_an_unknown_plugin_is_refused_with_a_suggestion(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=6)
     code, _, err = crossgrad("run", scene, "--operator", "equal-lenght")
     assert code == 2

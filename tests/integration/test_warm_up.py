@@ -1,4 +1,4 @@
-"""Before the first step all that training needs is compiled, with a second process beside."""
+"""All kernels are compiled before the first step, with the help of a second process."""
 
 import json
 import subprocess
@@ -41,7 +41,7 @@ print(json.dumps(sorted(kernels() - before)))
 
 
 @pytest.mark.parametrize("length", [{"steps": 160}, {"seconds": 3.0}], ids=["steps", "seconds"])
-def test_training_compiles_nothing_behind_the_warm_up(tmp_path, length):
+def test_training_compiles_nothing_after_the_warm_up(tmp_path, length):
     settings = {
         "scene": str(bundled_scene()),
         "data": {"max_size": 48},
@@ -84,7 +84,7 @@ print(json.dumps([len(before), sorted(kernels() - before)]))
 """
 
 
-def test_what_is_compiled_beside_is_what_a_run_uses():
+def test_the_helper_process_compiles_every_kernel_that_a_run_uses():
     done = subprocess.run(
         [sys.executable, "-c", BESIDE], capture_output=True, text=True, timeout=300, check=False
     )
@@ -160,7 +160,7 @@ def test_the_other_process_ends_with_a_run_that_is_refused(started):
 
 
 @pytest.mark.parametrize(("settings", "kept"), [({"threads": 1}, True), ({}, False)])
-def test_no_other_process_where_it_has_no_core_or_keeps_nothing(started, settings, kept):
+def test_no_helper_process_starts_without_a_free_core_or_a_kernel_cache(started, settings, kept):
     with start.compiling_beside(_setup(**settings)):
         _miss(kept=kept)
     assert started == []
@@ -178,7 +178,7 @@ def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeyp
     assert asked == ["rows"]
 
 
-def test_a_probe_begins_again_behind_a_kernel_that_had_to_be_compiled(monkeypatch):
+def test_a_probe_begins_again_after_a_kernel_was_compiled(monkeypatch):
     clock = SimpleNamespace(seconds=0.0)
     clock.trained = lambda kind: clock.seconds
     clock.copy = lambda: SimpleNamespace(trained=lambda kind, at=clock.seconds: at)

@@ -58,7 +58,7 @@ def run(tmp_path, monkeypatch):
     return out
 
 
-def test_a_run_is_looked_at_without_what_trained_it(run, capsys):
+def test_a_run_can_be_evaluated_without_the_plugins_that_trained_it(run, capsys):
     before = (run / "per_view.csv").read_text()
     assert ended("eval", run) == 0
     told = capsys.readouterr().err
@@ -70,7 +70,7 @@ def test_a_run_is_looked_at_without_what_trained_it(run, capsys):
     assert ended("render", run, "--out", run.parent / "pictures") == 0
 
 
-def test_it_does_not_go_on_without_them(run, capsys):
+def test_a_run_cannot_be_resumed_without_its_plugins(run, capsys):
     assert ended("run", "--resume", run, "-q") == 2
     assert "own-" in capsys.readouterr().err
 
@@ -92,7 +92,7 @@ def test_settings_that_were_changed_are_still_refused(run, capsys):
         ("planned_seconds: null", "planned_seconds: 5.0", "follows the clock"),
     ],
 )
-def test_how_a_run_is_drawn_and_what_its_length_follows_stay_as_they_were(
+def test_changed_render_and_length_settings_are_refused_without_the_plugins(
     run, capsys, old, new, named
 ):
     text = (run / "config.yaml").read_text()
@@ -119,7 +119,7 @@ def test_a_figure_that_cannot_be_measured_now_stays(run, capsys):
     assert "per_view.csv stays as it is: gains, lpips not measured here" in capsys.readouterr().err
 
 
-def test_an_operator_that_names_one_that_is_gone_is_stood_in():
+def test_a_default_replaces_an_operator_that_names_a_missing_operator():
     operator = {"name": "dispatch", "rules": {"near-far": "own-operators"}}
     config = RunConfig.model_validate({"operator": operator})
     assert [each.name for each in without_missing(config).operators] == ["sum"]

@@ -1,4 +1,4 @@
-"""What two runs have to share to be the same run."""
+"""Comparison of two runs that must be the same bit for bit."""
 
 import csv
 import json

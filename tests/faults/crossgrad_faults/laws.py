@@ -1,4 +1,4 @@
-"""What must hold of a run's folder after any fault."""
+"""Conditions that the folder of a run must fulfil after any fault."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""What every execution must hold, whatever the input."""
+"""Conditions that every execution must fulfil for any input."""
 
 import contextlib
 import os

@@ -21,7 +21,7 @@ _KNOWING = 0.6
 
 @dataclass
 class Search:
-    """What a search has found.
+    """The findings of a search.
 
     Attributes:
         guide: Knows what was reached of the parser.

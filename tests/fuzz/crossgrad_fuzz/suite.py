@@ -31,7 +31,7 @@ _THREADS = dict.fromkeys(
 
 @dataclass
 class Report:
-    """What came out of one search.
+    """The result of one search.
 
     Attributes:
         target: Name of the parser.

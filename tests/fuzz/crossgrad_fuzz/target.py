@@ -1,4 +1,4 @@
-"""What is fuzzed: a parser, valid files for it, and the functions that it consists of."""
+"""A fuzzing target: a parser, valid files for it, and the functions that it consists of."""
 
 import random
 from collections.abc import Callable, Mapping, Sequence

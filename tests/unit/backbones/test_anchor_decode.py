@@ -122,7 +122,7 @@ def test_every_gaussian_is_that_of_the_formulas(options, faded, dtype):
     assert found.decoded.nonzero().squeeze(1).tolist() == rows.tolist()
 
 
-def test_an_anchor_that_draws_nothing_counts_as_decoded():
+def test_an_anchor_without_visible_gaussians_counts_as_decoded():
     backbone, parameters = model({})
     parameters["mlp_opacity.2.bias"] -= 30.0
     found = decoded(backbone.heads, parameters, VIEWS[0].camera, Seen(torch.tensor([2, 5])))

@@ -126,7 +126,7 @@ def norm_of(gradients, name):
     return torch.zeros(()).double() if gradient is None else gradient.norm()
 
 
-def test_many_stretches_are_the_plain_pass_too():
+def test_decoding_in_several_chunks_agrees_with_the_plain_pass():
     backbone = Scaffold(offsets=2, feature=8)
     few = jittered(backbone)
     source = torch.arange(5000) % len(few["anchors"])
@@ -144,7 +144,7 @@ def test_many_stretches_are_the_plain_pass_too():
                 assert (each[name].double() - want).norm() <= 1e-5 * want.norm(), name
 
 
-def test_networks_that_do_not_matter_get_no_gradient():
+def test_networks_without_influence_on_the_loss_get_no_gradient():
     backbone = Scaffold()
     parameters = jittered(backbone)
     _, (volume,) = results(

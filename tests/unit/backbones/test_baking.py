@@ -65,7 +65,7 @@ def test_scales_and_opacities_are_those_of_the_formulas(blur, cameras, size):
     assert baked.response == "plain" and baked.dilation is None
 
 
-def test_what_no_camera_sees_stays_as_it_is():
+def test_baking_leaves_gaussians_outside_all_views_unchanged():
     gaussians = sample_gaussians(harmonics=True).detached()
     away = replace(gaussians, means=gaussians.means + 100.0)
     baked = as_plain(away, CAMERAS, 0.1, NEAR)
@@ -81,7 +81,7 @@ def test_extreme_sizes_stay_finite_and_positive(size):
     assert ((baked.opacities >= 0) & (baked.opacities <= 1)).all()
 
 
-def test_no_gaussians_are_no_error():
+def test_baking_zero_gaussians_works():
     none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
     assert len(as_plain(none, CAMERAS, 0.1, NEAR)) == 0
 
@@ -90,9 +90,7 @@ def test_no_gaussians_are_no_error():
 @pytest.mark.parametrize(
     ("response", "dilation", "blur"), [("antialiased", 0.1, 0.1), ("analytic", 0.0, 1 / 12)]
 )
-def test_baking_takes_off_most_of_what_the_plain_response_does_wrong(
-    response, dilation, blur, size
-):
+def test_baking_removes_most_of_the_error_of_the_plain_response(response, dilation, blur, size):
     live = sample_gaussians(400, harmonics=True).detached()
     live = replace(live, scales=live.scales * size, response=response, dilation=dilation)
     for camera in CAMERAS[::3]:

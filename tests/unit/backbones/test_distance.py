@@ -77,7 +77,7 @@ def test_a_camera_at_the_mean_has_a_finite_encoding():
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_equal_distances_encode_to_zero_and_leave_the_conditions_out(count):
+def test_equal_distances_encode_to_zero_and_have_no_conditions(count):
     places = [(np.cos(a), np.sin(a), 0.0) for a in 2 * np.pi * np.arange(count) / count]
     cameras = [at(CAMERAS[0], *place) for place in places]
     assert encoded(fitted_scale(cameras), cameras[:1]).tolist() == [0.0, 0.0]

@@ -72,7 +72,7 @@ def test_bounding_range_takes_all_axes_together():
 @pytest.mark.parametrize("edge", [0.3, 2.71, 16.77, 1e6])
 @pytest.mark.parametrize("levels", [1, 2, 4, 7])
 @pytest.mark.parametrize("fork", [2, 3])
-def test_the_level_below_the_middle_has_the_asked_size(edge, levels, fork):
+def test_the_level_below_the_middle_has_the_requested_cell_size(edge, levels, fork):
     cell = root_cell(edge, -1, root_above(0.02, levels, fork))
     halvings = math.log2(edge / cell)
     assert halvings == pytest.approx(round(halvings), abs=1e-9)
@@ -118,7 +118,7 @@ def sites_by_loops(points, levels, origin, everywhere):
 
 
 @pytest.mark.parametrize("everywhere", [False, True])
-def test_planting_rounds_to_every_level_once(everywhere):
+def test_initial_anchors_round_points_to_each_level_without_duplicates(everywhere):
     points = np.random.default_rng(3).uniform(-1, 1, (60, 3))
     anchors = init_anchors(points, lattice(4, origin=-1.1), everywhere=everywhere)
     positions, levels = anchors.positions, anchors.levels
@@ -133,7 +133,7 @@ def test_planting_rounds_to_every_level_once(everywhere):
 
 
 @pytest.mark.parametrize(("everywhere", "wanted"), [(False, [0]), (True, [0, 1, 2])])
-def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywhere, wanted):
+def test_one_point_has_anchors_on_finer_levels_only_with_plant_everywhere(everywhere, wanted):
     anchors = init_anchors(np.array([[0.1, 0.2, 0.3]]), lattice(3), everywhere=everywhere)
     assert anchors.levels.tolist() == wanted
     assert anchors.positions[0].tolist() == [0.0, 0.0, 0.5]
@@ -142,14 +142,14 @@ def test_one_point_repeats_its_anchor_on_finer_levels_only_where_asked(everywher
 @pytest.mark.parametrize(
     ("x", "wanted"), [((0.1, 0.2), [0, 1, 1]), ((0.01, 0.05), [0, 3, 3]), ((0.1, 0.1), [0])]
 )
-def test_levels_that_part_no_points_are_passed_over(x, wanted):
+def test_levels_that_separate_no_points_get_no_anchors(x, wanted):
     """Cells of 1/2, 1/4, 1/8 and 1/16 around 0."""
     points = np.array([[each, 0.0, 0.0] for each in x])
     assert init_anchors(points, lattice(4), everywhere=False).levels.tolist() == wanted
 
 
 @pytest.mark.parametrize("everywhere", [False, True])
-def test_initial_scales_come_from_the_sites_of_the_same_level_planted_or_not(everywhere):
+def test_initial_scales_use_all_sites_of_the_same_level(everywhere):
     points = np.random.default_rng(4).uniform(-1, 1, (60, 3))
     anchors = init_anchors(points, lattice(4), everywhere=everywhere)
     assert anchors.levels.max() == 3
@@ -162,7 +162,7 @@ def test_initial_scales_come_from_the_sites_of_the_same_level_planted_or_not(eve
 
 @pytest.mark.parametrize("fork", [2, 3])
 @pytest.mark.parametrize("reach", [0.5, 12.0, 1e4])
-def test_cells_of_the_finest_level_are_told_apart_by_float32(fork, reach):
+def test_float32_distinguishes_the_cells_of_the_finest_level(fork, reach):
     levels = resolvable_levels(16, fork, 1e-3, reach)
     cell = 1e-3 / fork ** (levels - 1)
     if levels > 1:
@@ -180,7 +180,7 @@ def test_automatic_visible_share_is_the_mean():
     assert visible_share(shares, 0.01) == 0.01
 
 
-def test_openings_are_a_decreasing_geometric_series_that_ends_on_time():
+def test_level_openings_follow_a_geometric_series_that_ends_on_time():
     openings = opening_steps(10_000.0, 3, 1.5)
     q = 1 / 1.5
     first = 10_000 * (1 - q) / (1 - q**3)
@@ -195,7 +195,7 @@ def test_levels_open_one_by_one(step, top):
     assert allowed_top(step, (4736.84, 7894.74, 10_000.0), 2) == top
 
 
-def test_equal_terms_and_no_levels_at_all():
+def test_level_openings_with_ratio_one_and_without_levels():
     assert opening_steps(9.0, 3, 1.0) == pytest.approx((3.0, 6.0, 9.0))
     assert opening_steps(9.0, 0, 1.5) == ()
     assert allowed_top(0, (), 0) == 0

@@ -64,7 +64,7 @@ def test_filter_widths(parity):
 
 
 @pytest.mark.parametrize("means", [torch.full((3, 3), 1e3), torch.zeros(0, 3)])
-def test_where_no_camera_sees_anything_nothing_is_widened(means):
+def test_the_filter_width_is_zero_for_means_that_no_camera_sees(means):
     assert filter_widths(means, cameras(), NEAR, parity=False).tolist() == [0.0] * len(means)
 
 

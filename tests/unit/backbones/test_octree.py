@@ -89,7 +89,7 @@ def test_one_point_and_one_camera_make_one_anchor():
     assert 0 < len(baked) <= 10
 
 
-def test_the_mean_share_weeds_out_what_few_cameras_see():
+def test_the_automatic_threshold_removes_anchors_that_few_cameras_see():
     everything, some = leveled(visible_threshold=0.0), leveled(visible_threshold=-1.0)
     counts = [
         [int((parameters["levels"] == level).sum()) for level in range(3)]
@@ -233,7 +233,7 @@ def test_gradients_through_the_reference_rasterizer():
     assert all(g.any() for g in torch.autograd.grad(rendered(*values), values))
 
 
-def test_a_tensor_of_the_run_says_all_that_decoding_needs():
+def test_the_lattice_tensor_contains_all_values_that_decoding_needs():
     scene = sample_scene()
     backbone = Octree()
     parameters = backbone.create(scene, np.random.default_rng(0))
@@ -259,7 +259,7 @@ def test_no_visible_gaussian_to_start_from_is_reported(backbone):
         backbone.adopt(faint, scene, rng)
 
 
-def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_round():
+def test_densifier_anchor_works_on_octree_but_densifier_octree_needs_a_lattice():
     config = {"backbone": {"name": "octree"}, "densifier": {"name": "anchor"}, "steps": 200}
     assemble(RunConfig.model_validate(config), sample_scene(), "none")
     for other in ("scaffold", "vanilla"):
@@ -268,7 +268,7 @@ def test_the_densifier_of_scaffold_works_on_an_octree_and_not_the_other_way_roun
             assemble(RunConfig.model_validate(config), sample_scene(), "none")
 
 
-def test_what_is_left_out_is_reported():
+def test_omitted_anchors_are_reported_with_the_option():
     assert "plant_everywhere=true" in Octree().fitted_to(sample_scene())[1][0]
     assert Octree(plant_everywhere=True).fitted_to(sample_scene())[1] == ()
 

@@ -1,4 +1,4 @@
-"""Where anchors start, what they learn with, and what is baked of them."""
+"""Initial anchors, learning rates and baking of backbone scaffold."""
 
 from dataclasses import replace
 
@@ -165,7 +165,7 @@ def spread():
 
 
 @pytest.mark.parametrize("view", [0, 3, 7])
-def test_baked_for_one_camera_is_what_it_sees(view):
+def test_baking_for_one_camera_keeps_the_gaussians_that_it_sees(view):
     backbone, parameters = spread()
     camera = VIEWS[view].camera
     live = backbone.decode(parameters, camera, EVALUATION).detached()
@@ -250,7 +250,7 @@ def test_baked_for_several_cameras_is_the_mean_of_those_that_see_an_anchor():
     np.testing.assert_allclose(harmonics, colors, rtol=1e-3, atol=1e-3)
 
 
-def test_an_anchor_that_no_camera_sees_is_baked_as_all_would_see_it():
+def test_an_anchor_that_no_camera_sees_is_baked_for_all_cameras():
     backbone, parameters = spread()
     cameras = [view.camera for view in VIEWS[:2]]
     behind = replace(
@@ -268,7 +268,7 @@ def test_an_anchor_that_no_camera_sees_is_baked_as_all_would_see_it():
     np.testing.assert_allclose(baked.opacities, seen.opacities[drawn].detach(), atol=1e-5)
 
 
-def test_at_most_so_many_cameras_are_averaged():
+def test_evenly_chosen_cameras_are_limited_in_number():
     from crossgrad_backbones.anchors.baking import evenly
 
     cameras = [VIEWS[i % len(VIEWS)].camera for i in range(100)]

@@ -1,4 +1,4 @@
-"""What a backbone decodes, and its gradients, do not depend on the number of threads."""
+"""Decoded Gaussians and their gradients do not depend on the number of threads."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Who is seen, and how finely, against loops over cameras and means in float64."""
+"""Visibility and finest pixel of means, compared with loops over cameras and means in float64."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def looked_at(mean, camera):
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_depths_and_sight(camera):
+def test_depths_and_visibility_agree_with_a_loop(camera):
     depths, seen = depths_in_view(columns_of(means()), camera, NEAR)
     expected = [looked_at(mean, camera) for mean in means().numpy()]
     assert depths.numpy() == pytest.approx([depth for depth, _ in expected], abs=1e-12)
@@ -59,7 +59,7 @@ def test_the_finest_pixel_is_that_of_the_nearest_camera_in_pixels():
     assert 0 < found.isfinite().sum() < len(found)
 
 
-def test_a_mean_is_judged_alike_wherever_it_stands():
+def test_the_finest_pixel_does_not_depend_on_the_order_of_rows():
     all_means = means(1003).float()
     order = torch.randperm(1003, generator=torch.Generator().manual_seed(1))
     found = finest_pixels(all_means, CAMERAS, NEAR)

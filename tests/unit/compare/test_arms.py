@@ -36,12 +36,12 @@ def test_seeds_scenes_and_lengths_make_no_arm(tmp_path):
     assert len(only.runs) == len(runs)
 
 
-def test_an_arm_is_named_by_what_tells_it_apart(tmp_path):
+def test_an_arm_is_named_by_the_setting_that_differs(tmp_path):
     found = names(tmp_path, RunFolder(views_per_step=2), RunFolder(), RunFolder(views_per_step=10))
     assert found == ["views=1", "views=2", "views=10"]
 
 
-def test_what_a_component_brings_is_not_in_the_name(tmp_path):
+def test_defaults_that_follow_from_a_component_are_not_in_the_name_of_an_arm(tmp_path):
     [scaffold, vanilla] = arms(
         tmp_path,
         RunFolder(settings={**SCAFFOLD, "densifier": {"name": "anchor", "levels": 3}}),
@@ -65,7 +65,7 @@ def test_two_things_that_differ_are_both_named(tmp_path):
     ]
 
 
-def test_options_of_one_component_are_told_apart_beside_another_one(tmp_path):
+def test_options_distinguish_arms_of_one_component_next_to_another_component(tmp_path):
     found = names(
         tmp_path,
         RunFolder(settings={"operator": {"name": "cagrad", "c": 0.4}}),
@@ -79,7 +79,7 @@ def test_options_of_one_component_are_told_apart_beside_another_one(tmp_path):
     ]
 
 
-def test_what_follows_from_the_scene_makes_no_arm(tmp_path):
+def test_settings_that_follow_from_the_scene_do_not_make_an_arm(tmp_path):
     low, high = ({"backbone": {"name": "vanilla", "sh_degree": n}} for n in (1, 3))
     runs = [
         RunFolder(scene=scene, settings=settings, views_per_step=views)
@@ -95,7 +95,7 @@ def test_an_option_that_an_older_version_lacks_makes_no_arm(tmp_path):
     assert len(names(tmp_path, RunFolder(settings=old), RunFolder(seed=1, settings=new))) == 1
 
 
-def test_what_is_set_in_one_arm_and_not_in_another_one_tells_them_apart(tmp_path):
+def test_a_setting_given_in_one_arm_only_distinguishes_the_arms(tmp_path):
     few, mip = {"max_gaussians": 5000}, {"backbone": {"name": "mip"}}
     runs = [RunFolder(seed=n, settings=own) for own in ({}, few, mip) for n in range(3)]
     found = arms(tmp_path, *runs)
@@ -112,7 +112,7 @@ def test_what_is_set_in_one_arm_and_not_in_another_one_tells_them_apart(tmp_path
     ]
 
 
-def test_an_option_of_a_component_that_is_not_set_in_one_arm_tells_it_apart(tmp_path):
+def test_an_option_that_is_none_in_one_arm_distinguishes_the_arms(tmp_path):
     runs = [RunFolder(settings={"loss": {"name": "dssim", "clip": c}}) for c in (None, 0.5)]
     assert names(tmp_path, *runs) == ["loss.clip=0.5", "loss.clip=none"]
 
@@ -148,7 +148,7 @@ def test_one_label_of_two_sweeps_is_told_apart_by_settings(tmp_path):
     assert swept(tmp_path) == {"backbone=mip": 1, "backbone=vanilla": 1}
 
 
-def test_a_label_that_stands_for_one_configuration_on_each_scene_is_taken(tmp_path):
+def test_a_label_with_one_configuration_per_scene_names_the_arm(tmp_path):
     for folder, factor in (("a", 1.0), ("b", 2.0)):
         runs = {
             "one": RunFolder(),
@@ -166,7 +166,7 @@ def test_no_two_arms_have_one_name(tmp_path):
     assert swept(tmp_path) == {"views=1": 1, "views=2": 1, "views=4": 1}
 
 
-def test_a_run_with_two_labels_beside_one_without_does_not_repeat_itself(tmp_path):
+def test_a_run_with_two_labels_counts_once_next_to_a_run_without_label(tmp_path):
     RunFolder().write(tmp_path / "runs" / "aa")
     (tmp_path / "runs.csv").write_text("run,configuration\naa,one\naa,two\n")
     RunFolder(views_per_step=2).write(tmp_path / "other")
@@ -182,7 +182,7 @@ def test_labels_of_a_sweep_are_taken_and_a_run_can_have_two(tmp_path):
     assert [arm.name for arm in arms_of(found.runs)] == ["seconds", "steps", "views"]
 
 
-def test_lengths_in_a_label_make_no_arm(tmp_path):
+def test_lengths_in_a_label_do_not_make_an_arm(tmp_path):
     for number in range(4):
         RunFolder(steps=100 + 100 * number).write(tmp_path / "runs" / str(number))
     labels = ('"run, steps=100"', '"run, steps=200"', '"two, views=2, seconds=9"', "run")

@@ -1,4 +1,4 @@
-"""What does not compare is refused, with the reason and the way out."""
+"""Runs that cannot be compared are refused with the reason and a remedy."""
 
 import json
 from html import unescape
@@ -43,7 +43,7 @@ def costs(found):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_does_not_compare_is_refused(tmp_path, other, what, found):
+def test_runs_that_cannot_be_compared_are_refused(tmp_path, other, what, found):
     with pytest.raises(UserError, match=what) as error:
         comparison(tmp_path, RunFolder(), RunFolder(views_per_step=2, **other))
     assert found in error.value.found
@@ -98,7 +98,7 @@ def test_another_training_split_is_refused(tmp_path):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
-def test_a_run_says_of_which_figures_less_is_better(tmp_path):
+def test_a_run_records_for_which_metrics_less_is_better(tmp_path):
     for name, views, error in (("worse", 1, 9.0), ("better", 2, 4.0)):
         path = RunFolder(views_per_step=views).write(tmp_path / name) / "summary.json"
         summary = json.loads(path.read_text()) | {"falling": ["mae"]}
@@ -190,7 +190,7 @@ def test_runs_without_cpu_seconds_have_no_such_axis_and_no_note(tmp_path):
     assert found.notes == ()
 
 
-def test_regimes_that_differ_leave_the_overall_figures(tmp_path):
+def test_runs_with_different_regimes_are_compared_overall_only(tmp_path):
     other = RunFolder(views_per_step=2, regimes={"street": 1.0, "air": -1.0})
     found = comparison(tmp_path, RunFolder(), other)
     assert [each.where for each in found.ends] == ["at the end"]
@@ -208,7 +208,7 @@ def test_names_that_are_not_there_are_refused(tmp_path, options, match):
     assert "psnr" in error.value.expected or "views=1" in error.value.expected
 
 
-def test_what_is_advised_about_figures_can_be_done(tmp_path):
+def test_errors_about_metrics_give_advice_that_works(tmp_path):
     with pytest.raises(UserError, match="no run has this figure") as lacking:
         comparison(tmp_path / "1", RunFolder(), metric="lpips")
     other = RunFolder(views_per_step=2, definitions={"psnr": "of means"})

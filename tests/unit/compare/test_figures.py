@@ -70,7 +70,7 @@ def test_arms_look_different(arms):
 
 
 @pytest.mark.parametrize("arms", [2, 8, 14, 28])
-def test_a_legend_of_many_arms_leaves_the_panels_their_room(arms):
+def test_a_legend_of_many_arms_does_not_shrink_the_panels(arms):
     names = [f"two views, equal views, statistics of one view, {index}" for index in range(arms)]
     with styled(), warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -74,7 +74,7 @@ def test_a_method_is_not_different_from_itself(scenes, pairs, law):
 @pytest.mark.parametrize(
     ("pairs", "effects"), [(10, (0.1, -0.1, 0.2, -0.2, 0.0)), (12, (0.1, -0.1, 0.2, -0.2))]
 )
-def test_nor_where_scenes_differ(pairs, effects):
+def test_a_method_is_not_different_from_itself_on_different_scenes(pairs, effects):
     assert self_comparisons(scenes=len(effects), pairs=pairs, effects=effects) <= 16
 
 

@@ -115,7 +115,7 @@ def test_a_number_beyond_all_others_is_damage(folder, file):
     assert file in read_runs([folder], skip_broken=True).left_out["1-1"]
 
 
-def test_what_is_reached_before_anything_is_spent_has_a_ratio(tmp_path):
+def test_a_target_reached_at_zero_cost_has_a_ratio(tmp_path):
     for views in (1, 2):
         path = RunFolder(views_per_step=views).write(tmp_path / f"{views}") / "metrics.csv"
         first, second, *lines = path.read_text().splitlines()
@@ -267,14 +267,14 @@ def test_a_comparison_that_was_broken_off_is_replaced(folder, monkeypatch):
     assert (out / "notes.txt").read_text() == "mine"
 
 
-def test_why_nothing_is_paired_is_said(tmp_path):
+def test_the_reason_for_missing_pairs_is_reported(tmp_path):
     for seed in range(2):
         RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
         RunFolder(seed=seed, views_per_step=2, status="failed").write(tmp_path / f"bad-{seed}")
     assert "Nothing is paired: every run of views=2 failed" in headlines(tmp_path)
 
 
-def test_arms_without_a_figure_at_their_ends_are_not_said_to_share_no_scene(tmp_path):
+def test_arms_without_final_metrics_are_reported_as_such(tmp_path):
     for seed in range(2):
         RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
         RunFolder(seed=seed, views_per_step=2, final=float("nan")).write(tmp_path / f"bad-{seed}")

@@ -58,7 +58,7 @@ def test_quality_at_equal_cost_is_read_where_the_shorter_run_ends(tmp_path):
     assert steps.pairs[0].second == pytest.approx(one.psnr(0.5))
 
 
-def test_a_run_that_never_gets_there_stays_in_the_denominator(tmp_path):
+def test_a_run_that_never_reaches_the_target_stays_in_the_denominator(tmp_path):
     runs = [RunFolder(seed=0), RunFolder(seed=1, final=20.0)]
     runs += [RunFolder(seed=n, views_per_step=2, steps=300, seconds=30.0) for n in range(3)]
     runs += [RunFolder(seed=2, status="failed")]
@@ -140,7 +140,7 @@ def test_an_arm_of_two_runs_reaches_what_it_ends_with(tmp_path):
     assert all(row.median < inf for row in found.reached)
 
 
-def test_each_table_has_a_place_of_its_own(tmp_path):
+def test_each_table_is_written_to_its_own_file(tmp_path):
     finals = {1: (20.0, 20.1, 20.3), 2: (20.4, 20.3, 20.9)}
     regimes = dict.fromkeys("abcdef", 0.0)
     for views, own in finals.items():
@@ -168,7 +168,7 @@ def arms_with(folder, *runs):
     }
 
 
-def test_a_short_run_does_not_stand_for_a_long_one_that_is_missing(tmp_path):
+def test_a_short_run_does_not_replace_a_missing_long_run(tmp_path):
     long = [(factor, seed, 600) for factor in (1.0, 2.0) for seed in range(3)]
     runs = [run for run in long if run != (1.0, 2, 600)]
     found, main = arms_with(tmp_path, *runs, (1.0, 2, 300), (1.0, 0, 300))
@@ -194,7 +194,7 @@ def test_each_scene_has_a_usual_length_of_its_own(tmp_path):
     assert len(found.ends[0].pairs) == 3
 
 
-def test_an_arm_of_another_length_keeps_it_beside_a_run_of_the_usual_one(tmp_path):
+def test_an_arm_keeps_its_own_length_next_to_one_run_of_that_length(tmp_path):
     # Two views in half the steps; and one run of one view that is as short.
     runs = [RunFolder(seed=n, steps=1200) for n in range(3)]
     runs += [RunFolder(seed=n, steps=600, views_per_step=2) for n in range(3)]
@@ -241,7 +241,7 @@ def test_a_run_without_a_finite_end_is_named_and_not_paired(tmp_path):
     assert {row.amounts[2] for row in found.reached if row.arm == "views=2"} == {inf}
 
 
-def test_views_cost_what_they_cost(tmp_path):
+def test_cost_in_views_is_steps_times_views_per_step(tmp_path):
     found = comparison(tmp_path, RunFolder(views_per_step=3, steps=100))
     assert found.runs[0].spent(VIEWS) == 300.0
     assert VIEWS.shown(1234.0) == "1,234 views"

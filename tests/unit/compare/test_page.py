@@ -65,7 +65,7 @@ def compared_in(folder, runs, **options):
     return compared(read_runs([folder], skip_broken=False), Options(**options))
 
 
-def test_phases_are_seconds_of_the_clock_and_shown_only_where_these_are_compared(tmp_path):
+def test_phases_are_shown_only_if_wall_seconds_are_compared(tmp_path):
     runs = [
         RunFolder(views_per_step=views, seed=seed, cpu_seconds=50.0)
         for views in (1, 2)
@@ -129,7 +129,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_page_needs_nothing_else(written):
+def test_the_page_loads_local_files_only(written):
     text = (written / "index.html").read_text()
     page = Reader(text)
     local = {"data:,", *(f"figures/{path.name}" for path in (written / "figures").iterdir())}
@@ -165,7 +165,7 @@ def test_there_are_figures_for_a_paper(written):
     assert b"/Type3" not in (written / "figures" / "differences.pdf").read_bytes()
 
 
-def test_all_that_is_written_is_known_to_the_next_comparison(written):
+def test_every_written_file_is_in_the_list_of_owned_files(written):
     files = {path.relative_to(written).as_posix() for path in written.rglob("*.*")}
     assert files <= {"index.html", *app.OWNED}
     modules = {path.stem for path in Path(app.__file__).parent.glob("figures/*.py")}
@@ -266,7 +266,7 @@ def page_with(folder, capsys, name):
     return (folder / "out" / "index.html").read_text(), said.out + said.err
 
 
-def test_names_make_no_element_and_no_attribute(tmp_path, capsys):
+def test_names_create_no_html_elements_or_attributes(tmp_path, capsys):
     plain, _ = page_with(tmp_path / "plain", capsys, "a harmless name")
     page, said = page_with(tmp_path / "evil", capsys, EVIL)
     found = Elements(page)

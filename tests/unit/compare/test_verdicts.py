@@ -73,7 +73,7 @@ def test_p_values_and_intervals_of_the_bootstrap_agree():
 
 
 @pytest.mark.parametrize("shift", [5.0, -5.0])
-def test_what_is_far_above_the_noise_is_different_beside_any_number_of_others(shift):
+def test_a_difference_far_above_the_noise_stays_different_among_100_comparisons(shift):
     scenes = [name for name in "abcd" for _ in range(3)]
     found = estimate(shift + 0.05 * RNG.standard_normal(12), scenes, 0.1)
     assert found.method == IQM
@@ -148,12 +148,12 @@ def test_the_verdict_on_few_comparisons_is_what_the_intervals_say():
     assert verdicts([found] * 6) == [Verdict.INCONCLUSIVE] * 6
 
 
-def test_noise_far_above_the_margin_asks_for_no_number():
+def test_noise_far_above_the_margin_gives_no_number_of_needed_pairs():
     values = np.random.default_rng(0).normal(0.0, 10.0, 12)
     assert estimate(values, ["a"] * 12, 0.1).needed is None
 
 
-def test_differences_between_scenes_ask_for_no_pairs_where_the_interval_leaves_them_out():
+def test_differences_between_scenes_do_not_raise_the_number_of_needed_pairs():
     scenes = [name for name in "abcd" for _ in range(3)]
     noise = 0.1 * np.tile([-1.0, 0.0, 1.0], 4)
     levels = np.repeat([-2.0, -1.0, 1.0, 2.0], 3)

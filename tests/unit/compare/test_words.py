@@ -8,7 +8,7 @@ from crossgrad_plugins.compare.narrative import headline
 from crossgrad_plugins.compare.options import Options
 
 
-def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_path):
+def test_an_arm_that_leads_only_by_the_mean_is_not_reported_as_winner(tmp_path):
     # One run of two views diverged: less in the mean, more in eleven pairs of twelve.
     for number in range(12):
         scene, seed = f"scene {number % 4}", number // 4
@@ -26,7 +26,7 @@ def test_who_leads_by_the_mean_and_loses_pair_by_pair_is_not_said_to_win(tmp_pat
     assert not any("ends best" in each.claim for each in (first, second))
 
 
-def test_arms_of_different_lengths_are_said_to_be(tmp_path):
+def test_different_lengths_of_arms_are_reported(tmp_path):
     for views, steps in ((1, 300), (2, 900)):
         for seed in range(3):
             run = RunFolder("place", seed, 20.0 + views, views_per_step=views, steps=steps)
@@ -36,7 +36,7 @@ def test_arms_of_different_lengths_are_said_to_be(tmp_path):
     assert told["The arms were given different lengths"] == "views=2 900 steps; views=1 300 steps"
 
 
-def test_lengths_that_follow_the_scene_are_not_told(tmp_path):
+def test_lengths_that_depend_on_the_scene_only_are_not_reported(tmp_path):
     for views in (1, 2):
         for seed in range(4):
             steps = 300 * (1 + seed % 2)

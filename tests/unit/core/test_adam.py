@@ -113,7 +113,7 @@ def test_a_gradient_that_is_not_finite_is_seen_in_the_parameters_of_a_gpu(bad):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_a_tensor_held_that_counts_as_zero_is_not_read(dtype):
+def test_memory_of_tensors_that_count_as_zero_is_not_read(dtype):
     """Also where no gradient has moved anything, as in the second half."""
     grad = torch.cat([tensors(6)["means"].flatten(), torch.zeros(70_000)]).to(dtype)
     found = []
@@ -229,7 +229,7 @@ def test_wrong_arguments_are_refused(grad, options):
 
 
 @pytest.mark.parametrize("last", ["grad", "exp_avg", "exp_avg_sq"])
-def test_what_nothing_has_moved_yet_stays_and_all_else_does_not(last):
+def test_only_elements_with_nonzero_gradient_or_moments_move(last):
     """Runs of zeros are left out: every place of the first and last number that is not zero."""
     size = 3 * 2**13 + 5
     rule = coefficients()
@@ -279,7 +279,7 @@ def test_a_tensor_without_a_rate_leaves_all_as_they_were():
     assert torch.equal(params["x"], torch.ones(3)) and not state.steps.get("x")
 
 
-def test_not_a_number_is_not_left_out():
+def test_a_nan_gradient_is_not_skipped():
     grad = torch.zeros(2**17)
     grad[100_000] = torch.nan
     tensors = [torch.ones(2**17), torch.zeros(2**17), torch.zeros(2**17)]

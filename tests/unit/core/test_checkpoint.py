@@ -206,7 +206,7 @@ def test_a_full_disk_is_explained_with_what_is_needed(
 @pytest.mark.parametrize(
     ("keep", "left"), [(Keep(), [200, 300]), (Keep(every=100), [100, 200]), (Keep(3), [100, 200])]
 )
-def test_where_the_disk_is_full_what_would_be_deleted_anyway_makes_room(
+def test_on_a_full_disk_an_old_checkpoint_is_deleted_before_the_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: Keep, left: list[int]
 ):
     for step in (100, 200):
@@ -224,7 +224,7 @@ def test_where_the_disk_is_full_what_would_be_deleted_anyway_makes_room(
     assert steps_in(tmp_path) == left
 
 
-def test_a_reader_finds_the_newer_one_where_its_own_is_deleted_meanwhile(
+def test_a_reader_takes_the_newer_checkpoint_if_its_own_is_deleted_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     save(tmp_path, make_checkpoint(100))

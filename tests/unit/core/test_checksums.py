@@ -43,7 +43,7 @@ def test_a_file_that_changed_or_is_gone_is_named(folder):
     check_unchanged(folder, ["a.txt"], "")
 
 
-def test_what_a_command_replaces_is_listed_anew(folder):
+def test_checksums_are_updated_for_files_that_a_command_replaces(folder):
     with relisted(folder, "b", "c.txt"):
         assert changed_files(folder) == []
         (folder / "b" / "ż.txt").write_text("new")

@@ -29,7 +29,7 @@ def test_the_bits_do_not_depend_on_the_threads(name):
         assert torch.equal(*found)
 
 
-def test_neither_do_those_of_gradients():
+def test_the_bits_of_gradients_do_not_depend_on_the_threads():
     generator = torch.Generator().manual_seed(0)
     values, upstream = torch.randn(2, 126_003, generator=generator)
     found = []
@@ -51,7 +51,7 @@ def test_gradients_of_gradients_pass_through_every_block():
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("shape", [(), (0,), (7, 3), (BLOCK + 1, 3)])
-def test_they_are_what_torch_computes(name, shape):
+def test_elementwise_functions_agree_with_torch(name, shape):
     mine, theirs = FUNCTIONS[name]
     values = torch.linspace(-90.0, 90.0, max(1, torch.Size(shape).numel()))[
         : torch.Size(shape).numel()

@@ -1,9 +1,9 @@
-"""How the one error that users see is worded."""
+"""The wording of UserError."""
 
 from crossgrad_core.errors import LONGEST, LONGEST_PLACE, UserError
 
 
-def test_parts_stand_in_lines_of_their_own():
+def test_each_part_of_a_message_has_its_own_line():
     error = UserError("wrong", where="a.ply", expected="x", found="y", todo="do z")
     assert str(error).splitlines() == [
         "wrong",
@@ -24,7 +24,7 @@ def test_what_a_file_holds_cannot_fill_or_move_the_terminal():
     message.encode()
 
 
-def test_what_is_written_out_is_cut_too():
+def test_every_part_of_a_message_is_cut_to_a_length():
     text = "\0" * 2000
     error = UserError(text, where=text, expected=text, found=text, todo=text)
     assert len(str(error)) < 4 * LONGEST + LONGEST_PLACE + 100

@@ -86,7 +86,7 @@ def test_free_space_of_a_folder_that_does_not_exist_yet(tmp_path: Path):
     assert free_bytes(tmp_path / "a" / "b") > 0
 
 
-def test_what_a_killed_process_left_half_written_is_cleared(tmp_path: Path):
+def test_partly_written_files_of_a_killed_process_are_cleared(tmp_path: Path):
     with atomic_file(tmp_path / "a.png") as file:
         left = Path(file.name)
         assert is_leftover(left)

@@ -1,4 +1,4 @@
-"""Whether tensors are finite and whether anything is in them."""
+"""Checks for finite and for non-zero tensors."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_one_bad_element_among_many_is_found(place, value, rows):
     assert finite_and_present(values.view(rows, 511).T) == (False, True)
 
 
-def test_what_is_missing_is_finite_and_absent():
+def test_none_and_empty_tensors_count_as_finite_and_absent():
     assert finite_and_present(None) == (True, False)
     assert finite_and_present(torch.zeros(0, 3, requires_grad=True)) == (True, False)
 

@@ -167,7 +167,7 @@ def test_blocks_without_a_finite_view_are_left_out():
 
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
-def test_what_a_view_does_not_touch_counts_as_zero(granularity):
+def test_a_missing_gradient_counts_as_zero(granularity):
     views = make_views(2)
     zero = [views[0], {**views[1], "opacities": torch.zeros(50, 1)}]
     absent = [views[0], {n: g for n, g in views[1].items() if n != "opacities"}]
@@ -315,7 +315,7 @@ def test_elementwise_sees_the_views_that_count():
     assert torch.equal(found["means"], views[1]["means"])
 
 
-def test_accumulated_gradients_are_refused_where_single_views_are_looked_at():
+def test_accumulated_gradients_are_refused_by_operators_that_need_single_views():
     gradients = accumulation(make_views(2))
     assert gradients.views == 2
     with pytest.raises(TypeError, match="separate = True"):
@@ -404,7 +404,7 @@ def test_aggregation_is_what_operators_do_by_default():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.parametrize("bad", [None, "first", "middle", "last", "all"])
-def test_sums_that_are_read_late_are_those_that_are_read_at_once(count, bad):
+def test_deferred_sums_equal_immediate_sums(count, bad):
     """What is left out, what is counted as present, and the sum and the mean that remain."""
     views = make_views(count)
     views[0]["scales"].zero_()
@@ -429,7 +429,7 @@ def test_sums_that_are_read_late_are_those_that_are_read_at_once(count, bad):
                 torch.testing.assert_close(tensor, other, rtol=1e-6, atol=1e-6)
 
 
-def test_sums_that_are_read_late_take_no_more_views_than_were_to_come():
+def test_deferred_sums_refuse_more_views_than_announced():
     late = DeferredSums(BLOCKS, 1)
     late.add(make_views(1)[0])
     with pytest.raises(RuntimeError, match="one view more than the 1"):
@@ -443,7 +443,7 @@ def summed(views):
     return gradients
 
 
-def test_the_gradient_of_one_view_is_not_looked_at_twice_unless_it_was_written_to():
+def test_the_gradient_of_one_view_is_checked_again_only_after_a_write():
     (view,) = make_views(1)
     view["scales"][3, 1] = torch.inf
     gradients = summed([view])
@@ -457,7 +457,7 @@ def test_the_gradient_of_one_view_is_not_looked_at_twice_unless_it_was_written_t
     assert not gradients.is_judged("means", total["means"])
 
 
-def test_sums_are_looked_at_again_for_they_may_overflow():
+def test_sums_of_views_are_checked_again_because_they_may_overflow():
     gradients = summed(make_views(2))
     assert not any(gradients.is_judged(name, g) for name, g in gradients.total(2).items())
     (view,) = make_views(1)

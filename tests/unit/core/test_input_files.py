@@ -53,13 +53,13 @@ def odd(request, tmp_path):
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_what_is_no_file_is_refused_at_once(name, odd):
+def test_parsers_refuse_paths_that_are_not_regular_files(name, odd):
     parse, error = PARSERS[name]
     with pytest.raises(error):
         parse(odd)
 
 
-def test_it_is_none_and_is_not_opened(odd):
+def test_paths_that_are_not_regular_files_are_not_opened(odd):
     assert not is_file(odd)
     with pytest.raises(OSError, match=r"place of a file|too long"):
         open_file(odd)
@@ -72,7 +72,7 @@ def test_no_list_of_views_and_no_mark_of_the_scene_is_read_from_a_pipe(tmp_path)
     assert read_scene_file(tmp_path) is None
 
 
-def test_a_link_is_what_it_stands_for(tmp_path):
+def test_a_symbolic_link_to_a_file_is_read_as_the_file(tmp_path):
     (tmp_path / "blob").write_bytes(b"content")
     (tmp_path / "name").symlink_to("blob")
     assert is_file(tmp_path / "name")
@@ -89,7 +89,7 @@ def test_a_file_beyond_the_largest_is_not_even_read(name, tmp_path):
         parse(path)
 
 
-def test_of_settings_only_the_first_are_read(tmp_path):
+def test_a_huge_settings_file_is_refused_after_its_first_bytes(tmp_path):
     path = tmp_path / "run.yaml"
     with path.open("wb") as file:
         file.write(b"steps: 3\n")

@@ -99,7 +99,7 @@ def occupied_helper():
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
+def test_parallel_does_not_wait_for_a_busy_helper(threads):
     marks = np.zeros(1000, np.int64)
     with occupied_helper():
         jobs.parallel(mark, marks)
@@ -107,7 +107,7 @@ def test_a_helper_that_has_other_things_to_do_is_not_waited_for(threads):
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
-def test_what_was_begun_is_done_at_its_end(threads, count):
+def test_background_work_is_complete_after_end(threads, count):
     marks = np.zeros(count, np.int64)
     begun = jobs.Begun(mark, marks)
     assert threads > 1 or (marks == 1).all()
@@ -117,7 +117,7 @@ def test_what_was_begun_is_done_at_its_end(threads, count):
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_other_work_goes_on_beside_what_was_begun(threads):
+def test_parallel_works_while_background_work_runs(threads):
     enough, marks = threading.Event(), np.zeros(1000, np.int64)
 
     def waits(_numbers):
@@ -131,7 +131,7 @@ def test_other_work_goes_on_beside_what_was_begun(threads):
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_what_was_begun_and_fails_does_so_whenever_its_end_is_asked_for(threads):
+def test_an_error_of_background_work_is_raised_at_every_end(threads):
     def fails(_numbers):
         if threading.current_thread() is not threading.main_thread():
             raise ValueError("of a helper")
@@ -148,7 +148,7 @@ def test_what_was_begun_and_fails_does_so_whenever_its_end_is_asked_for(threads)
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_what_is_left_alone_is_not_worked_on_any_more(threads):
+def test_abandoned_background_work_is_not_continued(threads):
     marks = np.zeros(1000, np.int64)
     with occupied_helper():
         jobs.Begun(mark, marks).leave()
@@ -197,7 +197,7 @@ linux = pytest.mark.skipif(
 
 @linux
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_helpers_run_on_other_cores_than_who_asks_them(threads, monkeypatch):
+def test_helpers_run_on_other_cores_than_their_caller(threads, monkeypatch):
     allowed = os.sched_getaffinity(0)
     jobs._helpers.cache_clear()
     for core in sorted(allowed) * 2:
@@ -213,7 +213,7 @@ def test_helpers_run_on_other_cores_than_who_asks_them(threads, monkeypatch):
 
 
 @linux
-def test_a_thread_that_has_nowhere_else_to_go_stays(monkeypatch):
+def test_a_thread_without_another_allowed_core_is_not_moved(monkeypatch):
     allowed = os.sched_getaffinity(0)
     core = cores.current_core()
     assert core in allowed

@@ -105,7 +105,7 @@ def test_a_damaged_file_counts_as_missing_and_is_written_anew(package, caplog, d
     assert compiled(caplog) == []
 
 
-def test_what_stands_in_the_place_of_a_file_is_survived(package, caplog):
+def test_a_folder_in_place_of_a_cache_file_is_a_warning_only(package, caplog):
     kernel(package)(1)
     (file,) = files(package)
     file.unlink()
@@ -114,7 +114,7 @@ def test_what_stands_in_the_place_of_a_file_is_survived(package, caplog):
     assert caplog.records[-1].levelno == logging.WARNING
 
 
-def test_a_change_of_what_the_kernel_holds_is_noticed_and_the_old_file_goes(package, caplog):
+def test_a_changed_constant_recompiles_the_kernel_and_deletes_the_old_file(package, caplog):
     assert kernel(package)(1) == 2
     old = files(package)
     (package / "numba_kernels" / "constants.py").write_text("STEP = 10\n")
@@ -129,7 +129,7 @@ def blocked(folder: Path) -> Path:
     return folder
 
 
-def test_without_a_place_beside_the_kernel_the_users_cache_is_taken(
+def test_the_cache_of_the_user_is_used_if_the_folder_of_the_kernel_is_read_only(
     package, caplog, monkeypatch, tmp_path
 ):
     blocked(package / "__pycache__")

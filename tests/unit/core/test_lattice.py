@@ -96,7 +96,7 @@ def test_shares_count_cameras():
         )
 
 
-def test_weeding_drops_what_few_see_and_never_what_all_see():
+def test_keep_levels_drops_low_shares_and_never_a_share_of_one():
     grid = lattice(share=0.5)
     shares = torch.tensor([0.0, 0.5, 0.51, 1.0], dtype=torch.float64)
     assert grid.keep_levels(shares).tolist() == [False, False, True, True]

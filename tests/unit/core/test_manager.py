@@ -96,7 +96,7 @@ def test_a_method_that_only_looks_like_a_hook_is_refused():
     assert "did you mean 'crossgrad_step_end'?" in refusal(silent=Unmarked()).todo
 
 
-def test_a_hook_under_another_name_and_a_hook_of_the_future_are_welcome():
+def test_specname_and_optional_hooks_are_accepted():
     class Modern:
         @hookimpl(specname="crossgrad_log")
         def say(self, text):
@@ -185,7 +185,7 @@ def test_a_hook_that_is_not_answered_is_an_error(answer):
     assert "NO_EDIT" in caught.value.todo
 
 
-def test_a_draw_of_nothing_is_no_answer():
+def test_a_sample_result_without_views_is_refused():
     class Sampler:
         @hookimpl
         def crossgrad_sample_views(self, context):
@@ -204,7 +204,7 @@ def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
     assert "yield" in caught.value.todo
 
 
-def test_what_a_hook_raises_is_noted_where_it_was_raised_and_passes_the_wrappers():
+def test_an_error_in_a_hook_names_its_plugin_and_passes_the_wrappers():
     class Failing:
         @hookimpl
         def crossgrad_densify(self, context):

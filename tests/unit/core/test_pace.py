@@ -16,7 +16,7 @@ def ks(plan, total):
 
 
 @pytest.mark.parametrize("text", PLANS)
-def test_a_plan_is_its_text(text):
+def test_a_views_per_step_spec_prints_as_its_text(text):
     plan = ViewsPerStepSpec.parsed(text)
     assert str(plan) == text
     assert plan.setting == (text if ".." in text else int(text))
@@ -43,7 +43,7 @@ def test_a_length_in_views_is_the_most_steps_that_draw_no_more(text, views):
     assert plan.paced(steps + 1).views(steps + 1) > views
 
 
-def test_k_at_the_half():
+def test_k_changes_at_half_of_the_steps():
     pace = ViewsPerStepSpec.parsed("1..2@0.5").paced(10)
     assert [pace.at(step) for step in range(1, 11)] == [1] * 5 + [2] * 5
     assert pace.views(10) == 15 and ViewsPerStepSpec.parsed("1..2@0.5").steps_of(15) == 10
@@ -56,18 +56,18 @@ def test_k_at_the_half():
         *("1..1@0.5", "0..2@0.5", "1..2@0.5..3@0.5", "1..2@0.5..3@0.4", "1@0.5", "1..2@nan"),
     ],
 )
-def test_what_is_no_plan_is_refused(text):
+def test_an_invalid_views_per_step_spec_is_refused(text):
     with pytest.raises(ValueError, match="must "):
         ViewsPerStepSpec.parsed(text)
 
 
 @pytest.mark.parametrize(("step", "start"), [(10, 40), (19, 40), (20, 40), (21, 20), (30, 20)])
-def test_a_change_that_is_ahead_moves_with_the_length(step, start):
+def test_a_coming_change_of_k_moves_with_the_length(step, start):
     plan = ViewsPerStepSpec.parsed("1..2@0.5")
     assert plan.paced(40).moved(plan.paced(80), step) == ViewsPerStep((0, start), (1, 2))
 
 
-def test_a_change_that_would_be_behind_comes_at_once_and_rewrites_no_step():
+def test_a_change_of_k_that_would_be_in_the_past_applies_from_the_current_step():
     plan = ViewsPerStepSpec.parsed("1..2@0.5..3@0.9")
     pace = plan.paced(100)
     moved = pace.moved(plan.paced(50), 40)

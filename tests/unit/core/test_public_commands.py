@@ -27,7 +27,7 @@ def test_each_name_is_there_with_a_docstring(name):
     assert name == "FAILED" or inspect.getdoc(thing)
 
 
-def test_nothing_else_can_be_taken():
+def test_the_public_module_exports_its_documented_names_only():
     defined = {name for name, thing in vars(commands).items()
                if not name.startswith("_") and inspect.isfunction(thing)}  # fmt: skip
     assert defined <= {*commands.__all__, "replace", "import_module"}

@@ -33,19 +33,19 @@ def install(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("slot", "method"), [("readers", "accepts"), ("rasterizers", "speed")])
-def test_each_of_ours_announces_one(slot, method):
+def test_every_bundled_component_has_a_quick_answer(slot, method):
     for name, entry in entries(slot).items():
         assert quick_answer(entry) is not None, name
         assert callable(getattr(load(slot, name), method))
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda", "mps"])
-def test_rasterizers_answer_as_their_classes(device):
+def test_quick_answers_of_rasterizers_agree_with_their_classes(device):
     for name, entry in entries("rasterizers").items():
         assert quick_answer(entry)(device) == load("rasterizers", name).speed(device)
 
 
-def test_a_reader_is_not_imported_to_be_asked(install, tmp_path):
+def test_the_quick_answer_of_a_reader_does_not_import_it(install, tmp_path):
     install(ACCEPTS)
     assert not accepts("made-up", tmp_path)
     (tmp_path / "made-up.txt").touch()
@@ -58,7 +58,7 @@ def test_an_answer_that_fails_leaves_the_reader_out(install, tmp_path, caplog):
     assert "reader made-up left out: RuntimeError: no answer" in caplog.text
 
 
-def test_only_the_package_of_a_component_answers_for_it(install):
+def test_a_quick_answer_of_another_package_is_ignored(install):
     install(ACCEPTS)
     entry = find("readers", "made-up")
     assert quick_answer(entry) is not None

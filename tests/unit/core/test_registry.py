@@ -170,13 +170,13 @@ def test_a_name_that_two_packages_offer_is_refused_with_both(good, install):
     assert "other-made-up 3.0" in error.found
 
 
-def test_a_name_of_crossgrads_own_is_to_be_changed_by_the_other_package(install):
+def test_for_a_name_clash_with_crossgrad_the_other_package_has_to_rename(install):
     install("made-up", {"samplers": {"random": "elsewhere:Good"}})
     error = refusal("samplers", "random")
     assert "rename it in made-up" in error.todo
 
 
-def test_what_comes_from_other_packages_is_said_with_their_versions(good):
+def test_components_of_other_packages_are_listed_with_their_versions(good):
     names = {"groupings": ["good", "radial", "missing"], "samplers": ["random"]}
     assert registry.from_elsewhere(names) == ("from made-up 1.0: grouping good",)
     assert registry.from_elsewhere({"groupings": ["radial"]}) == ()
@@ -226,7 +226,7 @@ def test_an_error_of_many_lines_is_reported_in_one(install):
     assert refusal("observers", "noisy").found == "RuntimeError: first second"
 
 
-def test_a_plugin_may_say_itself_what_is_missing(install):
+def test_a_user_error_raised_at_import_of_a_plugin_is_passed_on(install):
     source = (
         "from crossgrad_core.errors import UserError\n"
         "raise UserError('gpu needs CUDA', todo='install it')"
@@ -260,12 +260,12 @@ def test_methods_that_cannot_be_called_like_those_of_their_slot_are_refused(good
 
 
 @pytest.mark.parametrize("name", ["any", "static", "decorated", "own"])
-def test_methods_that_can_be_called_are_none_of_them(good, name):
+def test_methods_with_a_compatible_signature_are_accepted(good, name):
     assert registry.build("groupings", name, {})
 
 
 @pytest.mark.parametrize("slot", GROUPS)
-def test_our_own_take_what_they_are_called_with(slot):
+def test_all_bundled_components_have_compatible_signatures(slot):
     for name in registry.entries(slot):
         registry.load(slot, name)
 

@@ -67,7 +67,7 @@ def test_gramian_and_remainder_have_twice_the_digits(granularity, dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_so_have_those_of_single_primitives(dtype):
+def test_gramians_of_single_primitives_have_twice_the_digits(dtype):
     views = views_of(4, dtype, seed=1)
     gradients = DenseGradients(views, BLOCKS)
     for row in range(6):
@@ -85,7 +85,7 @@ def test_gradients_whose_squares_leave_float64_keep_their_digits():
     assert abs(found[0] / found[1] - exact[0] / exact[1]) <= 1e-29
 
 
-def test_views_that_do_not_count_have_none():
+def test_views_that_are_left_out_have_zero_rounding_residuals():
     views = views_of(3, torch.float32)
     views[1]["means"][2, 1] = torch.inf
     views[2] = {"scales": views[2]["scales"], "mlp.0": None}

@@ -49,7 +49,7 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
 
 
 @pytest.mark.parametrize("every", range(1, 20))
-def test_what_may_rest_learns_in_one_of_each_n_steps_and_with_all_turns_of_a_sampler(every):
+def test_sparse_updates_come_once_in_n_steps_and_meet_all_turns_of_a_sampler(every):
     learns = np.array([learns_in(step, every) for step in range(1, 100 * every + 1)])
     assert (learns.reshape(100, every).sum(axis=1) == 1).all()
     for turns in (2, 3, 4, 8):
@@ -77,7 +77,7 @@ def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
 
 
 @pytest.mark.parametrize(("step", "until"), [(700, 750), (900, 900), (1000, 1000), (1200, 1000)])
-def test_density_control_ends_where_it_may_and_never_comes_back(step, until):
+def test_density_control_that_has_ended_does_not_start_again(step, until):
     schedule = Schedule.for_run(2000).with_length(Schedule.for_run(1500), step)
     assert schedule.densify_until == until
     again = schedule.with_length(Schedule.for_run(4000), 1300)
@@ -97,7 +97,7 @@ def test_large_gaussians_are_pruned_after_the_first_reset_whatever_the_length(to
     assert not schedule.prunes_large(first) and schedule.prunes_large(first + 1)
 
 
-def test_harmonics_wait_and_then_come_as_many_as_would_be_there():
+def test_sh_bands_wait_and_then_reach_the_degree_of_the_plain_schedule():
     plain = Schedule.for_run(2000)
     waiting = replace(plain, sh_wait=250)
     assert [waiting.sh_degree(step) for step in (0, 100, 249, 250, 299, 300)] == [0, 0, 0, 2, 2, 3]
@@ -108,7 +108,7 @@ def test_harmonics_wait_and_then_come_as_many_as_would_be_there():
 @pytest.mark.parametrize(
     ("step", "wait"), [(100, 900), (899, 900), (950, 950), (999, 999), (1000, 1000), (1500, 1000)]
 )
-def test_harmonics_that_are_drawn_do_not_go_when_the_run_gets_another_length(step, wait):
+def test_active_sh_bands_stay_active_when_the_length_changes(step, wait):
     schedule = replace(Schedule.for_run(2000), sh_wait=1000)
     other = replace(Schedule.for_run(1800), sh_wait=900)
     longer = replace(Schedule.for_run(4000), sh_wait=2000)
@@ -179,7 +179,7 @@ def test_one_view_and_two_have_the_same_events_after_as_many_views(views, densif
 @pytest.mark.parametrize("text", ["1", "2", "3", "1..2@0.5", "4..1@0.2"])
 @pytest.mark.parametrize("steps", [100, 601, 1200, 2500])
 @pytest.mark.parametrize("photos", [1, 24, 112, 3000])
-def test_any_run_has_six_edits_of_a_pass_each_where_it_is_long_enough(text, steps, photos):
+def test_long_enough_runs_have_six_edits_one_pass_apart(text, steps, photos):
     schedule = Schedule.for_run(steps, counting=in_views(text, photos))
     counts = view_counts(schedule)
     assert len(counts) == schedule.edits() >= FEWEST_EDITS
@@ -200,7 +200,7 @@ def test_more_photos_than_edits_have_room_for_leave_the_warm_up_as_it_is(photos)
     assert schedule.edits() == FEWEST_EDITS
 
 
-def test_edits_of_a_curve_begin_with_a_length_and_follow_the_clock_there_and_back():
+def test_edits_for_a_budget_depend_on_the_length_in_both_directions():
     setup = assemble(RunConfig(steps=700, views=1), sample_scene(), "none")
 
     def schedule(views):
@@ -214,7 +214,7 @@ def test_edits_of_a_curve_begin_with_a_length_and_follow_the_clock_there_and_bac
     assert long.with_length(short, 100).min_refinements == 0
 
 
-def test_floors_hold_in_views_where_no_edits_are_asked_for():
+def test_without_min_refinements_the_floors_count_in_views():
     def default(steps, photos=24):
         return Schedule.for_run(
             steps, counting=Counting("views", ViewsPerStepSpec.parsed("2"), photos)
@@ -260,7 +260,7 @@ def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
 
 @pytest.mark.parametrize("text", ["1", "2", "5..1@0.5"])
 @pytest.mark.parametrize("views", [250, 600, 605, 2400])
-def test_edits_of_a_flat_schedule_behind_the_end_of_the_run_do_not_count(text, views):
+def test_edits_of_a_flat_schedule_after_the_end_of_the_run_do_not_count(text, views):
     total = ViewsPerStepSpec.parsed(text).steps_of(views)
     schedule = Schedule.for_run(total, "absolute", in_views(text, schedule_length=1200))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
@@ -268,7 +268,7 @@ def test_edits_of_a_flat_schedule_behind_the_end_of_the_run_do_not_count(text, v
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
-def test_a_flat_schedule_in_steps_has_the_floors_of_before():
+def test_a_flat_schedule_in_steps_has_the_floors_of_a_short_run():
     flat = Schedule.for_run(4000, "absolute", Counting(schedule_length=2000))
     short = Schedule.for_run(2000)
     assert view_counts(flat) == view_counts(short) == [600, 700, 800, 900]
@@ -303,7 +303,7 @@ def test_a_run_whose_length_follows_the_clock_keeps_its_edits(text, planned, act
 
 @pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
 @pytest.mark.parametrize("seed", range(20))
-def test_any_lengths_in_turn_keep_what_was_and_what_is_ahead(text, seed):
+def test_repeated_changes_of_length_keep_past_events_and_reschedule_later_ones(text, seed):
     rng, counting = np.random.default_rng(seed), in_views(text, photos=9)
     schedule, step = Schedule.for_run(int(rng.integers(1, 1000)), counting=counting), 0
     while step + 1 < schedule.total:
@@ -344,6 +344,6 @@ def test_times_that_the_user_set_stay_whatever_the_length():
         ({"recipe": {"name": "published"}, "schedule_unit": "views"}, "views"),
     ],
 )
-def test_published_rules_count_steps_and_all_others_views(settings, unit):
+def test_the_published_recipe_counts_steps_and_other_recipes_count_views(settings, unit):
     config, *_ = with_decisions(RunConfig(**settings), sample_scene())
     assert config.schedule_unit == unit

@@ -77,7 +77,7 @@ def _sixteen(a, b, target):
     return bits(smaller)
 
 
-def test_triples_come_apart_and_together_again():
+def test_vectors_of_triples_are_split_and_joined_again():
     source = np.arange(3 * LANES + 1, dtype=np.float32)
     target = np.full(3 * LANES + 3, -1, np.float32)
     _turned(source, target)
@@ -86,7 +86,7 @@ def test_triples_come_apart_and_together_again():
     assert target[[0, 1, -1]].tolist() == [-1, -1, -1]
 
 
-def test_fours_come_apart():
+def test_vectors_of_four_values_are_split():
     source = np.arange(4 * LANES + 1, dtype=np.float32)
     target = np.full(4 * LANES + 1, -1, np.float32)
     _apart(source, target)

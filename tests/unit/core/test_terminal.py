@@ -1,4 +1,4 @@
-"""What counts as a terminal that shows a progress bar."""
+"""Detection of a terminal that can show a progress bar."""
 
 import io
 import os

@@ -32,7 +32,7 @@ def test_sets_both_libraries(n):
 
 
 @pytest.mark.parametrize("n", [-1, 0, 10**6])
-def test_refuses_what_cannot_be(n):
+def test_an_impossible_number_of_threads_is_refused(n):
     most = numba.config.NUMBA_NUM_THREADS
     with pytest.raises(UserError, match="number of threads out of range") as error:
         configure_threads(n)

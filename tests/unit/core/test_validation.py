@@ -66,7 +66,7 @@ def test_an_error_of_the_whole_names_the_whole():
 
 
 @pytest.mark.parametrize("values", [{"": 3}, 3])
-def test_what_has_no_name_is_placed_too(values):
+def test_a_validation_error_without_a_field_name_has_a_location(values):
     assert explained(Outer, values).where == "a run"
 
 

@@ -39,7 +39,7 @@ def refused(text: str, *words: str) -> None:
 
 
 @given(st.dictionaries(WORDS, VALUES, max_size=4))
-def test_what_is_written_is_read_back(settings):
+def test_yaml_values_survive_a_round_trip(settings):
     found = read_yaml(write_yaml(settings))
     assert found == settings
     assert repr(found) == repr(settings)  # 1 is not 1.0, and -0.0 is not 0.0
@@ -83,7 +83,7 @@ def test_an_alias_bomb_is_refused_at_once():
         ("a: \x07", ""),
     ],
 )
-def test_what_no_setting_can_be_is_refused_with_its_place(text, words):
+def test_yaml_values_that_are_not_settings_are_refused_with_their_place(text, words):
     refused(text, words)
 
 

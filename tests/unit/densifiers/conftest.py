@@ -1,4 +1,4 @@
-"""What the tests of densifiers share."""
+"""Fixtures that the tests of densifiers share."""
 
 import pytest
 

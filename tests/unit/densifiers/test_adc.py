@@ -117,7 +117,7 @@ def test_children_are_drawn_from_their_parent():
     assert edit.source.tolist()[-2:] == [1, 1]
 
 
-def test_faint_ones_are_pruned_and_large_ones_only_after_the_first_reset():
+def test_transparent_gaussians_are_pruned_and_large_ones_only_after_a_reset():
     params = parameters((0.005, 0.2, 0.005, 0.2), (0.001, 0.5, 0.5, 0.5))
     view = record([STILL] * 4, [1] * 4)
     early, _ = AdaptiveDensityControl().densify(
@@ -130,7 +130,7 @@ def test_faint_ones_are_pruned_and_large_ones_only_after_the_first_reset():
     assert late.source.tolist() == [2]
 
 
-def test_no_room_takes_the_strongest_and_says_how_many_were_held_back():
+def test_with_little_room_the_largest_gradients_grow_and_the_rest_is_counted():
     view = record([[1e-5, 0], [3e-5, 0], [2e-5, 0], STILL], [1] * 4)
     ctx = context([view], step=600, params=parameters((0.005,) * 4), room=1)
     edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
@@ -149,7 +149,7 @@ def test_reset_caps_opacity_and_forgets_its_moments():
     assert not edit.values["opacities"].keep_moments
 
 
-def test_a_reset_that_comes_with_an_edit_caps_what_is_then_drawn():
+def test_a_reset_with_an_edit_caps_the_opacity_rendered_after_the_edit():
     """The filter of backbone mip depends on where the children are."""
     backbone = MipSplatting()
     rng = np.random.default_rng(0)

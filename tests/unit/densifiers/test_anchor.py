@@ -279,7 +279,7 @@ def test_a_level_is_skipped_while_none_before_it_has_grown():
 
 
 @pytest.mark.parametrize("room", [0, 1, 7])
-def test_short_room_takes_the_largest_gradients(room):
+def test_with_little_room_the_largest_gradients_grow(room):
     parameters = model()
     state = state_of(parameters)
     whole = slow_growth(parameters, state, np.random.default_rng(0))
@@ -302,7 +302,7 @@ def test_short_room_takes_the_largest_gradients(room):
     assert sorted(found, reverse=True) == pytest.approx(strengths[:room])
 
 
-def test_transparent_anchors_go_once_they_were_seen_often():
+def test_transparent_anchors_are_pruned_after_enough_views():
     parameters = model()
     count = len(parameters["anchors"])
     state = state_of(parameters)
@@ -342,7 +342,7 @@ def test_an_anchor_that_never_draws_is_removed():
 
 
 @pytest.mark.parametrize(("total", "renders", "views"), [(30_000, 40, 80), (6000, 20, 40)])
-def test_what_was_judged_starts_anew_and_the_rest_goes_on(total, renders, views):
+def test_statistics_of_judged_offsets_restart_and_the_others_continue(total, renders, views):
     parameters = model()
     state = state_of(parameters)
     schedule = AnchorControl().window(Schedule.for_run(total))
@@ -418,7 +418,7 @@ def test_equal_cells_have_equal_numbers_and_no_others():
     assert sorted(set(found)) == list(range(len(names)))
 
 
-def test_free_cells_are_those_that_nobody_holds():
+def test_free_cells_are_the_unoccupied_cells_without_duplicates():
     wanted = torch.tensor([[1, 0, 0], [0, 0, 0], [1, 0, 0], [2, 5, 5], [0, 1, 0]])
     taken = torch.tensor([[0, 0, 0], [2, 5, 5], [9, 9, 9]])
     first, place = free_cells(wanted, taken)

@@ -120,7 +120,7 @@ def test_statistics_are_means_of_what_the_pixels_give():
             assert totals["planes"][i, plane] == pytest.approx(sum(sides), rel=1e-4, abs=1e-9)
 
 
-def test_consistent_pixels_give_nothing_and_opposite_ones_all():
+def test_equal_pixel_gradients_have_no_inconsistency_and_opposite_ones_do():
     same = np.array([[0.5, 1e-5, 0.0], [-0.5, 3e-5, 0.0]])
     opposite = np.array([[0.5, 1e-5, 0.0], [-0.5, -3e-5, 0.0]])
     nothing = np.zeros((0, 3))
@@ -175,7 +175,7 @@ def parting(places, size=1e-4):
     return np.array([[t, size if t < places else -size, 1e-9] for t in offsets])
 
 
-def test_children_lie_side_by_side_where_the_directions_part():
+def test_children_are_placed_on_both_sides_of_the_splitting_plane():
     params = parameters(3, opacity=0.7)
     view = record([parting(-1.0), parting(0.0), parting(1.0)])
     edit, state = DirectionalConsistency().densify(context([view], params), PluginState())
@@ -239,7 +239,7 @@ def test_extreme_parents_have_finite_children(logit, log_scale):
     assert edit.source.shape[0] == 4
 
 
-def test_room_takes_those_farthest_above_their_threshold():
+def test_with_little_room_the_largest_excess_over_the_threshold_grows():
     view = record([parting(0.0, size) for size in (1e-4, 3e-4, 2e-4)])
     edit, _ = DirectionalConsistency().densify(
         context([view], parameters(3), room=1), PluginState()

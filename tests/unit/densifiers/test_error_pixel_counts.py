@@ -181,7 +181,7 @@ def test_the_running_count_is_that_of_the_views_that_were_rendered(regimes):
     assert seen.rank.numpy() == pytest.approx(expected[..., 1] / visits**0.75, rel=1e-6)
 
 
-def test_only_a_share_of_the_steps_counts_but_always_that_of_the_edit():
+def test_counting_uses_a_share_of_the_steps_and_always_the_step_of_the_edit():
     ctx = context(step=601, rng=np.random.default_rng(0))
     record = recorded(ctx, 0)
     method = MultiViewDensityControl(count="running", share=0.25)
@@ -228,7 +228,7 @@ counts = st.integers(0, 40)
 
 @given(data=st.data(), rows=st.integers(1, 6), regimes=st.integers(1, 3))
 @settings(max_examples=60)
-def test_importance_against_its_formulas(data, rows, regimes):
+def test_the_multiview_score_agrees_with_its_formulas(data, rows, regimes):
     shape = (rows, regimes)
 
     def draw(values):

@@ -143,7 +143,7 @@ def test_the_strongest_are_split_where_room_is_short():
     assert len(new["means"]) == 4
 
 
-def test_what_may_not_grow_does_not():
+def test_gaussians_outside_may_grow_do_not_grow():
     params = parameters()
     ctx = replace(context(params), may_grow=torch.tensor([True, False, False]))
     edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
@@ -162,5 +162,5 @@ def test_what_may_not_grow_does_not():
         (MultiViewDensityControl(division="axis"), False),
     ],
 )
-def test_the_size_is_named_where_it_decides_nothing(densifier, idle):
+def test_split_scale_is_reported_as_unused_if_it_has_no_effect(densifier, idle):
     assert ("split_scale" in densifier.unused_options(None)) == idle

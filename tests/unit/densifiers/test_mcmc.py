@@ -146,7 +146,7 @@ def test_extreme_opacities_give_finite_values(logit):
     assert new["means"].shape[0] == 60
 
 
-def test_nothing_is_done_where_all_are_dead_or_it_is_not_time():
+def test_no_edit_if_all_gaussians_are_dead_or_at_other_steps():
     params = parameters([0.5] * 30)
     with torch.no_grad():
         params["opacities"][:] = -1e4
@@ -193,7 +193,7 @@ def test_noise_is_the_formula_row_by_row():
         assert found == pytest.approx(shift, rel=1e-4, abs=2.0**-22)
 
 
-def test_noise_that_no_float_would_show_is_not_drawn():
+def test_noise_below_float_rounding_is_not_sampled():
     params = parameters([0.9, 0.01, 0.5])
     with torch.no_grad():
         params["scales"][:] = log(0.01)
@@ -301,7 +301,7 @@ def test_a_backbone_without_opacities_is_refused_with_the_reason(monkeypatch):
     assert "densifier mcmc edits the tensors opacities" in refused.value.found
 
 
-def test_edits_change_nothing_they_are_given():
+def test_densify_does_not_change_its_inputs():
     params = parameters(mixed())
     copies = {name: tensor.detach().clone() for name, tensor in params.items()}
     edit, _ = MarkovChainMonteCarlo().densify(densify_context(params), EMPTY_STATE)

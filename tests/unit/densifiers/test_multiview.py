@@ -119,7 +119,7 @@ FLOATS = st.sampled_from([0.0, 1e-4, 1.9e-4, 2e-4, 1e-3, 1.2e-3, 5e-3])
 
 @given(data=st.data(), rows=st.integers(1, 8))
 @settings(max_examples=60, deadline=None)
-def test_what_grows_against_the_published_rule(data, rows):
+def test_growth_agrees_with_the_published_rule(data, rows):
     lists = lambda values: data.draw(st.lists(values, min_size=rows, max_size=rows))  # noqa: E731
     scales = lists(st.sampled_from([1e-4, 9.9e-4, 1.1e-3, 0.05]))
     marked, g, ga = lists(st.integers(40, 80)), lists(FLOATS), lists(FLOATS)
@@ -147,7 +147,7 @@ def test_where_room_is_short_the_largest_error_per_visit_goes_first():
     assert edit.counts["held_back"] == 2
 
 
-def test_half_of_the_usual_candidates_goes_and_the_rest_is_capped():
+def test_half_of_the_pruning_candidates_is_removed_and_the_rest_capped():
     params = few([1e-4] * 7, [0.001, 0.002, 0.003, 0.004, 0.9, 0.79, 0.81])
     state = planted([0] * 7, [0.0] * 7, [0.0] * 7, error=[0.0, 1.0, 0.9999, 0.0, 0.0, 0.0, 0.0])
     edit, _ = Planted().densify(context(params=params), state)
@@ -303,7 +303,7 @@ def counted(method, ctx):
 
 
 @pytest.mark.parametrize("count", ["render", "running"])
-def test_what_errs_grows_and_what_is_right_does_not(count):
+def test_gaussians_with_wrong_pixels_grow_and_others_do_not(count):
     """Photos that are wrong where one Gaussian is blended: it grows, what never meets it not."""
     backbone = Vanilla()
     params = backbone.create(sample_scene(), np.random.default_rng(0))

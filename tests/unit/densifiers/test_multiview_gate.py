@@ -60,7 +60,7 @@ def test_nothing_grows_behind_a_closed_gate_and_much_behind_an_open_one(backbone
 
 
 @pytest.mark.parametrize("count", ["render", "running"])
-def test_of_what_the_other_one_asks_for_grows_what_several_views_ask_for(count):
+def test_the_gate_passes_growth_that_several_views_request(count):
     other = AdaptiveDensityControl(grad_threshold=1e-9)
     run = DensifierRun.of(MultiViewGate(of=other, count=count, share=1.0))
     for step in range(596, 600):
@@ -108,7 +108,7 @@ def test_an_anchor_grows_only_where_it_may():
         assert torch.equal(state.per_primitive[name], rows)
 
 
-def test_what_may_not_grow_asks_for_nothing():
+def test_a_growth_request_excludes_rows_that_may_not_grow():
     request = GrowthRequest(torch.ones(3, 2), torch.ones(3, 2, dtype=torch.bool))
     assert request.among(None) is request
     allowed = request.among(torch.tensor([True, False, True])).eligible
@@ -116,7 +116,7 @@ def test_what_may_not_grow_asks_for_nothing():
 
 
 @pytest.mark.parametrize("name", ["mcmc", "none", "multiview", "multiview-gate"])
-def test_what_can_only_stand_alone_is_refused(name):
+def test_a_densifier_that_can_only_stand_alone_is_refused_in_the_gate(name):
     with pytest.raises(UserError) as refused:
         build("densifiers", "multiview-gate", {"of": name})
     assert "can only stand alone" in str(refused.value)
@@ -125,12 +125,12 @@ def test_what_can_only_stand_alone_is_refused(name):
 @pytest.mark.parametrize(
     "of", ["adx", {"name": "adc", "grad_threshold": -1}, {"grad_threshold": 1}, 3]
 )
-def test_what_is_no_densifier_is_refused(of):
+def test_a_value_that_is_not_a_densifier_is_refused_in_the_gate(of):
     with pytest.raises(UserError):
         build("densifiers", "multiview-gate", {"of": of})
 
 
-def test_the_other_one_s_options_are_those_of_the_run():
+def test_the_options_of_the_inner_densifier_are_kept_in_the_configuration():
     setup, _, _ = run_of(SCAFFOLD, {"name": "anchor", "levels": 2}, steps=1)
     choice = resolved(setup).densifier
     assert choice.options["of"] == {"name": "anchor", "levels": 2}

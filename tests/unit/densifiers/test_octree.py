@@ -115,7 +115,7 @@ def test_without_eligible_offsets_nothing_grows():
     assert len(grown(parameters(rng), asked, THRESHOLDS, NEAR_CAMERA)) == 0
 
 
-def test_candidates_that_too_few_cameras_see_are_weeded_out():
+def test_candidates_that_too_few_cameras_see_do_not_grow():
     rng = np.random.default_rng(1)
     tensors, asked = parameters(rng, 40, share=0.5), request(rng, 40)
     # L* of level 1 is reached within 4 * 2^-0.5 = 2.83, that of level 2 within 1.41.
@@ -126,7 +126,7 @@ def test_candidates_that_too_few_cameras_see_are_weeded_out():
     assert grown(tensors, asked, THRESHOLDS, close).further["levels"].any()
 
 
-def test_an_offset_that_flew_away_grows_nothing():
+def test_an_offset_far_outside_the_scene_grows_nothing():
     tensors = parameters(np.random.default_rng(2), 2)
     tensors["offsets"][0] = 1e38
     tensors["scales"][1] = 200.0
@@ -134,7 +134,7 @@ def test_an_offset_that_flew_away_grows_nothing():
     assert len(grown(tensors, asked, THRESHOLDS, NEAR_CAMERA)) == 0
 
 
-def test_extra_levels_ask_for_a_quarter_of_the_own_threshold_on_average():
+def test_extra_levels_average_over_a_quarter_of_the_threshold_of_the_level():
     rng = np.random.default_rng(3)
     tensors, asked = parameters(rng, 50), request(rng, 50)
     asked.eligible[:5] = False

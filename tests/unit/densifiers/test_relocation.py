@@ -48,7 +48,7 @@ def test_vanishing_opacities_keep_their_scales(opacity):
 
 @pytest.mark.parametrize("copies", [2, 5, 51])
 @pytest.mark.parametrize("opacity", [0.05, 0.6, 0.99])
-def test_the_copies_together_hide_as_much_as_the_one(opacity, copies):
+def test_relocated_copies_together_have_the_opacity_of_the_original(opacity, copies):
     # The scales are chosen so that the opacity along a line through the centre keeps its integral.
     n = torch.tensor([copies])
     each, scale = (f(numbers(opacity), n).item() for f in (shared_opacity, shared_scale))

@@ -1,4 +1,4 @@
-"""What density control does does not depend on the number of threads."""
+"""Density control does not depend on the number of threads."""
 
 import pytest
 import torch

@@ -52,7 +52,7 @@ def few_are_many(monkeypatch):
 
 
 @pytest.mark.parametrize("case", USUAL)
-def test_where_pixels_pull_is_asked_in_short_runs_of_plain_gaussians(case):
+def test_absgrad_is_the_default_in_short_runs_of_plain_gaussians(case):
     settings, expected = USUAL[case]
     given = {"steps": 2000, "plan": "off", **settings}
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
@@ -76,7 +76,7 @@ def default_of(**settings):
 
 
 @pytest.mark.parametrize("name", ["auto", "numba"])
-def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, monkeypatch):
+def test_without_absolute_gradients_the_default_densifier_is_adc(name, monkeypatch):
     given = {"steps": 2000, "rasterizer": {"name": name}}
     assert default_of(**given) == "absgrad"
     numba = load(Rasterizer, "numba")
@@ -89,5 +89,5 @@ def test_a_rasterizer_that_cannot_say_it_stays_and_gets_the_published_one(name, 
     )
 
 
-def test_a_gpu_has_the_published_one_also_where_there_is_none():
+def test_the_default_densifier_on_cuda_is_adc():
     assert default_of(steps=2000, device="cuda") == "adc"

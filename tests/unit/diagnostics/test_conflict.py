@@ -14,7 +14,7 @@ def gramians(*blocks):
     return np.stack([np.array(rows) @ np.array(rows).T for rows in blocks])
 
 
-def test_both_readings_of_the_conflict_rate():
+def test_the_conflict_rate_is_given_in_both_definitions():
     found = conflict(
         gramians(
             [[1.0], [1.0], [-1.0], [2.0]],
@@ -103,7 +103,7 @@ def test_the_exponent_s_interval_covers_under_unequal_scatter():
         pytest.param([0.0] * 5, [1.0, 2.0, 3.0, 4.0, 5.0], id="zero gradients"),
     ],
 )
-def test_no_line_no_exponent(squared, distances):
+def test_without_a_fitted_line_the_exponent_is_nan(squared, distances):
     found = distance_exponent(np.array(squared), np.array(distances))
     assert np.isnan([found.value, found.interval.low, found.interval.high]).all()
 

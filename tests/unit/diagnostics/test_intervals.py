@@ -39,7 +39,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(kind, dimension, sizes, r
     assert (held > 0.95 - SLACK).all()
 
 
-def test_intervals_are_not_idle():
+def test_intervals_are_not_too_wide():
     # An interval that held everything would pass the test above.
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(24, 300))
@@ -150,7 +150,7 @@ def test_estimates_lie_inside_where_they_can(seed):
     assert found.between.low >= 0.0
 
 
-def test_a_wide_gap_is_told_from_none():
+def test_the_interval_excludes_zero_for_a_wide_gap_only():
     rows, near = sample(shift=3.0)
     assert ends(rows, near)[1, 0] > 0.0
     rows, near = sample(shift=0.0)
@@ -169,7 +169,7 @@ def test_an_estimate_far_below_zero_has_no_interval():
     assert found.within.low > 0.0
 
 
-def test_probing_every_camera_leaves_no_doubt():
+def test_probing_every_camera_gives_intervals_of_width_zero():
     rows, near = sample()
     groups = Groups(near, cameras=(9, 7))
     figures = variance_split(rows @ rows.T, groups)

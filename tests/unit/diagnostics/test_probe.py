@@ -194,7 +194,7 @@ def test_the_table_is_the_same_each_time(model):
     assert str(rows()) == str(rows())
 
 
-def test_one_probe_is_read_by_every_grouping(model):
+def test_one_probe_is_evaluated_for_every_grouping(model):
     measurement = measure(model, plan().views, np.random.default_rng(0))
     rows = grouping_rows(model.scene, measurement, 0)
     read = {row["grouping"] for row in rows if not row["note"]}

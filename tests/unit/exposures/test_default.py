@@ -1,4 +1,4 @@
-"""Which exposure a run has that names none."""
+"""The default exposure of a run."""
 
 import pytest
 from support.grey_scene import grey_scene
@@ -26,7 +26,7 @@ def test_a_run_decides_by_the_photos_and_says_why(lights, name):
 @pytest.mark.parametrize(
     "given", [{"exposure": {"name": "none"}}, {"recipe": {"name": "published"}}], ids=str
 )
-def test_what_is_named_and_published_rules_have_no_gains(given):
+def test_no_gain_is_chosen_for_a_named_exposure_or_the_published_recipe(given):
     assert taken(DIFFERENT, **given)[0] == "none"
 
 

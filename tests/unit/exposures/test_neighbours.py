@@ -72,7 +72,7 @@ def test_errors_are_those_of_photos_that_were_left_out(seed, count):
     assert Neighbours(views).errors(values) == pytest.approx(wanted)
 
 
-def test_neighbours_are_asked_only_where_they_tell_more():
+def test_neighbours_predict_exposure_only_if_they_predict_better_than_regimes():
     rng = np.random.default_rng(0)
     # Of two kinds of photos that stand apart each tells of its own kind, whatever the regimes are.
     views = [
@@ -91,7 +91,7 @@ def test_neighbours_are_asked_only_where_they_tell_more():
     ) == pytest.approx(float(drawn.mean()))
 
 
-def test_photos_that_nothing_tells_of_start_as_their_neighbours(monkeypatch):
+def test_photos_without_evidence_start_at_the_exposure_of_their_neighbours(monkeypatch):
     rng = np.random.default_rng(0)
     kinds = np.arange(20) % 2
     views = [

@@ -60,7 +60,7 @@ def test_a_start_differs_by_the_stops_that_were_found(model, stops, monkeypatch)
 @pytest.mark.parametrize("model", MODELS, ids=NAMES)
 @settings(max_examples=40, deadline=None)
 @given(STOPS, st.floats(-6, 6))
-def test_what_photos_differ_by_stays_when_the_mean_is_made_neutral(model, stops, level):
+def test_a_neutral_mean_keeps_the_differences_between_photos(model, stops, level):
     values = model.of_stops(torch.tensor(stops).double() + level)
     found = model.project({"x": values})["x"]
     assert torch.allclose(found.double().mean(dim=0), neutral(model), atol=ROUNDING)

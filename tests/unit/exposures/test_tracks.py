@@ -73,7 +73,7 @@ def judged(seen, photos=NEAR + FAR):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("joining", [16, 40, 200])
-def test_groups_of_other_exposure_are_told_apart_by_few_points_that_join_them(joining, seed):
+def test_groups_of_different_exposure_are_found_with_few_shared_points(joining, seed):
     gains = judged(two_groups(joining, offset=1.49, seed=seed))
     assert gains.gains[:NEAR].mean() - gains.gains[NEAR:].mean() == pytest.approx(1.49, abs=0.4)
     assert gains.differ
@@ -161,7 +161,7 @@ def test_parts_that_share_no_point_have_a_mean_of_zero_each():
     assert gains[3] - gains[2] == pytest.approx(-0.5, abs=0.05)
 
 
-def test_without_observations_there_is_nothing_to_tell():
+def test_without_observations_all_gains_are_zero():
     none = np.zeros(0, dtype=np.int64)
     fit = fitted(Observations(none, none, np.zeros(0), none), 3)
     assert fit.gains.tolist() == [0.0] * 3
@@ -209,7 +209,7 @@ def test_the_rule_asks_for_both_a_spread_and_a_reduction():
     assert not weak.differ
 
 
-def test_of_many_photos_some_neighbours_decide():
+def test_for_many_photos_a_subset_decides_the_gains():
     count = 5 * MOST_DECIDING // 2
     lights = np.tile([0.1, 0.1, 0.4, 0.4], count)[:count]
     # Each photo shows points of its own and those of its neighbours.
@@ -254,7 +254,7 @@ def test_auto_takes_a_gain_where_the_rule_says_so_and_says_why():
     assert "no SfM tracks" in blind.notes[0]
 
 
-def test_no_exposure_names_the_option_where_it_would_help():
+def test_exposure_none_suggests_the_gain_if_photos_differ():
     (remark,) = NoExposure().messages(grey_scene([0.1, 0.2, 0.4]), {})
     assert "--exposure gain" in remark
     assert NoExposure().messages(grey_scene([0.2, 0.2, 0.2]), {}) == ()

@@ -45,5 +45,5 @@ def test_east_north_up_is_that_of_proj(origin, steps):
 
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 0.0), (5e5, 5e6, 100.0), (np.nan, 0.0, 6.4e6)])
-def test_what_is_not_near_the_surface_is_no_place(point):
+def test_a_point_far_from_the_surface_has_no_geographic_place(point):
     assert place_at(np.array(point)) is None

@@ -59,7 +59,7 @@ def test_with_errors_it_is_the_least_squares_one(seed):
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("count", [8, 12, 60])
-def test_wrong_ones_are_left_out(seed, count):
+def test_outliers_are_left_out_of_the_fit(seed, count):
     _, points, measured, rng = case(seed, count, noise=0.01)
     frame = case(seed, count)[0]
     wrong = rng.permutation(count)[: count // 4]
@@ -94,7 +94,7 @@ def test_without_wrong_ones_none_is_left_out(seed):
 
 
 @pytest.mark.parametrize("count", [3, 6, 40])
-def test_points_in_one_line_do_not_tell(count):
+def test_points_on_one_line_give_no_similarity(count):
     along = np.linspace(0.0, 1.0, count)[:, None]
     points = along * [1.0, 2.0, 3.0]
     measured = along * [300.0, -100.0, 0.0]
@@ -118,7 +118,7 @@ def test_fewer_than_three_do_not_tell(count):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_error_of_the_turn_is_what_repetitions_have(seed):
+def test_the_estimated_rotation_error_agrees_with_repeated_fits(seed):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(12, 3)) * [10.0, 1.0, 0.2]
     turns, told = [], []

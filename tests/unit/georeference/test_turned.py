@@ -181,7 +181,7 @@ def test_left_handed_axes_are_refused():
 
 
 @pytest.mark.parametrize("code", ["+init=/etc/hostname:1", "file.wkt", "epsg:", "epsg:٣٢٦٣٣", ""])
-def test_nothing_but_a_code_is_given_to_proj(code):
+def test_only_codes_of_coordinate_systems_are_passed_to_proj(code):
     with pytest.raises(UserError, match="PROJ cannot compute"):
         Projection.of(code, "here")
 

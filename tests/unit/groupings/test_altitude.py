@@ -1,4 +1,4 @@
-"""Which way is up, and where heights are cut."""
+"""The up axis and the threshold between heights."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def upright(axis):
 
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)])
-def test_upright_cameras_tell_which_way_is_up(axis):
+def test_the_up_axis_is_found_from_upright_cameras(axis):
     scene = upright(axis)
     found, source = upward(scene)
     assert np.allclose(found, axis)

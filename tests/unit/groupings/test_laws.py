@@ -1,4 +1,4 @@
-"""What every grouping promises, and what each does on a scene made for it."""
+"""Properties of every grouping, and the result of each grouping on a scene made for it."""
 
 from dataclasses import replace
 

@@ -23,7 +23,7 @@ def test_names_with_commas_and_the_line_ends_of_windows(tmp_path):
         (b"\xff\xfea\0", "cannot be read"),
     ],
 )
-def test_what_is_no_list_of_labels_is_one_error(tmp_path, content, words):
+def test_an_invalid_list_of_labels_is_one_error(tmp_path, content, words):
     path = tmp_path / "labels.csv"
     path.write_bytes(content)
     with pytest.raises(UserError, match=words) as caught:

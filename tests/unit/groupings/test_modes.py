@@ -93,7 +93,7 @@ def test_small_samples_of_one_mode_are_noted():
 
 
 @pytest.mark.parametrize("heights", [[1.0, 2.0, 3.0], [1.0] * 12])
-def test_where_nothing_can_be_said_nothing_is(heights):
+def test_altitude_notes_are_empty_without_enough_evidence(heights):
     assert notes("altitude", at_heights(heights)) == ()
 
 

@@ -185,7 +185,7 @@ def test_a_missing_file_is_a_user_error(tmp_path):
 
 @pytest.mark.parametrize("size", [1, 2, 5, 8])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_cut_parts_groups_that_share_nothing(size, seed):
+def test_the_spectral_cut_separates_groups_that_share_nothing(size, seed):
     # The largest eigenvalue stands there twice: any vector of its plane comes out of a solver.
     sides = np.repeat([1.0, -1.0], size)
     order = np.random.default_rng(seed).permutation(2 * size)

@@ -296,7 +296,7 @@ def test_a_camera_on_the_ground_of_another_photo_has_no_margin():
     assert margins[0] == 0 < margins[1]
 
 
-def test_what_is_full_stays_as_it_is():
+def test_a_scene_without_gaps_is_not_filled():
     full = some_ground(4000, (-6.0, 6.0), (-5.0, 9.0))
     scene = ground_scene(full)
     assert Filled(margin=0.0).more_points(scene) is None
@@ -345,7 +345,7 @@ def test_the_margin_goes_on_behind_what_another_photo_sees_before_it(away, hides
     assert (apart < 1e-9).all() if hides else (apart > 1e-9).all()
 
 
-def test_photos_that_say_nothing_are_left_aside():
+def test_photos_without_enough_points_or_pixels_are_left_out():
     scene = ground_scene(LEFT, seen=np.arange(7))
     assert Filled().more_points(scene) is None
     assert "2 photos with fewer than 8 points were left aside" in Filled().messages(scene)[0]
@@ -367,7 +367,7 @@ def test_no_more_photos_are_looked_at_than_asked_for():
     assert len(set(looked_at)) == 3
 
 
-def test_gaussians_get_the_sizes_and_opacities_and_the_others_stay_as_they_were():
+def test_added_gaussians_get_their_size_and_opacity_and_the_others_do_not_change():
     scene = ground_scene(LEFT)
     begun = Filled(opacity=0.7).begun(scene)
     rng = np.random.default_rng(0)

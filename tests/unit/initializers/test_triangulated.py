@@ -48,7 +48,7 @@ def test_points_lie_among_those_of_colmap_and_have_their_colour(scene, bare):
     assert f"{len(more.positions)} points triangulated" in FEW.messages(bare)[0]
 
 
-def test_it_answers_alike(bare):
+def test_triangulation_is_repeatable(bare):
     ours, again = FEW.more_points(bare), FEW.more_points(replace(bare))
     assert ours.positions.tobytes() == again.positions.tobytes()
 
@@ -58,7 +58,7 @@ def test_a_scene_with_points_starts_from_those(scene):
     assert "has points" in Triangulated().messages(scene)[0]
 
 
-def test_without_points_the_start_or_the_user_has_to_give_some(bare):
+def test_a_scene_without_points_is_refused_with_the_options_that_add_points(bare):
     config = RunConfig(scene="somewhere", steps=2, threads=1, plan="off")
     with pytest.raises(UserError, match="no SfM points") as caught:
         assemble(config, bare, "colmap")

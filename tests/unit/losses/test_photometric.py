@@ -120,7 +120,7 @@ def test_no_kept_pixel_gives_zero(loss):
 
 
 @pytest.mark.parametrize("loss", [photometric_loss, l1_ssim_loss])
-def test_masked_pixels_neither_give_nor_take(loss):
+def test_masked_pixels_change_neither_the_loss_nor_its_gradient(loss):
     kept = block_mask((H, W))
     spoiled = torch.where(kept.unsqueeze(-1), BLURRED, torch.nan)
     clean = loss_and_gradient(loss, BLURRED, NATURAL, kept)
@@ -237,7 +237,7 @@ def test_wrong_shapes_are_refused(image, target, mask):
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("name", CASES)
-def test_the_gradient_written_out_is_autograds(name, masked):
+def test_the_analytic_gradient_agrees_with_autograd(name, masked):
     """What a GPU computes: in float64 to its rounding, in float32 as near as autograd in it."""
     image, target, _ = CASES[name]
     mask = random_mask(image.shape[:2]) if masked else None
@@ -290,7 +290,7 @@ def test_the_loss_of_a_gpu_hands_its_gradient_on():
     torch.testing.assert_close(found, -3.0 * expected)
 
 
-def test_the_window_serves_gradients_whoever_asked_first():
+def test_a_window_cached_in_inference_mode_can_be_used_with_gradients():
     _window_for.cache_clear()
     with torch.inference_mode():
         ssim_map(BLURRED.double(), NATURAL.double())

@@ -37,7 +37,7 @@ def assembled(regimes, names=()):
     ],
     ids="+".join,
 )
-def test_of_metrics_by_default_those_stay_that_have_columns_of_their_own(regimes, left_out):
+def test_default_metrics_with_a_duplicate_column_are_left_out(regimes, left_out):
     setup = assembled(regimes)
     columns = columns_of(setup)
     assert len(set(columns)) == len(columns)

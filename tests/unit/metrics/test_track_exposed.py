@@ -74,7 +74,7 @@ def test_too_dark_and_cut_off_observations_do_not_count():
     assert TrackExposedPSNR().measure(compared(drawn, torch.ones_like(drawn))) is None
 
 
-def test_a_black_render_has_the_figure_that_it_has():
+def test_a_black_render_keeps_its_plain_psnr():
     photo = smooth()
     pair = compared(torch.zeros_like(photo), photo)
     assert TrackExposedPSNR().measure(pair) == pytest.approx(psnr(pair.render, pair.photo))

@@ -1,4 +1,4 @@
-"""What each operator gives for two or three gradients, from the formulas of the papers."""
+"""The result of each operator for two or three gradients, from the formulas of the papers."""
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_mgda_meets_the_optimality_conditions(views, ask):
         assert (rows @ found.result).min() >= found.result @ found.result * (1 - 1e-10)
 
 
-def test_soft_takes_away_a_share(ask):
+def test_soft_removes_a_share_of_the_conflicting_component(ask):
     half = build("operators", "soft", {"strength": 0.5})
     np.testing.assert_allclose(ask(half, PAIR).weights, [1.5, 1.25], rtol=1e-14)
     patient = build("operators", "soft", {"threshold": 0.8})

@@ -53,7 +53,7 @@ def test_one_view_is_left_as_it_is(name, ask):
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_nothing_comes_of_nothing(name, ask):
+def test_zero_gradients_give_a_zero_result(name, ask):
     np.testing.assert_array_equal(ask(name, [0 * E, 0 * E]).result, 0 * E)
 
 

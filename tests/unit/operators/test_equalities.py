@@ -26,7 +26,7 @@ def same(one, other, rows):
     ("name", "factor"),
     [("pcgrad", 1), ("upgrad", 2), ("gradvac", 1), ("anchors", 1), ("soft", 1)],
 )
-def test_two_views_make_symmetric_of_it(name, factor, ask):
+def test_operators_equal_symmetric_for_two_views(name, factor, ask):
     for rows in pairs():
         same(ask("symmetric", rows), factor * ask(name, rows).weights, rows)
 

@@ -78,7 +78,7 @@ def test_order_of_views(name, data, ask):
 @pytest.mark.parametrize("name", ["upgrad", "dualproj", "mgda"])
 @DRAWN
 @given(data=st.data())
-def test_conflicts_with_nobody(name, data, ask, gradient_rows):
+def test_the_result_has_no_negative_dot_product_with_any_view(name, data, ask, gradient_rows):
     rows = data.draw(gradient_rows())
     found = ask(name, rows)
     norms = np.linalg.norm(rows, axis=1)
@@ -87,7 +87,7 @@ def test_conflicts_with_nobody(name, data, ask, gradient_rows):
 
 
 @pytest.mark.parametrize("name", ["pcgrad", "gradvac"])
-def test_more_than_two_views_are_met_in_random_order(name, ask):
+def test_more_than_two_views_are_processed_in_random_order(name, ask):
     rows = np.random.default_rng(1).standard_normal((4, 5)) - 0.3
     results = {ask(name, rows, seed=seed).weights.tobytes() for seed in range(10)}
     assert len(results) > 1

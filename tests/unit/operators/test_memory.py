@@ -51,7 +51,7 @@ def test_confgate_waits_and_then_projects(ask):
     np.testing.assert_array_equal(agreed.weights, [1, 1])
 
 
-def test_confgate_does_not_believe_a_rare_conflict(ask):
+def test_confgate_does_not_project_a_rare_conflict(ask):
     operator = build("operators", "confgate", {})
     used_to_agree = repeat(ask, operator, AGREEMENT, 150).state
     np.testing.assert_array_equal(ask(operator, CONFLICT, state=used_to_agree).weights, [1, 1])

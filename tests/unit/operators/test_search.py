@@ -116,7 +116,7 @@ def test_a_short_search_finds_nothing_outside_what_is_stated(name, rounds):
     assert not tally.failures and not wide.failures
 
 
-def test_what_is_stated_is_what_the_page_says():
+def test_the_stated_bounds_are_on_the_page():
     page = (Path(__file__).parents[3] / "docs" / "operators.md").read_text(encoding="utf-8")
     for name, promise in PROMISES.items():
         assert f"| {name} | " in page and f" | {promise.factor_words} |" in page
@@ -153,7 +153,7 @@ def test_families_reach_the_extremes_that_they_are_meant_for():
     assert (~FAMILIES["zeros"](rng, 50, 6, 5).any(axis=2)).any()
 
 
-def test_a_worse_case_shrinks_to_what_it_needs():
+def test_a_failing_case_is_reduced_to_the_rows_it_needs():
     class OffForThree(Symmetric):
         def transform(self, gramians, context, state, rng):
             matrices, state = super().transform(gramians, context, state, rng)

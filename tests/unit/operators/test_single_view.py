@@ -82,7 +82,7 @@ def test_views_are_those_of_the_sampler_where_the_operator_works_with_them(
 
 
 @pytest.mark.parametrize("operator", ["pcgrad", "mean", "preconditioner+symmetric", "anchors"])
-def test_an_operator_that_is_named_gets_so_many_views_that_it_works(operator):
+def test_a_named_operator_gets_enough_views_per_step(operator):
     views, (note,) = views_of(operator)
     assert views == 2
     needed = "the operator needs" if operator == "anchors" else "with fewer views the operator"
@@ -105,11 +105,11 @@ def test_an_operator_without_a_second_view_is_noted_once_with_the_way_out():
     ],
     ids=["sum", "two views", "two by default", "weighs one view"],
 )
-def test_what_does_something_is_not_noted(operator, sampler, views):
+def test_an_operator_with_an_effect_gets_no_note(operator, sampler, views):
     assert notes_of(operator, sampler, views) == []
 
 
-def test_a_sampler_of_one_view_is_named_as_what_stands_in_the_way():
+def test_the_note_names_a_sampler_that_draws_one_view_only():
     (note,) = notes_of({"name": "pcgrad"}, {"name": "near-far", "alternating": True})
     assert "--views" not in note and "near-far" in note
 

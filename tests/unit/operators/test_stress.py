@@ -123,7 +123,7 @@ def test_no_table_is_overwritten(tmp_path, capsys):
     assert "the file exists" in capsys.readouterr().err and table.read_text() == "mine"
 
 
-def test_a_case_that_there_is_not_is_refused(capsys):
+def test_an_unknown_stress_case_is_refused(capsys):
     assert ended("stress", "symmetric", "--case", "nosuch", "--elements", "1000") == 2
     assert "no case has this in its name" in capsys.readouterr().err
 

@@ -161,7 +161,7 @@ def test_the_same_results_make_the_same_page(modules, planted, grid_of):
     assert pages[0] == pages[1]
 
 
-def test_data_that_say_two_things_or_nothing_are_refused(modules):
+def test_claims_with_contradictory_or_missing_data_are_refused(modules):
     data = modules.data
     pairing = {"first": "a", "second": "b"}
     for wrong in (

@@ -45,7 +45,7 @@ def test_a_changed_grid_has_its_own_runs(modules, tmp_path, first):
     assert factors(modules, tmp_path, grid(rate_factor=2)) == [2.0] * 3
 
 
-def test_runs_that_are_to_come_are_not_stood_in_for(modules, tmp_path):
+def test_runs_of_an_earlier_grid_do_not_replace_missing_runs(modules, tmp_path):
     old = write_runs(tmp_path, "a", rate_factor=2.0)
     write_table(tmp_path, old)
     found = modules.runs.read_results({"x": tmp_path}, {"x": grid(rate_factor=20)})
@@ -63,14 +63,14 @@ def test_runs_of_another_length_are_others(modules, tmp_path):
     assert factors(modules, tmp_path, grid(seconds=60)) == []
 
 
-def test_settings_that_the_run_decides_or_the_command_line_has_fit(modules, tmp_path):
+def test_automatic_settings_and_command_line_settings_match_the_grid(modules, tmp_path):
     write_table(tmp_path, write_runs(tmp_path, "a", rate_factor=2.0))
     assert factors(modules, tmp_path, grid(exposure="auto")) == [2.0] * 3
     more = {"assignments": ["rate_factor=2"]}
     assert factors(modules, tmp_path, grid(rate_factor=20), **more) == [2.0] * 3
 
 
-def test_two_configurations_that_nothing_tells_apart_are_refused(modules, tmp_path):
+def test_two_configurations_of_one_arm_and_seed_are_refused(modules, tmp_path):
     rows = write_runs(tmp_path, "a", rate_factor=2.0) + write_runs(tmp_path, "m", rate_factor=20.0)
     write_table(tmp_path, [(row[0], row[2]) for row in rows], columns=("run", "configuration"))
     with pytest.raises(UserError, match="B has two configurations with seed 1 on city") as error:

@@ -50,7 +50,7 @@ def test_a_planted_difference_has_its_verdict(modules, results, arm, expected, o
     assert ("less than the margin" in found.detail) == (arm == "a bit")
 
 
-def test_noise_leaves_it_open_and_says_how_many_pairs_it_takes(modules, planted, grid_of):
+def test_a_noisy_comparison_is_inconclusive_and_reports_the_pairs_needed(modules, planted, grid_of):
     sweep = planted("noisy", {"a": 0.0, "b": 0.1}, noise=1.0)
     results = modules.runs.read_results({"noisy": sweep}, {"noisy": grid_of("ab")})
     for expected in ("better", "worse", "equal", "not better"):

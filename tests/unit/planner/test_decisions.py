@@ -1,4 +1,4 @@
-"""What the planner decides, on which evidence: scenes that were measured, and made-up ones."""
+"""Decisions of the planner and their evidence, on measured and on synthetic scenes."""
 
 import csv
 import json
@@ -112,7 +112,7 @@ def plan_for(scene, **given):
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_modes_as_measured(name):
+def test_the_decision_on_modes_matches_the_measured_scenes(name):
     choice, separability, ratio, spread, *_ = MEASURED[name]
     found = grouping.modes(evidence_of(name))
     assert found.choice == choice
@@ -137,7 +137,7 @@ def test_exposure_as_measured(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_the_scenes_themselves(name):
+def test_the_plan_of_the_real_scenes_matches_the_measurements(name):
     if not (SCENES / name).is_dir():
         pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
     config = configured({"scene": str(SCENES / name)})
@@ -207,7 +207,7 @@ def test_pairs_need_the_probe():
         (np.nan, np.nan, np.nan, "default", {}),
     ],
 )
-def test_pairs_by_the_whole_interval(low, rho, high, status, changes):
+def test_pairs_are_decided_by_the_whole_interval(low, rho, high, status, changes):
     probe = Probe(rho=rho, rho_low=low, rho_high=high, noise_scale=50.0, conflict=0.5)
     found = grouping.pairs(evidence_of("city_hybrid", probe))
     assert found.basis == status
@@ -236,7 +236,7 @@ def test_one_view_whatever_the_noise_of_gradients(noise):
     assert found.figures == {"noise_scale": noise}
 
 
-def test_pairs_bring_two_views():
+def test_a_sampler_of_pairs_sets_two_views_per_step():
     probe = Probe(rho=0.5, rho_low=0.2, rho_high=0.9)
     found = grouping.views_per_step(evidence_of("city_hybrid", probe))
     # The sampler brings them: nothing else is to be set.
@@ -370,7 +370,7 @@ def test_a_probe_that_fails_decides_nothing():
     assert probe.problem in grouping.views_per_step(evidence).evidence
 
 
-def test_a_noise_scale_without_an_end_is_not_told():
+def test_an_infinite_noise_scale_is_reported_as_beyond_all_views():
     probe = Probe(rho=0.5, rho_low=0.1, rho_high=0.9, noise_scale=inf, conflict=0.5)
     found = grouping.views_per_step(evidence_of("city_unimodal", probe))
     assert found.evidence.endswith("gradient noise scale beyond all views: no common part")
@@ -482,7 +482,7 @@ def test_a_run_without_a_length_gets_one_by_its_photos(photos):
 
 
 @pytest.mark.parametrize(("photos", "stays"), [(299, False), (300, True), (2_000, True)])
-def test_it_never_gets_longer_than_by_default(photos, stays):
+def test_the_planned_length_is_never_longer_than_the_default(photos, stays):
     found = length_of(photos)
     assert found.basis == "decided"
     assert (found.choice == "30,000 steps") == stays
@@ -512,7 +512,7 @@ def test_published_schedules_keep_their_length(mine, seconds, choice):
     assert "published" in found.evidence
 
 
-def test_views_within_seconds_are_yours():
+def test_views_and_seconds_given_by_the_user_are_kept():
     found = length_of(20, seconds=60.0, max_views=500)
     assert (found.choice, found.basis) == ("500 views within 60 s", "given")
 
@@ -577,7 +577,7 @@ _GIVEN = st.fixed_dictionaries(
     _GIVEN,
     st.lists(st.text(max_size=30), max_size=3),
 )
-def test_no_scene_breaks_the_planner(centers, points, asked, notes):
+def test_the_planner_handles_random_scenes(centers, points, asked, notes):
     if asked.get("backbone") == "scaffold":
         asked.pop("backbone.sh_degree", None)
     views = [

@@ -44,7 +44,7 @@ def decided(scene, found, monkeypatch, **given):
     return appearance.degree(Evidence(configured({"scene": "nowhere", **given}), scene))
 
 
-def test_leaving_one_out_is_what_it_is_called():
+def test_the_leave_one_out_error_agrees_with_a_loop():
     count, tracks = 9, 5
     stops = RNG.normal(size=(tracks, count))
     directions = RNG.normal(size=(tracks, count, 3))
@@ -125,7 +125,7 @@ def test_the_user_s_degree_stays(monkeypatch):
     assert not found.settings
 
 
-def test_who_says_in_which_steps_bands_learn_has_them(monkeypatch):
+def test_sh_bands_are_kept_if_the_user_sets_sparse_sh(monkeypatch):
     scene = ring()
     found = decided(scene, observed(scene, 0.0), monkeypatch, rules={"sparse-sh": {"every": 4}})
     assert found.basis == "given"

@@ -57,7 +57,7 @@ def test_far_views_come_first_where_near_ones_look_around():
     json.dumps(found.as_data())
 
 
-def test_what_is_decided_is_a_run_that_draws_so():
+def test_the_decided_view_schedule_is_the_sampler_of_the_run():
     scene = scene_of(AROUND)
     plan = plan_of(configured({"scene": "x", "steps": 100}), scene)
     run = assemble(configured(plan.applied_to({"scene": "x", "steps": 100})), scene, "colmap")
@@ -68,7 +68,7 @@ def test_what_is_decided_is_a_run_that_draws_so():
 @pytest.mark.parametrize(
     "length", [{"steps": 100}, {"seconds": 5.0}, {"max_views": 100}, {"steps": 29_999}], ids=str
 )
-def test_a_short_run_with_this_plan_draws_so(length):
+def test_a_short_run_uses_the_far_first_schedule(length):
     run = assemble(configured({"scene": "x", **length}), scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "horizon"
     assert run.selection.names["grouping"] == run.config.grouping.name
@@ -117,7 +117,7 @@ def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeyp
         assemble(asked, scene_of(AROUND), "colmap")
 
 
-def test_views_of_long_runs_come_alike():
+def test_long_runs_draw_epochs():
     found = decision(scene_of(AROUND), steps=30_000)
     assert (found.choice, found.settings) == ("epoch", {})
     assert found.evidence == "measured in shorter runs only"
@@ -139,7 +139,7 @@ def test_two_flight_levels_come_alike(height):
     assert "degrees away" in found.evidence
 
 
-def test_one_mode_has_no_turns():
+def test_a_scene_with_one_mode_draws_epochs():
     views = [posed_view((3 * i, 0, 90.0), f"{i}.png", forward=(0, 0.2, -1)) for i in range(24)]
     found = decision(posed_scene(views, CLOUD))
     assert (found.choice, dict(found.settings)) == ("epoch", {})
@@ -155,12 +155,12 @@ def test_what_the_user_set_wins(given):
     "given",
     [{"operator": {"name": "pcgrad"}}, {"views_per_step": 2}, {"recipe": {"name": "published"}}],
 )
-def test_what_was_not_measured_is_not_chosen(given):
+def test_the_far_first_schedule_is_not_chosen_for_settings_without_measurements(given):
     found = decision(scene_of(AROUND), **given)
     assert (found.basis, dict(found.settings)) == ("default", {})
 
 
-def test_few_far_views_do_not_come_again_and_again():
+def test_a_small_far_mode_does_not_get_the_far_first_schedule():
     views = scene_of(AROUND).views
     found = decision(posed_scene([*views[:6], *views[12:]], CLOUD))
     assert not found.settings

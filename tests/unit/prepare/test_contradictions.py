@@ -42,7 +42,7 @@ def test_right_poses_are_not_contradicted(made):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_photos_in_a_wrong_place_are(made, count):
+def test_misplaced_photos_are_contradicted(made, count):
     """Each has its matches with the others against it; what was found before has no vote."""
     model, path = made
     wrong = numbers(model)[:count]
@@ -53,7 +53,7 @@ def test_photos_in_a_wrong_place_are(made, count):
     assert all(votes[0] == 0 and votes[1] >= 30 * (PHOTOS - count) for votes in found.values())
 
 
-def test_one_other_photo_is_not_enough(made):
+def test_one_other_photo_does_not_contradict_a_pose(made):
     """Which of two is wrong nobody can tell."""
     model, path = made
     one, *others = numbers(model)
@@ -63,7 +63,7 @@ def test_one_other_photo_is_not_enough(made):
     assert contradicted(model, path) == {}
 
 
-def test_few_matches_say_nothing(made):
+def test_few_matches_do_not_contradict_a_pose(made):
     model, path = made
     wrong = numbers(model)[0]
     misplace(model, wrong)
@@ -76,13 +76,13 @@ def test_few_matches_say_nothing(made):
     assert contradicted(model, path) == {}
 
 
-def test_a_model_of_nothing_is_none(tmp_path):
+def test_an_empty_model_has_no_contradicted_photos(tmp_path):
     database = pycolmap.Database.open(tmp_path / "database.db")
     database.close()
     assert contradicted(pycolmap.Reconstruction(), tmp_path / "database.db") == {}
 
 
-def test_they_are_taken_out_of_the_model_and_written_down(made):
+def test_contradicted_photos_are_removed_from_the_model_and_recorded(made):
     model, path = made
     layout = Layout(path.parent / "scene")
     layout.work.mkdir(parents=True)

@@ -39,7 +39,7 @@ def asked(tmp_path, monkeypatch):
     return found
 
 
-def test_small_photos_are_asked_for_fainter_features(asked):
+def test_small_photos_use_a_lower_feature_threshold(asked):
     large, small = photo("large.jpg", 1600, 1200), photo("small.jpg", 640, 400)
     usual = pytest.approx((0.02 / 3, 10.0))
     (first, second) = asked((large, small))

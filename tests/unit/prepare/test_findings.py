@@ -1,4 +1,4 @@
-"""What the report concludes: bridges that are missing, and why photos were lost."""
+"""Conclusions of the report: missing bridges, and the reasons why photos were lost."""
 
 import itertools
 
@@ -36,7 +36,7 @@ PLAN = plan_of(*map(photo, AERIAL + STREET))
 MODELS = [frozenset(AERIAL), frozenset(STREET)]
 
 
-def test_a_ramp_is_asked_for_between_the_heights_of_two_models():
+def test_the_advice_for_two_models_at_different_heights_is_a_ramp():
     heights = dict.fromkeys(AERIAL, 40.0) | dict.fromkeys(STREET, 5.0)
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), heights)
     assert "fly a ramp from 5 to 40 m here" in bridge.advice
@@ -50,13 +50,13 @@ def test_without_heights_it_is_reported_in_ratios():
     assert bridge.heights is None
 
 
-def test_at_like_heights_overlap_is_asked_for():
+def test_the_advice_for_two_models_at_similar_heights_is_overlap():
     heights = dict.fromkeys(AERIAL, 12.0) | dict.fromkeys(STREET, 10.0)
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), heights)
     assert "overlap with both" in bridge.advice
 
 
-def test_one_bridge_leads_to_all_pieces_of_a_folder():
+def test_one_bridge_covers_all_pieces_of_a_folder():
     pieces = [frozenset(AERIAL), frozenset(STREET[:1]), frozenset(STREET[1:])]
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, pieces), {})
     assert bridge.photos == 3
@@ -90,7 +90,7 @@ def test_pairs_across_are_counted():
 
 
 @given(st.floats(1.0, 50.0), st.floats(1.5, 60.0))
-def test_rungs_lead_from_end_to_end_in_equal_factors(low, factor):
+def test_intermediate_heights_span_the_range_in_equal_factors(low, factor):
     found = fallbacks(low, low * factor)
     assert found[0] == pytest.approx(low)
     assert found[-1] == pytest.approx(low * factor)
@@ -129,7 +129,7 @@ def test_a_photo_of_another_model_is_reported_so():
     assert not lost_photos(PLAN, counts, [], list(zip(MODELS, [True, True], strict=True)), {})
 
 
-def test_a_photo_that_was_taken_out_is_reported_by_what():
+def test_a_removed_photo_is_reported_with_the_reason():
     counts = dict.fromkeys(AERIAL + STREET, 1000)
     models = [(frozenset(AERIAL + STREET[1:]), True)]
     (lost,) = lost_photos(PLAN, counts, [], models, {STREET[0]: (40, 310)})

@@ -116,7 +116,7 @@ def test_mapping_names_no_model_that_is_cut_short(model, layout, full, monkeypat
     assert found.num_points3D() == model.num_points3D()
 
 
-def test_a_place_that_is_cut_short_gets_no_name(model, layout, full):
+def test_a_partly_written_georegistered_model_is_not_kept(model, layout, full):
     with pytest.raises(UserError, match=FULL):
         _place(layout, plan_of(model, layout.scene), [pycolmap.Reconstruction(model)])
     assert not layout.placed.exists()
@@ -246,7 +246,7 @@ def test_features_and_matches_are_not_begun_without_room(model, layout, free, mo
         matching.found_links(layout, plan, 1)
 
 
-def test_what_is_done_needs_no_room(model, layout, monkeypatch):
+def test_finished_features_need_no_disk_space(model, layout, monkeypatch):
     plan, photos = plan_of(model, layout.scene), len(model.images)
     layout.database.touch()
     asked = {}

@@ -88,7 +88,7 @@ def walk(rng, orientation, pitch, count=12):
 @pytest.mark.parametrize("orientation", [1, 6])
 @pytest.mark.parametrize("pitch", [-50.0, 0.0, 15.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_on_a_straight_way_level_photos_tell_which_way_is_up(orientation, pitch, seed):
+def test_on_a_straight_track_level_photos_give_the_up_direction(orientation, pitch, seed):
     rng = np.random.default_rng(seed)
     model = walk(rng, orientation, pitch)
     gps = {name: at + 0.1 * rng.normal(size=3) for name, at in centers_of(model).items()}

@@ -44,13 +44,13 @@ def test_a_photo_of_few_points_has_no_pose():
     assert parts_of(model_of(tracks, 4)) == [[1, 2, 3]]
 
 
-def test_it_joins_nothing_either():
+def test_a_photo_with_few_points_does_not_join_models():
     """Photos 1 and 2, and 3 and 4, are joined only through one that has too few points itself."""
     tracks = [(40, (1, 2)), (40, (3, 4)), (14, (2, 5)), (14, (5, 3))]
     assert parts_of(model_of(tracks, 5), smallest=2) == [[1, 2], [3, 4]]
 
 
-def test_models_that_are_too_small_are_none():
+def test_models_below_the_smallest_size_are_dropped():
     assert parts_of(model_of([(40, (1, 2))], 2)) == []
     assert parts_of(model_of([], 3)) == []
 

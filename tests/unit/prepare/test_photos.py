@@ -78,7 +78,7 @@ def test_degrees_minutes_and_seconds_are_put_together(latitude, longitude, altit
         {2: (), 4: (), 6: 3.0},
     ],
 )
-def test_what_is_no_place_is_none(tags):
+def test_invalid_gps_tags_give_no_position(tags):
     assert position_of(Shown(tags)) is None
 
 
@@ -189,7 +189,7 @@ def test_a_mask_folder_within_the_photos_that_is_named_holds_no_photos(linked, t
     assert left_out == {"sky/": "the folder of masks (--masks), not of photos"}
 
 
-def test_the_photos_own_folder_may_be_that_of_the_masks(tmp_path):
+def test_the_folder_of_the_photos_may_also_contain_the_masks(tmp_path):
     """No photo is its own mask."""
     for name in ("1.jpg", "1.png", "2.png", "2.png.png", "3.png"):
         save(tmp_path / name)
@@ -288,7 +288,7 @@ def test_transparent_pixels_do_not_count(tmp_path):
 @pytest.mark.parametrize(
     "name", ["a\tb.jpg", "a\nb.jpg", "a\x1b[2Jb.jpg", "a\\b.jpg", "d\te/1.jpg", "x" * 250 + ".jpg"]
 )
-def test_names_that_no_scene_can_have_are_left_out_with_words(name, tmp_path):
+def test_photos_with_names_that_no_scene_can_use_are_left_out_with_a_reason(name, tmp_path):
     save(tmp_path / "1.jpg")
     save(tmp_path / "2.jpg")
     save(tmp_path / name)
@@ -299,7 +299,7 @@ def test_names_that_no_scene_can_have_are_left_out_with_words(name, tmp_path):
     assert "control characters or backslashes, is too long or is not UTF-8: rename it" in why
 
 
-def test_names_that_are_no_text_are_left_out_with_words(tmp_path):
+def test_photos_whose_names_are_not_text_are_left_out_with_a_reason(tmp_path):
     for name in (b"1.jpg", b"2.jpg", b"\xff.jpg", b"\xfe_mask.png"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
         with path.open("wb") as file:
@@ -370,7 +370,7 @@ def test_names_with_spaces_and_signs_are_photos_and_hidden_files_are_not(tmp_pat
 @pytest.mark.parametrize(
     ("mode", "words"), [("F", "floating point"), ("I", "32 bits"), ("1", "1 bit")]
 )
-def test_values_that_colmap_would_write_for_nobody_are_left_out(mode, words, tmp_path):
+def test_photos_with_pixel_types_that_colmap_cannot_write_are_left_out(mode, words, tmp_path):
     for name in ("good.jpg", "better.jpg"):
         save(tmp_path / name)
     levels = np.linspace(0, 1, 90 * 70).reshape(70, 90)

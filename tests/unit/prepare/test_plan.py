@@ -61,7 +61,7 @@ def test_the_same_photos_in_another_folder_are_gone_on_with(layout):
         ),
     ],
 )
-def test_what_differs_is_reported_with_the_way_out(photos, settings, told, layout):
+def test_differences_from_the_begun_plan_are_reported_with_a_remedy(photos, settings, told, layout):
     first = agreed(layout, plan(*BEGUN))
     with pytest.raises(UserError, match="begun otherwise") as caught:
         agreed(layout, plan(*photos, **settings))
@@ -70,7 +70,7 @@ def test_what_differs_is_reported_with_the_way_out(photos, settings, told, layou
     assert read_plan(layout) == first
 
 
-def test_a_ready_scene_needs_no_photo_but_takes_no_other_either(layout):
+def test_a_ready_scene_needs_no_photos_and_refuses_new_ones(layout):
     first = agreed(layout, plan(*BEGUN))
     finish(layout)
     assert agreed(layout, plan(BEGUN[0], photo("b"), root="/new")) == first

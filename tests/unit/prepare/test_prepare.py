@@ -150,7 +150,7 @@ def test_the_origin_lies_among_the_photos(report, longitudes, middle):
     assert max(np.linalg.norm(at) for at in local_positions(plan).values()) < 1e5
 
 
-def test_what_is_of_no_use_is_named_with_the_reason(report):
+def test_unusable_photos_are_listed_with_the_reason(report):
     why = {each.name: each.why for each in report.plan.left_out}
     assert set(why) == {"kite/cut.jpg", "phone.HEIC", "kite/icon.png", "mast/z.jpg"}
     assert "the same file as mast/" in why["mast/z.jpg"]
@@ -185,14 +185,16 @@ def test_masks_are_undistorted_with_their_photos(report, scene):
     assert shares[-100:].min() == 1.0
 
 
-def test_again_it_changes_nothing(report, photos, scene):
+def test_preparing_again_changes_nothing(report, photos, scene):
     before = content(scene)
     again = prepared(photos, scene, Settings())
     assert data_of(again) == data_of(report)
     assert content(scene) == before
 
 
-def test_hidden_files_of_others_stay_and_its_own_remains_go(report, photos, scene, tmp_path):
+def test_hidden_files_of_others_stay_and_leftovers_of_prepare_are_deleted(
+    report, photos, scene, tmp_path
+):
     (scene / ".git").mkdir()
     (scene / ".git" / "HEAD").write_text("ref")
     (scene / ".cache").symlink_to(tmp_path)
@@ -211,7 +213,7 @@ def test_hidden_files_of_others_stay_and_its_own_remains_go(report, photos, scen
     (scene / "prepare" / "models" / ".DS_Store").unlink()
 
 
-def test_without_its_last_stages_it_comes_out_the_same(report, photos, scene):
+def test_redoing_the_last_stages_gives_the_same_scene(report, photos, scene):
     """What a kill may have left undone is done again, with the same result."""
     before = content(scene)
     (scene / "report.json").unlink()
@@ -250,7 +252,7 @@ def unfinish(scene):
     (scene / "prepare" / "plan.json").write_text(json.dumps(plan | {"photos": "/gone"}))
 
 
-def test_it_goes_on_where_the_photos_were_moved(copied, scene, photos, tmp_path):
+def test_prepare_continues_after_the_photos_were_moved(copied, scene, photos, tmp_path):
     moved = shutil.copytree(photos, tmp_path / "moved")
     unfinish(copied)
     found = prepared(moved, copied, Settings())
@@ -276,7 +278,9 @@ def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
 @pytest.mark.parametrize(
     "lost", ["workshop", "part", "photos", "some photos", "most photos", "all"]
 )
-def test_a_ready_scene_is_read_without_what_it_was_made_of(copied, photos, lost, tmp_path):
+def test_a_ready_scene_is_read_without_its_intermediate_files_and_photos(
+    copied, photos, lost, tmp_path
+):
     place = shutil.copytree(photos, tmp_path / "photos")
     if lost in {"workshop", "all"}:
         shutil.rmtree(copied / "prepare")
@@ -307,7 +311,7 @@ def test_new_photos_of_a_ready_scene_are_not_left_out_silently(copied, photos, t
     assert caught.value.found == "1 photo new: kite/new.png"
 
 
-def test_a_ready_scene_without_its_workshop_is_not_prepared_again(copied, photos, capsys):
+def test_a_ready_scene_without_intermediate_files_is_not_prepared_again(copied, photos, capsys):
     shutil.rmtree(copied / "prepare")
     before = content(copied)
     assert ended("prepare", photos, copied) == 2
@@ -346,7 +350,7 @@ def test_transparent_photos_get_a_mask(report, tmp_path):
     assert any(line.startswith(f"masks: 1 of {COUNT + 1} photos") for line in told)
 
 
-def test_a_run_prepares_photos_where_it_is_told_to(report, photos, capsys):
+def test_run_with_prepare_prepares_the_photos(report, photos, capsys):
     assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
     told = capsys.readouterr().out
     assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
@@ -430,7 +434,7 @@ def test_photos_of_linked_folders_are_found_once(tmp_path):
     assert left_out == ()
 
 
-def test_photos_at_the_root_ask_for_a_place(capsys):
+def test_photos_at_the_root_folder_need_an_output_folder(capsys):
     assert ended("run", "/", "--prepare") == 2
     assert "reader.scene=FOLDER" in capsys.readouterr().err
 
@@ -473,7 +477,7 @@ def test_unknown_choices_are_refused(option, tmp_path, capsys):
         ((), "no features"),
     ],
 )
-def test_what_cannot_work_is_refused(options, what, tmp_path, capsys):
+def test_impossible_prepare_options_are_refused(options, what, tmp_path, capsys):
     for number in range(2):
         photo = tmp_path / "photos" / f"{number}.png"
         photo.parent.mkdir(exist_ok=True)
@@ -482,7 +486,7 @@ def test_what_cannot_work_is_refused(options, what, tmp_path, capsys):
     assert what in capsys.readouterr().err
 
 
-def test_progress_is_counted_beside_the_database_s_writer(tmp_path):
+def test_rows_are_counted_while_the_database_is_written(tmp_path):
     path = tmp_path / "a b.db"
     assert rows_of(path, "cameras") == 0
     database = pycolmap.Database.open(path)

@@ -125,7 +125,7 @@ def test_a_photo_without_a_pose_gets_one(made, tmp_path):
     assert found.image(lost).num_points2D() > 0
 
 
-def test_two_directions_tell_a_place_where_no_point_does(made):
+def test_two_directions_locate_a_photo_without_points(made):
     """The model has poses alone: how far to go is told by where directions cross."""
     model, truth = made[0], truth_of(made[0])
     lost = numbers(model)[0]
@@ -136,7 +136,7 @@ def test_two_directions_tell_a_place_where_no_point_does(made):
     assert close_to(poses_of(found)[lost], truth[lost])
 
 
-def test_wrong_pairs_are_outvoted_and_laid_aside(made):
+def test_wrong_pairs_are_outvoted_and_removed(made):
     """Three of the seven pairs of a photo tell of nothing: their matches are mixed up."""
     model, path = made
     truth, lost = truth_of(model), numbers(model)[0]
@@ -157,7 +157,7 @@ def test_wrong_pairs_are_outvoted_and_laid_aside(made):
     assert settled == {lost}
 
 
-def test_mapping_goes_on_where_a_photo_has_no_pair_left(made, tmp_path):
+def test_mapping_continues_if_a_photo_has_no_pair_left(made, tmp_path):
     """One photo is misplaced; all pairs of another one tell of nothing, so that they go aside."""
     model, path = made
     truth, (lost, strange, *_) = truth_of(model), numbers(model)
@@ -207,7 +207,7 @@ def test_one_pair_alone_places_nothing(made):
     assert one not in numbers(found) and adjust.models == []
 
 
-def test_a_photo_goes_over_from_a_smaller_model(made, tmp_path):
+def test_a_photo_moves_from_a_smaller_model_to_the_largest(made, tmp_path):
     model, truth = made[0], truth_of(made[0])
     (tmp_path / "small").mkdir()
     model.write(tmp_path / "small")
@@ -223,7 +223,7 @@ def test_a_photo_goes_over_from_a_smaller_model(made, tmp_path):
     assert all(close_to(poses_of(large)[number], truth[number]) for number in truth)
 
 
-def test_a_round_that_fewer_matches_agree_with_is_not_kept(made):
+def test_a_refinement_round_that_fewer_matches_support_is_discarded(made):
     """Mapping goes on and throws all photos but two about, as often as it is asked."""
     model, path = made
     truth, lost = truth_of(model), numbers(model)[0]
@@ -303,7 +303,7 @@ def test_a_photo_whose_camera_no_lens_is_like_is_left_out(tmp_path):
     assert numbers(found) == [one, two, *others]
 
 
-def test_nothing_is_moved_when_nobody_waits(made):
+def test_no_photo_is_moved_after_a_stop_request(made):
     model, path = made
     misplace(model, numbers(model)[0])
     adjust = Adjust()
@@ -311,7 +311,7 @@ def test_nothing_is_moved_when_nobody_waits(made):
     assert adjust.models == [] and found is model
 
 
-def test_no_model_is_none(tmp_path):
+def test_refining_no_models_returns_no_models(tmp_path):
     assert looked_again([], tmp_path / "database.db", tmp_path, Adjust()) == ([], frozenset())
 
 
@@ -337,5 +337,5 @@ def test_what_speaks_for_a_place(made):
     ("pairs", "matches", "enough"),
     [(1, 900, False), (2, 99, False), (2, 100, True), (3, 59, False), (3, 60, True)],
 )
-def test_how_much_is_enough(pairs, matches, enough):
+def test_the_support_needed_for_a_pose(pairs, matches, enough):
     assert Support(matches, pairs).enough == enough

@@ -362,7 +362,7 @@ def test_marked_pixels_of_random_views_are_counted_exactly(seed, response, size,
     ],
 )
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
-def test_what_cannot_be_drawn_leaves_no_trace(name, response, tensor, value):
+def test_a_gaussian_that_cannot_be_rendered_changes_nothing(name, response, tensor, value):
     made, _ = settled(case(20, response=response))
     getattr(made.gaussians, tensor)[3] = value
     others = torch.arange(20) != 3

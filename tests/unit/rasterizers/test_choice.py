@@ -47,7 +47,7 @@ def install(tmp_path, monkeypatch):
 SOUND = FAST.partition("class Broken")[0]
 
 
-def test_ours_are_chosen_by_device():
+def test_bundled_rasterizers_are_chosen_by_device():
     assert choose_rasterizer("auto", PLAIN)[0] == "numba"
     # Those that were made for it have tests of their own, and may not be installed here.
     assert choose_rasterizer("auto", Wanted("cuda", "analytic"))[0] == "torch"
@@ -57,7 +57,7 @@ def test_a_name_is_taken_as_it_is():
     assert choose_rasterizer("torch", PLAIN) == ("torch", ("rasterizer torch: asked for",))
 
 
-def test_a_faster_one_of_somebody_else_is_taken(install):
+def test_a_faster_third_party_rasterizer_is_chosen(install):
     install(SOUND, fast="made_up_rasterizer:Fast")
     name, notes = choose_rasterizer("auto", PLAIN)
     assert name == "fast"
@@ -78,12 +78,12 @@ def test_one_that_ranks_itself_at_zero_is_never_taken(install):
     ],
     ids=["response", "output", "option"],
 )
-def test_a_faster_one_that_cannot_do_what_is_wanted_is_passed_over(install, wanted):
+def test_a_faster_rasterizer_without_a_needed_feature_is_skipped(install, wanted):
     install(SOUND, fast="made_up_rasterizer:Fast")
     assert choose_rasterizer("auto", wanted)[0] == "numba"
 
 
-def test_where_none_can_do_it_the_fastest_is_taken_and_the_objections_say_why(install):
+def test_the_fastest_rasterizer_is_chosen_if_none_provides_the_outputs(install):
     install(SOUND, fast="made_up_rasterizer:Fast")
     wanted = Wanted("cpu", "plain", outputs=frozenset({"no such output"}))
     assert choose_rasterizer("auto", wanted)[0] == "fast"

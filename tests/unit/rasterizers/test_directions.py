@@ -136,7 +136,7 @@ def test_directions_do_not_depend_on_the_size_of_the_loss(name, factor):
 
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
-def test_directions_are_left_out_where_nobody_asks(name):
+def test_directions_are_left_out_if_not_requested(name):
     gaussians = random_gaussians(5, CAMERA)
     others = OUTPUTS - {"directions"}
     with_, without = (

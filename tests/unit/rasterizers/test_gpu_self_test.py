@@ -71,7 +71,7 @@ class WrongFirst(Changed):
 
 @pytest.mark.parametrize("rasterizer", [TorchRasterizer(), NumbaRasterizer()])
 @pytest.mark.parametrize("footprint", ["alpha", "3-sigma"])
-def test_ours_pass(rasterizer, footprint):
+def test_bundled_rasterizers_pass_the_self_test(rasterizer, footprint):
     self_test(rasterizer.model_copy(update={"footprint": footprint}), "cpu")
 
 
@@ -93,14 +93,14 @@ def test_gsplat_passes_on_its_reference(monkeypatch):
     ],
     ids=lambda each: type(each).__name__,
 )
-def test_what_is_wrong_is_refused_with_a_way_out(rasterizer, found):
+def test_a_wrong_rasterizer_fails_the_self_test_with_a_remedy(rasterizer, found):
     with pytest.raises(UserError) as raised:
         self_test(rasterizer, "cpu")
     assert found in raised.value.found
     assert "torch's CUDA version" in raised.value.todo
 
 
-def test_a_run_looks_before_it_trains(monkeypatch):
+def test_the_self_test_runs_before_training(monkeypatch):
     asked = []
     monkeypatch.setattr(NumbaRasterizer, "self_test", lambda _self, device: asked.append(device))
     from crossgrad_core.config import RunConfig

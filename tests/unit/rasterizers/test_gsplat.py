@@ -48,7 +48,7 @@ def drawn(rasterizer, gaussians, camera, background=(0.1, 0.5, 0.3)):
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-def test_projection_is_ours(camera):
+def test_gsplat_projection_agrees_with_the_reference(camera):
     """Means, depths, covariances and the margin of the Jacobian, in float64."""
     gaussians = random_gaussians(200, camera, seed=1, border=1.5)
     ours = project(gaussians.means, gaussians.quats, gaussians.scales, camera)
@@ -79,7 +79,7 @@ def test_harmonics_are_ours(degree):
     torch.testing.assert_close(harmonics(directions, degree), theirs, rtol=1e-6, atol=1e-7)
 
 
-def test_thresholds_are_ours_but_for_the_cap():
+def test_gsplat_thresholds_equal_the_reference_except_the_alpha_cap():
     assert gsplat_on_cpu.THRESHOLD == ALPHA_THRESHOLD
     assert gsplat_on_cpu.STOP == TRANSMITTANCE_STOP
     assert GsplatRasterizer().max_alpha == gsplat_on_cpu.CAP
@@ -87,7 +87,7 @@ def test_thresholds_are_ours_but_for_the_cap():
         GsplatRasterizer(max_alpha=0.99)
 
 
-def test_its_footprint_is_never_the_smaller_one():
+def test_the_footprint_of_gsplat_is_never_smaller_than_the_reference():
     """3.33 standard deviations, where gsplat ends, lie beyond alpha = 1/255 at any opacity."""
     assert (2 * torch.tensor(255.0).log()).sqrt() < gsplat_on_cpu.EXTENT
 
@@ -111,7 +111,7 @@ def same_direction(found, expected, share):
     assert (found - expected).norm() <= share * expected.norm()
 
 
-def test_a_gaussian_that_is_seen_has_our_radius_and_some_that_are_not_have_one_too(gsplat):
+def test_gsplat_radii_equal_the_reference_for_visible_gaussians(gsplat):
     camera = CAMERAS["middle"]
     scene = leaves(random_gaussians(60, camera, seed=4, border=0.5))
     ours = TorchRasterizer(max_alpha=0.999).render(scene, camera, torch.zeros(3)).screen.radii
@@ -122,7 +122,7 @@ def test_a_gaussian_that_is_seen_has_our_radius_and_some_that_are_not_have_one_t
     assert 0 < (theirs[~seen] > 0).sum() < 0.25 * len(ours)
 
 
-def test_a_cap_of_0_999_is_what_differs(gsplat):
+def test_gsplat_differs_from_the_default_only_by_the_cap_of_0_999(gsplat):
     """Opacities above 0.99 only, and by 0.009 at most."""
     camera = CAMERAS["middle"]
     at_centre = replace(
@@ -203,7 +203,7 @@ def test_no_gaussians_give_the_background(gsplat):
 
 
 @pytest.mark.parametrize("taken_back", [False, True])
-def test_nothing_is_kept_of_a_render_that_is_gone(gsplat, monkeypatch, taken_back):
+def test_a_deleted_render_frees_its_memory(gsplat, monkeypatch, taken_back):
     centers = []
 
     def watched(means2d, *rest, **options):

@@ -115,7 +115,7 @@ def leaves(gaussians):
 
 @pytest.mark.parametrize("camera", [CAMERA, OFF_AXIS], ids=["middle", "off the axis"])
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 3])
-def test_what_is_handed_over_and_taken_back_is_ours(gswarp, camera, sh_degree):
+def test_gswarp_inputs_and_outputs_agree_with_the_reference(gswarp, camera, sh_degree):
     scene = random_gaussians(30, camera, seed=6, sh_degree=sh_degree)
     mine, theirs = leaves(scene), leaves(scene)
     reference = TorchRasterizer(near=0.05, footprint="3-sigma")

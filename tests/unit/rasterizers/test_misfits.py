@@ -53,7 +53,7 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
     assert refused.value.found.startswith(f"{field} is {list(change(tensor).shape)}, not ")
 
 
-def test_colours_are_given_once():
+def test_giving_both_or_neither_of_colors_and_sh_is_refused():
     some = complete(harmonics=True)
     for wrong in (replace(some, colors=some.means), replace(some, sh_dc=None)):
         with pytest.raises(UserError, match="colors and sh_dc"):
@@ -69,7 +69,7 @@ def test_a_degree_without_its_coefficients_is_refused():
 
 
 @pytest.mark.parametrize(("degree", "rest"), [(3, False), (1, False), (-1, True), (4, True)])
-def test_a_degree_that_there_is_not_is_refused(degree, rest):
+def test_an_sh_degree_that_does_not_exist_is_refused(degree, rest):
     some = complete(harmonics=True)
     bands = torch.zeros((len(some), 24, 3)) if rest else None
     with pytest.raises(UserError, match=f"sh_degree is {degree}"):
@@ -77,7 +77,7 @@ def test_a_degree_that_there_is_not_is_refused(degree, rest):
 
 
 @pytest.mark.parametrize("harmonics", [False, True])
-def test_what_fits_is_drawn(harmonics):
+def test_complete_gaussians_are_rendered(harmonics):
     some: Gaussians = complete(harmonics)
     assert some.misfit() is None
     assert drawn(some).image.isfinite().all()

@@ -1,4 +1,4 @@
-"""What a rasterizer of another package lacks is told before training, with a way out."""
+"""Missing requirements of a third-party rasterizer are reported before training with a remedy."""
 
 import sys
 from types import SimpleNamespace
@@ -46,7 +46,7 @@ def objections(rasterizer, device="cuda", **more):
     return rasterizer.crossgrad_validate_selection(selection)
 
 
-def test_a_package_that_is_not_there_is_named_with_its_extra(machine):
+def test_a_missing_package_is_named_with_its_extra(machine):
     machine()
     for rasterizer, package in ((GsplatRasterizer(), "gsplat"), (GswarpRasterizer(), "gswarp")):
         (reason,) = objections(rasterizer)
@@ -89,7 +89,7 @@ def test_gsplat_needs_a_compiler_for_the_host(machine, monkeypatch):
     assert "no C++ compiler" in objections(GsplatRasterizer())[0]
 
 
-def test_gsplat_needs_ninja_which_may_lie_beside_this_python(machine, monkeypatch, tmp_path):
+def test_gsplat_needs_ninja_on_the_path_or_next_to_python(machine, monkeypatch, tmp_path):
     machine("gsplat", nvcc="12.8")
     monkeypatch.setattr(missing.shutil, "which", lambda name: None if name == "ninja" else name)
     monkeypatch.setattr(missing.sys, "executable", str(tmp_path / "env" / "python"))
@@ -114,7 +114,7 @@ def test_torch_looks_for_nvcc_where_cuda_home_points_and_nowhere_else(monkeypatc
     assert f"no nvcc in {tmp_path / 'gone'}, where CUDA_HOME" in missing.compiler_missing("gsplat")
 
 
-def test_an_nvcc_that_says_nothing_is_not_held_against_anybody(machine, tmp_path):
+def test_an_nvcc_without_a_readable_version_is_accepted(machine, tmp_path):
     machine("gsplat", nvcc="12.8")
     (tmp_path / "bin" / "nvcc").write_text("#!/bin/sh\nexit 1\n")
     missing.nvcc_version.cache_clear()
@@ -146,7 +146,7 @@ def test_what_a_rasterizer_does_not_give_is_refused_before_training(slot, name, 
     assert any(reason in objection for objection in objections_to(selection))
 
 
-def test_gswarp_refuses_a_dilation_of_ones_own(machine):
+def test_gswarp_refuses_a_backbone_that_sets_its_dilation(machine):
     machine("gswarp", "warp")
 
     class Own(type(build("backbones", "vanilla", {}))):
@@ -155,7 +155,7 @@ def test_gswarp_refuses_a_dilation_of_ones_own(machine):
     assert "by its own" in objections(GswarpRasterizer(), backbone=Own())[0]
 
 
-def test_the_fastest_that_is_there_and_can_is_taken(machine):
+def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(machine):
     machine("gsplat", "gswarp", "warp", nvcc="12.8")
     assert choose_rasterizer("auto", CUDA)[0] == "gsplat"
     assert choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"count"})))[0] == "gsplat"
@@ -175,7 +175,7 @@ def test_without_a_compiler_gswarp_is_taken_and_without_both_the_reference(machi
     assert choose_rasterizer("auto", CUDA)[0] == "torch"
 
 
-def test_a_third_partys_is_asked_too(machine, tmp_path, monkeypatch):
+def test_a_third_party_rasterizer_takes_part_in_the_choice(machine, tmp_path, monkeypatch):
     machine("gsplat", nvcc="12.8")
     source = """
 from crossgrad_core.plugin import Rasterizer

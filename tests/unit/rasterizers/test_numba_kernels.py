@@ -130,7 +130,7 @@ def test_a_gaussian_is_its_opacity_at_its_centre_and_falls_off_with_the_dilated_
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_the_nearer_of_two_hides_the_other_by_its_alpha(first):
+def test_the_nearer_gaussian_covers_the_farther_one_by_its_alpha(first):
     depths = [1.0, 2.0] if first == 0 else [2.0, 1.0]
     colors = np.array([(1.0, 0.0, 0.25), (0.0, 1.0, 0.5)])
     opacities = np.array([0.6, 0.5])
@@ -280,7 +280,7 @@ def test_optional_outputs_change_no_other_gradient():
 
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("count", [1, 40, 5000])
-def test_memory_that_held_something_changes_no_gradient(monkeypatch, count, response):
+def test_reused_memory_changes_no_gradient(monkeypatch, count, response):
     """Of Gaussians that are drawn and of those beside the image."""
     size, view = (40, 24), camera(40, 24)
     gaussians = cloud(count, size)
@@ -342,7 +342,7 @@ def test_harmonics_gradients_equal_difference_quotients(degree):
 
 @pytest.mark.parametrize("rows", [frozenset(), frozenset({"sh_dc", "sh_rest"})], ids=len)
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_what_nobody_asks_the_harmonics_changes_no_other_gradient(degree, rows):
+def test_leaving_out_gradients_of_sh_changes_no_other_gradient(degree, rows):
     size = (40, 30)
     dc, rest = harmonics(200, 3)
     base = cloud(200, size, seed=6)
@@ -409,7 +409,7 @@ def same_bits(first, second):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_bits_depend_neither_on_the_number_of_threads_nor_on_the_run(threads):
+def test_bits_do_not_depend_on_the_number_of_threads_or_the_run(threads):
     if threads > numba.config.NUMBA_NUM_THREADS:
         pytest.skip("fewer threads here")
     size = (150, 90)
@@ -455,7 +455,7 @@ def test_rows_of_sixteen_numbers_fill_cache_lines(count):
     assert count == 0 or room.ctypes.data % 64 == 0
 
 
-def test_two_frames_live_side_by_side():
+def test_two_frames_can_be_kept_at_the_same_time():
     size = (40, 30)
     first, second = cloud(50, size, seed=1), cloud(70, size, seed=2)
     v_image = weights(size)[0]
@@ -521,7 +521,7 @@ def test_very_many_gaussians_in_one_pixel():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5000])
-def test_items_of_one_depth_keep_their_order(count):
+def test_items_of_equal_depth_keep_their_order(count):
     items = np.arange(count, dtype=np.int32)[::-1].copy()
     np.testing.assert_array_equal(order_by_depth(np.full(count, 2.5), items), items)
 
@@ -548,7 +548,7 @@ def test_too_many_pairs_of_gaussian_and_tile_are_refused():
 
 
 @pytest.mark.parametrize("width", range(65, 73))
-def test_where_the_image_ends_within_a_patch_pixels_are_the_same(width):
+def test_pixels_are_the_same_if_the_image_ends_within_a_patch(width):
     gaussians, shown = cloud(60, (32, 24), seed=5), DrawOptions(depth=True)
     whole, cut = camera(128, 32), replace(camera(128, 32), width=width, height=21)
     # The Jacobian's bounds follow the size of the image; these means lie far within.

@@ -93,7 +93,7 @@ def test_every_pixel_follows_the_published_rule(name, seed):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_cuts_what_the_common_rules_draw(name):
+def test_the_published_footprint_cuts_pixels_of_the_default_footprint(name):
     """A round Gaussian whose 3.3 standard deviations reach one tile farther than its 3."""
     scale = torch.full((1, 3), 0.0643)  # 3.9 pixels, dilated
     facing = sample_camera().world_to_camera[2, :3].float()
@@ -121,7 +121,7 @@ def test_the_backward_pass_sees_the_same_pixels():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_too_faint_to_draw_counts_as_seen(name):
+def test_a_gaussian_too_transparent_to_render_counts_as_visible(name):
     of = gaussians(1)
     faint = replace(of, opacities=torch.full_like(of.opacities, 1e-4))
     radii = rendered(name, of).screen.radii
@@ -152,7 +152,7 @@ def test_what_the_user_sets_wins():
     assert options_of(recipe={"name": "published"}, rasterizer=chosen).near == 0.5
 
 
-def test_a_rasterizer_that_cannot_is_refused_with_the_way_out(monkeypatch):
+def test_a_rasterizer_without_the_published_footprint_is_refused_with_a_remedy(monkeypatch):
     class Common(Rasterizer):
         def render(self, gaussians, camera, background, outputs=frozenset()):
             raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Which patches of a tile are reached, against a look at every pixel."""
+"""The patches of a tile that a Gaussian reaches, compared with a test of every pixel."""
 
 import numpy as np
 

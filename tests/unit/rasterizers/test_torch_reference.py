@@ -1,4 +1,4 @@
-"""What the reference draws: closed forms, culling, and agreement with brute force."""
+"""Renders of the reference: closed forms, culling, and agreement with brute force."""
 
 from dataclasses import replace
 from math import ceil, erf, exp, log, pi, sqrt
@@ -65,7 +65,7 @@ def test_touches_exactly_the_pixels_at_or_above_the_threshold():
     assert result.screen.radii.tolist() == [ceil(sqrt(2 * log(255 * 0.8) * sigma2))]
 
 
-def test_nearer_gaussian_is_in_front_whatever_the_order_of_rows():
+def test_nearer_gaussian_is_in_front_for_any_order_of_rows():
     # Red and green, the second nearer: green is drawn first.
     result = render(stack([3.0, 2.0], [0.5, 0.6]), frontal())
     expected = torch.tensor([0.4 * 0.5, 0.6, 0.0], dtype=torch.float64)
@@ -209,7 +209,7 @@ def test_analytic_ignores_dilation():
     ],
 )
 @pytest.mark.parametrize("response", RESPONSES)
-def test_what_cannot_be_drawn_leaves_no_trace(field, value, response):
+def test_a_gaussian_that_cannot_be_rendered_changes_nothing(field, value, response):
     good = stack([2.0, 3.0, 4.0], [0.5, 0.5, 0.5], response=response)
     getattr(good, field)[1] = torch.tensor(value, dtype=torch.float64)
     tensors = [good.means, good.quats, good.scales, good.opacities, good.colors]

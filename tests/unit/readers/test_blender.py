@@ -66,7 +66,7 @@ def test_validation_views_are_held_out_where_there_are_no_others(tmp_path):
     assert {view.name for view in scene.test_views} == {"val/r_0.png", "val/r_1.png"}
 
 
-def test_training_views_alone_are_split_as_always(tmp_path):
+def test_a_scene_with_training_views_only_uses_the_default_split(tmp_path):
     scene = read(write(tmp_path, ("train",), views=4))
     assert [view.name for view in scene.test_views] == ["r_0.png"]
 
@@ -92,7 +92,7 @@ def test_alpha_may_be_a_mask_instead(tmp_path):
     assert torch.equal(mask, expected)
 
 
-def test_transforms_may_stand_in_a_folder(tmp_path):
+def test_transforms_may_be_in_a_folder(tmp_path):
     # As MatrixCity's pose/block_all, whose photos stand elsewhere in the scene.
     path = write(tmp_path)
     (path / "pose").mkdir()

@@ -227,7 +227,7 @@ def test_photos_may_be_links_and_a_note_says_where_they_lie(reader, what, make):
 
 @pytest.mark.parametrize("reader", [*FILES, "colmap"])
 @pytest.mark.parametrize("what", ["a text", "a pipe", "a device", "a folder", "nothing", "itself"])
-def test_what_stands_in_place_of_a_photo_is_refused_at_once(reader, what, make):
+def test_anything_else_in_place_of_a_photo_is_refused_at_once(reader, what, make):
     path = make(reader)
     for photo in path.rglob("*.png"):
         photo.unlink()
@@ -241,7 +241,7 @@ def test_what_stands_in_place_of_a_photo_is_refused_at_once(reader, what, make):
 
 @pytest.mark.parametrize("reader", FILES)
 @pytest.mark.parametrize("what", ["a pipe", "a device"])
-def test_what_stands_in_place_of_the_poses_is_refused_at_once(reader, what, make):
+def test_a_pipe_or_device_in_place_of_the_poses_is_refused_at_once(reader, what, make):
     path = make(reader)
     file = path / FILES[reader]
     file.unlink()
@@ -270,7 +270,7 @@ def test_every_file_may_be_a_link_as_caches_lay_them_out(make):
     ]
 
 
-def test_no_name_leads_through_a_folder_elsewhere_but_to_photos(make):
+def test_only_photos_may_be_reached_through_a_link_out_of_the_scene(make):
     path = make("nerfstudio")
     away = path.parent.parent / "away"
     away.mkdir()
@@ -294,7 +294,7 @@ def test_too_many_values_for_the_memory_are_not_built(make, monkeypatch):
 
 
 @pytest.mark.parametrize("key", ["mask_path", "ply_file_path", "train_filenames"])
-def test_every_name_in_a_file_is_held_to_the_scene(key, make):
+def test_every_file_name_in_a_file_must_stay_inside_the_scene(key, make):
     path = make("nerfstudio")
     name = "../../secret.png"
     where = {"mask_path": ("frames", 0, key)}.get(key, (key,))

@@ -307,7 +307,7 @@ class TestPhotos:
         assert "images_2/ is not used, 1 photo of it missing: 0007.png" in notes(scene)
         assert "24 x 16 px (8) from images/, 8 resized (scikit-image" in notes(scene)
 
-    def test_reduced_photos_alone_will_do(self, make):
+    def test_reduced_photos_without_the_originals_are_enough(self, make):
         path = make()
         (path / "images").rename(path / "images_4")
         rewrite_camera(path, 192, 128, (230.4, 230.4, 102.0, 60.0))
@@ -473,7 +473,7 @@ class TestModels:
         refuses(path, "cut short", file)
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-    def test_files_that_go_on_are_refused(self, make, file):
+    def test_files_with_data_after_the_last_record_are_refused(self, make, file):
         path = make()
         with (model(path) / file).open("ab") as end:
             end.write(b"\0" * 9)

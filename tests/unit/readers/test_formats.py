@@ -54,7 +54,7 @@ def plain(reader, name):
 
 
 @pytest.mark.parametrize("reader", FORMATS)
-def test_each_form_has_one_reader(reader, forms):
+def test_each_format_is_accepted_by_one_reader(reader, forms):
     assert accepting(forms[reader]) == [reader]
 
 

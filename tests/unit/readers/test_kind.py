@@ -43,7 +43,7 @@ def test_other_files_with_its_suffix_are_passed_over(program, scene):
     assert len(read(program, scene).views) > 0
 
 
-def test_of_two_the_named_one_is_read(program, scene):
+def test_of_two_files_the_named_file_is_read(program, scene):
     file = file_of(scene, program)
     file.with_stem("other").write_bytes(file.read_bytes())
     with pytest.raises(UserError, match=f"several {KINDS[program][0]}s") as caught:
@@ -52,7 +52,7 @@ def test_of_two_the_named_one_is_read(program, scene):
     assert len(read(program, scene, file=file.name).views) > 0
 
 
-def test_where_there_is_none_the_error_says_what_it_would_hold(program, scene):
+def test_the_error_for_a_missing_file_names_its_contents(program, scene):
     file_of(scene, program).unlink()
     assert not build("readers", program, {}).accepts(scene)
     with pytest.raises(UserError, match=f"no {KINDS[program][0]} of"):

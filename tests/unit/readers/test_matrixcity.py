@@ -49,7 +49,7 @@ def test_blocks_of_a_city_are_one_scene(held_out, blocks, tmp_path):
     assert len(scene.train) == 6
 
 
-def test_blocks_are_not_looked_for_everywhere(blocks, tmp_path):
+def test_blocks_are_not_searched_in_deep_or_linked_folders(blocks, tmp_path):
     shutil.copytree(blocks, tmp_path / "home" / "documents" / "block_1")
     (tmp_path / "home" / "block_9").symlink_to(blocks, target_is_directory=True)
     assert not MatrixCityReader().accepts(tmp_path / "home")

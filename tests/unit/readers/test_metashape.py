@@ -57,7 +57,7 @@ def test_the_terms_of_a_lens_are_agisofts():
     np.testing.assert_allclose(camera.img_from_cam(np.array([[x, y, 1.0]]))[0], pixel, rtol=1e-12)
 
 
-def test_the_chunks_own_coordinates_can_be_had(path):
+def test_the_coordinates_of_the_chunk_can_be_chosen(path):
     (path / "points.ply").unlink()
     reader, options = MetashapeReader(frame="chunk"), SceneOptions(init="random")
     own, world = reader.read(path, options), MetashapeReader().read(path, options)
@@ -158,7 +158,7 @@ def test_a_rolling_shutter_that_is_not_compensated_is_read(told, path):
     assert [view.camera.world_to_camera.tolist() for view in read(path).views] == before
 
 
-def test_a_rolling_shutter_of_no_photo_is_nobody_s(path):
+def test_a_rolling_shutter_of_an_unused_sensor_is_ignored(path):
     other = '<sensor id="77" type="frame"><property name="rolling_shutter" value="true"/></sensor>'
     edit(path, r"</sensors>", f"{other}</sensors>")
     assert len(read(path).views) == 3

@@ -95,7 +95,7 @@ def make_rig(path, *, of_master=None, order="master first", own=False):
 
 
 @pytest.mark.parametrize("order", ["master first", "slaves first"])
-def test_slaves_stand_where_their_masters_and_the_offset_put_them(order, path):
+def test_slave_cameras_are_placed_by_their_master_and_the_offset(order, path):
     poses = make_rig(path, order=order)
     scene = read(path)
     assert [view.name for view in scene.views] == [f"{i:04d}.png" for i in range(4)]
@@ -177,7 +177,7 @@ TWO = ["cam0/a.png", "cam1/a.png"]
         [("a", "", "cam0"), ("a", "", "other")],
     ],
 )
-def test_folder_group_sensor_or_what_is_left_tells_photos_apart(cameras, sizes):
+def test_equal_labels_are_resolved_by_folder_group_sensor_or_exclusion(cameras, sizes):
     for order in (1, -1):
         found, notes = pairs(cameras[::order], TWO)
         assert found == TWO[::order]
@@ -190,7 +190,7 @@ def test_the_size_of_the_photo_tells_them_apart(sizes):
 
 
 @pytest.mark.parametrize("of", ["group", "sensor"])
-def test_at_last_their_order_tells_with_a_note(of, sizes):
+def test_equal_labels_are_resolved_by_order_as_a_last_resort_with_a_note(of, sizes):
     labels = [(name, owner) for owner in ("first", "second") for name in ("a", "b")]
     cameras = [(name, owner, "x") if of == "group" else (name, "", owner) for name, owner in labels]
     names = [f"{folder}/{name}.png" for folder in ("left", "right") for name in ("a", "b")]
@@ -211,7 +211,7 @@ def test_at_last_their_order_tells_with_a_note(of, sizes):
         ([("a", "", "x"), ("a", "", "y")], ["cam0/a.png"], r"cam0/a\.png"),
     ],
 )
-def test_what_stays_open_is_one_error_that_names_it(cameras, names, named, sizes):
+def test_an_unresolved_label_is_one_error_that_names_it(cameras, names, named, sizes):
     with pytest.raises(UserError, match=rf"a \(sensor x\)(?s:.*){named}"):
         pairs(cameras, names)
 

@@ -48,7 +48,7 @@ def test_cameras_look_along_minus_z_with_y_up(tmp_path):
     np.testing.assert_allclose(pixels, [[11, 9], [11 + 6, 9], [11, 9 - 6.2]], atol=1e-6)
 
 
-def test_a_lens_is_that_of_the_frame_then_that_of_all(tmp_path):
+def test_lens_values_of_a_frame_override_the_values_of_the_file(tmp_path):
     camera = read(write(tmp_path, {"fl_x": 40.0}, **LENS)).views[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40.0, 31.0, 11.0, 9.0)
 
@@ -191,7 +191,7 @@ def test_lists_may_leave_out_suffixes_as_frames_may(tmp_path):
         ),
     ],
 )
-def test_lists_that_cannot_be_name_their_file_and_field(lists, what, where, tmp_path):
+def test_invalid_split_lists_are_reported_with_file_and_field(lists, what, where, tmp_path):
     path = write(tmp_path, **LENS, **{f"{part}_filenames": names for part, names in lists.items()})
     with pytest.raises(UserError, match=what) as caught:
         read(path, split="auto")

@@ -48,7 +48,7 @@ def test_lists_of_the_user_come_first(tmp_path):
         ("contest/0001.png", False),
     ],
 )
-def test_what_is_held_out(name, held_out):
+def test_held_out_photos_are_recognised_by_name(name, held_out):
     assert is_held_out(name) is held_out
 
 

@@ -165,7 +165,7 @@ def test_regimes_have_scales_of_their_own_where_their_spectra_differ(scene, per_
         assert far == pytest.approx(near, rel=0.02)
 
 
-def test_what_is_written_down_is_what_is_used():
+def test_a_fitted_resolution_is_read_back_without_a_new_measurement():
     resolution = Spectral().fitted_to(APART)
     again = Spectral.model_validate(resolution.model_dump(mode="json"))
     assert again == resolution
@@ -192,7 +192,7 @@ def test_a_bounded_number_of_photos_is_looked_at():
 
 
 @pytest.mark.parametrize("resolution", [Spectral().fitted_to(APART), Octaves()])
-def test_a_step_looks_at_no_photo(resolution, monkeypatch):
+def test_a_step_does_not_read_photos(resolution, monkeypatch):
     monkeypatch.setattr(spectral, "kept_shares", None)
     schedule, state = Schedule.for_run(900), PluginState()
     for step in range(1, 901, 100):

@@ -51,7 +51,7 @@ def test_a_zoom_path_begins_and_ends_with_photos_that_show_the_same():
     torch.testing.assert_close(ends[0].world_to_camera, views[1].camera.world_to_camera)
 
 
-def test_the_ends_of_a_ladder_against_all_pairs():
+def test_the_ends_of_a_zoom_path_agree_with_a_search_of_all_pairs():
     rng = np.random.default_rng(4)
     for _ in range(30):
         views, points = views_above(rng.choice(np.arange(1.0, 90.0), 12, replace=False))
@@ -157,7 +157,7 @@ def test_a_whole_number_of_pixels_may_have_a_point(tmp_path, width):
     assert (camera.width, type(camera.width)) == (30, int)
 
 
-def test_something_else_in_place_of_the_folder_of_frames(tmp_path):
+def test_a_file_in_place_of_the_frames_folder_is_refused(tmp_path):
     (tmp_path / "renders").touch()
     with pytest.raises(UserError, match="something else is in the way"):
         video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")

@@ -1,4 +1,4 @@
-"""Which views of another capture the run was trained on."""
+"""Detection of views of another capture on which the run was trained."""
 
 from dataclasses import replace
 from pathlib import Path

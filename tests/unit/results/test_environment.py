@@ -1,4 +1,4 @@
-"""Which code a run was made with."""
+"""The record of the code version that made a run."""
 
 import subprocess
 

@@ -14,7 +14,7 @@ STARTED = datetime(2026, 3, 5, 9, 8, 7).astimezone()
 NAME = RunName("boruszyn", "vanilla", "near-far", "pcgrad", STARTED)
 
 
-def test_is_named_after_scene_method_and_time(tmp_path: Path):
+def test_a_run_folder_is_named_after_scene_method_and_time(tmp_path: Path):
     folder = create_run_folder(NAME, root=tmp_path)
     assert folder == tmp_path / "boruszyn" / "vanilla-near-far-pcgrad" / "20260305-090807"
     assert list(folder.iterdir()) == []
@@ -64,7 +64,7 @@ def test_who_writes_into_the_folder_is_reported(tmp_path: Path):
         create_run_folder(NAME, out=tmp_path)
 
 
-def test_what_a_run_leaves_that_was_killed_at_once_does_not_count(tmp_path: Path):
+def test_leftovers_of_a_run_killed_at_once_do_not_make_a_folder_occupied(tmp_path: Path):
     (tmp_path / ".config.yaml.4711.tmp").write_text("backb")
     with locked(tmp_path, "training"):
         pass

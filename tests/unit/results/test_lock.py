@@ -35,7 +35,7 @@ def holder(tmp_path):
         process.kill()
 
 
-def test_a_second_process_is_refused_and_told_who_and_since_when(tmp_path, holder):
+def test_a_second_process_is_refused_with_the_holder_and_its_start_time(tmp_path, holder):
     with pytest.raises(RunInUseError) as told, locked(tmp_path, "training"):
         pass
     message = str(told.value)
@@ -54,7 +54,7 @@ def test_the_lock_dies_with_its_process(tmp_path, holder, number):
         assert held
 
 
-def test_it_holds_within_one_process_too_and_ends_with_the_block(tmp_path):
+def test_the_lock_works_within_one_process_and_ends_with_the_block(tmp_path):
     with locked(tmp_path, "training"):
         with pytest.raises(RunInUseError, match=f"process {os.getpid()}"), locked(tmp_path, "x"):
             pass

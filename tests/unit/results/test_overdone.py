@@ -14,7 +14,7 @@ def rows_of(*figures):
     ]
 
 
-def test_what_was_better_is_reported_with_its_step_and_time():
+def test_a_better_earlier_evaluation_is_reported_with_step_and_time():
     (line,) = overdone(rows_of(18.0, 19.07, 18.12))
     assert line.startswith("the last evaluation is 0.95 dB below that of step 200, 19.07 dB after ")
     assert "25 s of training" in line and "--max-views" in line
@@ -25,5 +25,5 @@ def test_what_was_better_is_reported_with_its_step_and_time():
     [(), (19.0,), (18.0, 19.0), (19.0, 19.0 - WORSE + 1e-9), (None, None), (19.0, None), (nan, 9.0),
      (19.0, nan)],
 )  # fmt: skip
-def test_ends_at_the_best_or_near_it_and_ends_without_figures_are_no_news(figures):
+def test_ending_at_or_near_the_best_or_without_metrics_is_not_reported(figures):
     assert overdone(rows_of(*figures)) == []

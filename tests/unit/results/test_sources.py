@@ -3,7 +3,7 @@
 from crossgrad_core.run.results.sources import FILE, name_for
 
 
-def test_places_of_one_name_get_numbers_and_keep_them(tmp_path):
+def test_scenes_of_one_name_get_numbers_and_keep_them(tmp_path):
     places = [tmp_path / where / "scene" for where in "abc"]
     names = [name_for(tmp_path, "scene", place) for place in (*places, *places)]
     assert names == ["scene", "scene-2", "scene-3"] * 2

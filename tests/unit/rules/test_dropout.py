@@ -62,7 +62,7 @@ def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
     assert np.mean(shares) == pytest.approx(share, abs=error)
 
 
-def test_what_is_nearly_opaque_can_still_fade():
+def test_nearly_opaque_gaussians_still_get_a_gradient_under_dropout():
     """Its opacity is cut off at 1, its gradient is not."""
     setup = setup_of(rules={"dropout": {"share": 0.3}})
     state = first_state(setup)
@@ -87,7 +87,7 @@ def test_without_the_rule_there_is_no_change_and_no_generator():
     assert "dropout" not in state.rngs
 
 
-def test_what_is_left_out_gets_no_gradient_and_plugins_see_everything():
+def test_dropped_gaussians_get_no_gradient_and_plugins_see_all_gaussians():
     setup = setup_of(rules={"dropout": {"share": 0.5}})
     state = first_state(setup)
     rendered, _ = render_views(setup, state, ViewSample((0,)), (1.0,))
@@ -118,7 +118,7 @@ def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share)
     assert len(noted) == (share > 0.0 and "rules" not in given)
 
 
-def test_what_is_said_of_the_default_is_the_default():
+def test_the_documented_dropout_default_is_the_default():
     said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
     row = next(line for line in said.splitlines() if line.startswith("| `rules.dropout`"))
     assert f"{DROPOUT}" in row and f"{FEW_PHOTOS} training photos" in row

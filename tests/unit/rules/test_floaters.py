@@ -108,7 +108,7 @@ def test_what_floats_is_what_the_whole_models_photos_leave_out(backbone, seed):
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
-def test_photos_stay_as_they_are(backbone):
+def test_removing_floaters_does_not_change_the_renders_of_photos(backbone):
     setup = setup_of(backbone)
     state = scattered(setup)
     before = [render.image for _, render in images(setup, state.parameters)]
@@ -173,7 +173,7 @@ def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
     assert {len(t) for t in moments.exp_avg.values()} == {before}
 
 
-def test_a_set_of_which_nothing_would_be_left_stays():
+def test_nothing_is_removed_if_all_gaussians_are_floaters():
     setup = setup_of(initializer=ComponentChoice(name="points"))
     state = first_state(setup)
     behind = setup.train_views[0].camera
@@ -221,7 +221,7 @@ def test_ground_below_a_level_camera_stays():
     ]
 
 
-def test_nothing_floats_where_nothing_says_what_is_empty():
+def test_no_floaters_are_found_without_observations():
     scene = sample_scene()
     blind = replace(
         scene, views=tuple(replace(view, seen=np.zeros(0, np.int64)) for view in scene.views)
@@ -245,7 +245,7 @@ def test_nothing_floats_where_nothing_says_what_is_empty():
         ({"densifier": ComponentChoice(name="none"), "rules": {"floaters": {}}}, True),
     ],
 )
-def test_the_default_and_what_is_said_of_it(given, what):
+def test_the_default_of_the_floaters_rule(given, what):
     assert bool(resolved(setup_of(**given)).rules.get("floaters")) == what
 
 

@@ -105,7 +105,7 @@ def test_axes_are_as_long_as_they_may_be(seed, bound, at_once, monkeypatch):
     assert all(torch.equal(state.parameters[n], before[n]) for n in before if n != "scales")
 
 
-def test_what_has_diverged_and_what_is_small_stay():
+def test_non_finite_and_small_scales_are_not_clamped():
     setup = setup_of()
     state = at_random(setup, 0)
     scales = state.parameters["scales"].detach()
@@ -118,7 +118,7 @@ def test_what_has_diverged_and_what_is_small_stay():
     assert scales[3, 0] >= np.log(np.float32(LEAST)) - 1e-6
 
 
-def test_nothing_is_too_long():
+def test_scales_below_the_bound_are_not_clamped():
     """No Gaussian is large, or all are large and far away."""
     setup = setup_of()
     state = at_random(setup, 0)
@@ -139,7 +139,7 @@ def test_a_run_within_seconds_is_reported_once_its_length_is_planned(tmp_path, c
     )
 
 
-def test_sizes_are_looked_at_once_in_so_many_steps():
+def test_scales_are_clamped_at_fixed_intervals_only():
     setup = setup_of()
     state = at_random(setup, 0, step=EVERY + 1)
     before = state.parameters["scales"].detach().clone()
@@ -183,7 +183,7 @@ def test_a_step_bounds_sizes(backbone):
     ],
     ids=str,
 )
-def test_which_runs_have_a_bound(settings, bound):
+def test_the_default_of_the_scale_clamp_rule(settings, bound):
     setup = setup_of(**settings)
     rule = setup.selection.rules.get("scale-clamp")
     assert (0.0 if rule is None else rule.ratio) == bound

@@ -112,7 +112,7 @@ def test_a_rule_that_the_user_sets_is_decided_no_longer(tmp_path):
 
 
 @pytest.mark.parametrize("value", [0.3, "off", [1]])
-def test_what_is_no_rule_is_refused(value):
+def test_an_invalid_value_for_a_rule_is_refused(value):
     with pytest.raises(UserError, match=r"rules\.dropout"):
         parsed({"rules": {"dropout": value}})
 

@@ -87,7 +87,7 @@ def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(setting
     assert all(steps == list(range(1, last + 1)) for steps in found.values())
 
 
-def test_what_rests_is_handed_over_without_a_gradient_and_the_rasterizer_leaves_it_out(monkeypatch):
+def test_sh_bands_that_do_not_learn_in_a_step_are_passed_without_gradient(monkeypatch):
     setup = setup_of(rules=RULES, views_per_step=2)
     due = [step for step in range(1, STEPS + 1) if learns_in(step, EVERY)]
     decoded, worked_out = [], []

@@ -81,7 +81,7 @@ def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left)
     assert rate_factor(setup, LearningRate(0.3, 0.3), step) == pytest.approx(left, rel=1e-12)
 
 
-def test_what_is_left_of_a_rate_is_an_option():
+def test_the_final_factor_of_the_learning_rate_is_an_option():
     setup = setup_of(**using("lr-tail", share=0.5, factor=0.25), steps=100)
     assert rate_factor(setup, CONSTANT, 100) == 0.25
     assert rate_factor(setup, CONSTANT, 75) == 0.5
@@ -145,7 +145,7 @@ def test_the_average_is_that_of_the_last_steps_and_changes_no_training(runs):
             assert tensor is state.parameters[name]
 
 
-def test_what_is_drawn_is_the_average(runs):
+def test_evaluation_renders_the_averaged_parameters(runs):
     setup, state = runs.setups["averaged"], runs.averaged[0]
     view = sample_scene().test_views[0]
     raw = TrainState(state.parameters, state.adam, state.rngs, step=state.step)
@@ -237,7 +237,7 @@ def test_sums_of_many_states_lose_nothing():
     assert float(shown["x"]) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_run_that_becomes_longer_forgets_what_is_not_its_end_any_more():
+def test_a_longer_length_discards_an_average_that_began_too_early():
     run = Counted(100, 0.1)
     for step in range(1, 96):
         run.take(step)
@@ -279,7 +279,7 @@ def test_noise_after_every_step_does_not_keep_the_average_from_growing():
     assert state.states[NAME].values["count"] == 5
 
 
-def test_the_published_recipe_has_neither():
+def test_the_published_recipe_has_no_rate_tail_and_no_averaging():
     published = {"recipe": {"name": "published"}}
     assert resolved(setup_of(**published)).rules == {}
     both = {"lr-tail": {"share": 0.2}, NAME: {"share": 0.1}}

@@ -73,7 +73,7 @@ def test_units_do_not_matter(scale, shift):
         pytest.param([0.0] * 5, "equal", id="zero"),
     ],
 )
-def test_what_has_no_coefficient_says_why(values, reason):
+def test_values_without_a_coefficient_give_the_reason(values, reason):
     found = bimodality(np.array(values))
     assert np.isnan([found.sample, found.population]).all()
     assert reason in found.reason

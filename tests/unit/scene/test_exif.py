@@ -1,4 +1,4 @@
-"""What EXIF headers say about exposure."""
+"""Exposure values from EXIF headers."""
 
 from dataclasses import replace
 from math import log2
@@ -37,7 +37,7 @@ def test_time_sensitivity_and_aperture_make_a_value(tmp_path):
         {SENSITIVITY: 0},
     ],
 )
-def test_what_no_camera_does_is_no_value(tmp_path, changes):
+def test_impossible_exif_values_give_no_exposure_value(tmp_path, changes):
     assert _of_file(photo(tmp_path / "a.jpg", {**WHOLE, **changes})) is None
 
 

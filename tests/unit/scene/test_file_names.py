@@ -1,4 +1,4 @@
-"""Names that other programs give to files: which file each one stands for, or why none."""
+"""Matching of names from other programs to files, with the reason if no file matches."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Where distortion models fold over, and what undistortion to a pinhole loses."""
+"""Fold-over of distortion models, and pixels that undistortion to a pinhole loses."""
 
 from pathlib import Path
 

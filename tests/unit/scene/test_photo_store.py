@@ -132,7 +132,7 @@ def test_an_entry_of_another_size_does_not_count(store, folder):
     assert len(other.decoded) == 1
 
 
-def test_what_nobody_used_goes_first_and_what_is_in_use_stays(folder):
+def test_unused_entries_are_evicted_first_and_used_entries_stay(folder):
     store = PhotoStore(folder, 1)
     store._limit = 4 * MASKED_BYTES
     for number in range(4):

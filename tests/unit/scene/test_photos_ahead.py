@@ -55,7 +55,7 @@ def all_done(sources):
     return all(source.done.wait(SECONDS) for source in sources)
 
 
-def test_what_is_expected_comes_before_what_was_not_seen(log):
+def test_expected_photos_are_decoded_before_unseen_photos(log):
     gate = Event()
     first = [Source(number, log, gate) for number in range(AT_ONCE)]
     sources = [Source(number, log) for number in range(10, 16)]
@@ -70,7 +70,7 @@ def test_what_is_expected_comes_before_what_was_not_seen(log):
     assert sorted(log) == sorted(source.number for source in (*first, *sources))
 
 
-def test_it_is_over_once_all_photos_are_in_memory(log):
+def test_decoding_ahead_ends_once_all_photos_are_in_memory(log):
     sources = [Source(number, log) for number in range(5)]
     views, ahead = views_of(sources), PhotosAhead()
     assert not ahead.useful

@@ -214,7 +214,7 @@ def test_a_las_file_without_colors_is_grey_and_a_damaged_one_is_an_error(tmp_pat
             read_las(path)
 
 
-def test_of_a_huge_las_file_each_so_many_points_is_read(tmp_path, monkeypatch):
+def test_of_a_huge_las_file_every_nth_point_is_read(tmp_path, monkeypatch):
     laspy = pytest.importorskip("laspy")
     xyz = np.arange(300.0).reshape(100, 3)
     path = write_las(laspy, tmp_path / "scan.las", xyz, None)

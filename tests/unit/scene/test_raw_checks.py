@@ -1,4 +1,4 @@
-"""What a reader found is refused or left out before anything is computed with it."""
+"""Invalid data of a reader is refused or left out before anything is computed with it."""
 
 import numpy as np
 import pytest

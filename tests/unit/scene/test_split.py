@@ -61,7 +61,7 @@ def test_stratified_takes_every_eighth_of_each_regime(tmp_path):
     assert len(split_views(NAMES, fourth, tmp_path, label=by_parity).test) == 8
 
 
-def test_by_itself_it_is_stratified_where_only_that_holds_out_two_of_a_regime(tmp_path):
+def test_the_default_split_is_stratified_only_if_a_regime_needs_it(tmp_path):
     result = split_views(NAMES, SceneOptions(), tmp_path, label=by_parity)
     assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
     assert result.notes[1] == (

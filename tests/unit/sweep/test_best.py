@@ -47,7 +47,7 @@ def swept(tmp_path):
     return grid, cells, standings
 
 
-def test_each_arm_stands_there_as_it_is_and_at_its_best(swept, tmp_path):
+def test_the_best_grid_contains_each_arm_as_given_and_at_its_best_value(swept, tmp_path):
     content, notes = best_grid(*swept, tmp_path / "elsewhere")
     path = tmp_path / "elsewhere" / "best.yaml"
     path.parent.mkdir()
@@ -131,7 +131,7 @@ def test_a_file_that_is_there_is_kept(tmp_path):
     assert best.read_text() == "mine"
 
 
-def test_it_is_refused_before_all_is_finished(swept, tmp_path):
+def test_the_best_grid_is_refused_before_all_runs_are_finished(swept, tmp_path):
     grid, cells, standings = swept
     left = [
         Standing(each.job, "waiting") if each.job.scene == "beach" else each for each in standings

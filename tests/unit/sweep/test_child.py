@@ -33,7 +33,7 @@ def test_its_session_is_as_nice_as_the_sweep():
 
 
 @pytest.mark.parametrize(("niceness", "said"), [(0, []), (7, ["7"])])
-def test_only_a_nice_one_says_so(monkeypatch, tmp_path, niceness, said):
+def test_the_session_niceness_is_written_only_if_nonzero(monkeypatch, tmp_path, niceness, said):
     place = tmp_path / "autogroup"
     monkeypatch.setattr(child, "_SESSION_NICENESS", place)
     monkeypatch.setattr(child.os, "nice", lambda _: niceness)

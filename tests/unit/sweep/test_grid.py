@@ -112,7 +112,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_what_is_wrong_is_said_with_its_place(tmp_path, text):
+def test_errors_of_a_grid_name_the_file_and_the_place(tmp_path, text):
     with pytest.raises(UserError) as caught:
         read_grid(written(tmp_path, text))
     assert WRONG[text] in str(caught.value)
@@ -125,7 +125,7 @@ def test_a_list_that_is_empty_without_its_wrong_parts_is_wrong_once(tmp_path):
     assert "not be empty" not in str(caught.value) and "2 things" not in str(caught.value)
 
 
-def test_all_that_is_wrong_is_said_at_once(tmp_path):
+def test_all_errors_of_a_grid_are_reported_at_once(tmp_path):
     text = "base: {out: x, threads: 1}\nseeds: [1, 1]\narms: [{name: a}, {name: a}]"
     with pytest.raises(UserError, match="4 things are wrong"):
         read_grid(written(tmp_path, text))
@@ -158,7 +158,7 @@ def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )
-def test_what_would_be_passed_over_is_refused(tmp_path, capsys, options, words):
+def test_sweep_options_without_effect_are_refused(tmp_path, capsys, options, words):
     path = written(tmp_path, "base: {steps: 3}")
     shown = () if "--list" in options else ("--dry-run",)
     assert ended("sweep", path, "--out", tmp_path / "out", *shown, *options) == 2

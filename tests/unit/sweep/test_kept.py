@@ -68,7 +68,7 @@ def test_runs_that_belong_to_no_sweep_are_refused_and_nothing_is_left(script, sw
     assert not (tmp_path / "results").exists()
 
 
-def test_what_is_there_stays(script, sweep, tmp_path):
+def test_unpacking_keeps_existing_runs(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     (sweep / "runs" / "r0" / "metrics.csv").write_text("newer")
     (sweep / "runs.csv").write_text("run,configuration\nr2,a\nr1,a\nr0,a\n")

@@ -78,7 +78,7 @@ def test_a_process_that_dies_is_tried_again(work):
     assert len(starts(given, "die_once-0")) == 2
 
 
-def test_one_that_dies_without_getting_further_has_failed(work):
+def test_a_run_that_dies_repeatedly_without_progress_has_failed(work):
     given = work("die", "finish", workers=1)
     found = carried_out(given)
     assert (found["die-0"].state, found["finish-1"].state) == ("failed", "finished")
@@ -86,7 +86,7 @@ def test_one_that_dies_without_getting_further_has_failed(work):
     assert "SIGKILL" in found["die-0"].error and "3 times" in found["die-0"].error
 
 
-def test_one_that_gets_further_each_time_goes_on(work):
+def test_a_run_that_makes_progress_between_deaths_continues(work):
     given = work("go_on", workers=1)
     assert carried_out(given)["go_on-0"].state == "finished"
     assert len(starts(given, "go_on-0")) == 5

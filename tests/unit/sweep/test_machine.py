@@ -41,7 +41,7 @@ def test_little_memory_means_fewer_workers(has):
     assert len(divided(None, 1, None).cores) == 1
 
 
-def test_where_the_system_does_not_say_there_is_no_bound(has):
+def test_without_a_known_memory_size_there_is_no_memory_limit(has):
     has(range(4), None)
     assert divided(None, 2, None).memory is None
     assert divided(3, 1, 1.5).memory == 3 * GIB // 2

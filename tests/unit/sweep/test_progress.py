@@ -35,7 +35,7 @@ def ended(sweep, run, status, **more):
     sweep.tell("ended", run, status=status, seconds=90.0, **more)
 
 
-def test_lines_tell_of_each_end(sweep, capsys):
+def test_a_line_reports_each_finished_or_failed_run(sweep, capsys):
     shown = Screen(sweep.watch, 2)
     ended(sweep, "id1", "finished")
     ended(sweep, "id2", "failed", error="the loss\nis not finite")

@@ -69,7 +69,7 @@ def test_the_script_says_what_is_asked_of_slurm(tmp_path):
         ({"cluster": "local", "time": "1h"}, "1h"),
     ],
 )
-def test_what_is_not_there_is_refused(tmp_path, monkeypatch, options, found):
+def test_a_missing_slurm_program_or_setting_is_refused(tmp_path, monkeypatch, options, found):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match=found):
         next(engine("slurm")(made(tmp_path, ["finish"], options)))

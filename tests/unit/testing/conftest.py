@@ -1,4 +1,4 @@
-"""What tests of the contract checks share."""
+"""Fixtures that tests of the contract checks share."""
 
 import pytest
 

@@ -1055,7 +1055,7 @@ def test_an_error_of_the_component_comes_through(check, make, error):
     ],
     ids=name_of,
 )
-def test_the_sound_ones_pass(checks, make):
+def test_correct_components_pass_all_checks(checks, make):
     for check in checks:
         check(make)
 
@@ -1088,7 +1088,7 @@ def test_every_check_has_a_defect_that_it_catches():
     ],
     ids=name_of,
 )
-def test_it_says_what_was_found(check, make, words):
+def test_a_failed_check_reports_what_it_found(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 

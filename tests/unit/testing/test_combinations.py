@@ -18,7 +18,7 @@ REASONS = ("needs K = 2 (--views); K is 1", "has no: tensors", "is late")
         st.sampled_from(ROWS), st.sets(st.sampled_from(REASONS), min_size=1), max_size=len(ROWS)
     )
 )
-def test_lines_say_neither_more_nor_less(refusals):
+def test_lines_of_refusals_are_read_back_exactly(refusals):
     lines = as_lines(refusals, ROWS)
     assert {row: set(reasons) for row, reasons in from_lines(lines, ROWS).items()} == refusals
     assert lines == sorted(set(lines))

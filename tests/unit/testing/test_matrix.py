@@ -63,7 +63,7 @@ def test_a_component_that_everything_refuses_fails(monkeypatch):
     assert "FAIL  backbone vanilla was trained in no combination" in text
 
 
-def test_what_is_no_combination_is_refused(mine):
+def test_an_unknown_combination_is_refused(mine):
     with pytest.raises(UserError, match="this is no combination"):
         report.train_one("mine", "sampler=epoch operator=no-such-operator")
 

@@ -41,7 +41,7 @@ def test_pairs_know_their_factors():
     assert pairs_of(("x", "x", "y")) == [(0, 1, "x", "x"), (0, 2, "x", "y"), (1, 2, "x", "y")]
 
 
-def test_nothing_admitted_needs_no_case():
+def test_an_empty_product_has_an_empty_pairwise_design():
     assert pairwise([]) == []
 
 

@@ -77,7 +77,7 @@ class OneBand(Fainter):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_it_is_refused_for_its_reason(check, make, words):
+def test_a_wrong_component_is_refused_for_its_reason(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 

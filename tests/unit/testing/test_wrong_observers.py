@@ -113,7 +113,7 @@ class Sleeps(api.Observer):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_it_is_refused_for_its_reason(check, make, words, short_windows):
+def test_a_wrong_observer_is_refused_for_its_reason(check, make, words, short_windows):
     with pytest.raises(ContractError, match=words):
         check(make)
 

@@ -107,7 +107,7 @@ def fixing(**options):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_it_is_refused_for_its_reason(check, make, words):
+def test_a_wrong_rasterizer_is_refused_for_its_reason(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 

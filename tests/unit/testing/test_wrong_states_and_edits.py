@@ -100,7 +100,7 @@ class RepeatsOne(NoDensification):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_it_is_refused_for_its_reason(check, make, words, short_windows):
+def test_a_wrong_state_or_edit_is_refused_for_its_reason(check, make, words, short_windows):
     with pytest.raises(ContractError, match=words):
         check(make)
 
@@ -114,7 +114,7 @@ def test_a_window_of_the_last_steps_is_bounded():
     growth.require_bounded((min(step, 900) for step in range(10_000)), "sample")
 
 
-def test_what_grows_for_three_thousand_steps_is_not():
+def test_a_state_that_grows_for_3000_steps_is_not_bounded():
     with pytest.raises(ContractError, match="1,007 numbers after 1,016 steps and 3,007 after"):
         growth.require_bounded((max(step, 8) - 8 for step in range(10_000)), "sample")
 

@@ -88,7 +88,7 @@ def test_one_axis_takes_no_more_than_its_limit():
     assert torch.equal(found[1:], torch.ones(4, 3))
 
 
-def test_nothing_is_asked_of_no_gaussians():
+def test_zero_gaussians_need_no_step():
     step_along_axes(*(torch.zeros(0, columns) for columns in (3, 3, 3, 4)))
 
 
@@ -130,7 +130,7 @@ def test_a_gaussian_that_is_not_finite_spoils_no_other():
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(20))
-def test_what_is_usual_is_that_of_the_middle_axes_that_are_finite(seed, kind):
+def test_the_typical_size_uses_the_finite_middle_axes(seed, kind):
     """NaN counts as longer than all."""
     rng = np.random.default_rng(seed)
     scales = rng.normal(size=(rng.integers(1, 40), 3))
@@ -143,7 +143,7 @@ def test_what_is_usual_is_that_of_the_middle_axes_that_are_finite(seed, kind):
     assert found == pytest.approx(want, rel=1e-6, nan_ok=True)
 
 
-def test_a_rotation_without_digits_is_none():
+def test_a_vanishing_quaternion_means_no_rotation():
     steps = torch.tensor([[1.0, 2.0, 3.0]]).repeat(3, 1)
     quats = torch.tensor([[1e-20, 2e-20, 0.0, 1e-20], [1e-23, 0.0, 1e-23, 0.0], [0.0] * 4])
     found = torch.zeros(3, 3)

@@ -1,4 +1,4 @@
-"""What backbones and densifiers may ask of the loop: frozen blocks, times, first values."""
+"""Requests of backbones and densifiers to the loop: frozen blocks, times, initial values."""
 
 from dataclasses import replace
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""How many steps fit into a budget of training seconds."""
+"""The number of steps that fit into a budget of training seconds."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -185,7 +185,7 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
     assert behind == pytest.approx(mean / (empty + 31_000))
 
 
-def test_growth_along_the_curve_is_never_taken_for_more_than_free_growth():
+def test_budgeted_growth_is_never_estimated_above_unbounded_growth():
     run, _ = along_the_curve(2000, 1)
     assert growth_ahead(run, PrimitiveCounts(1, 1), run.schedule, 0) == 2.0
 
@@ -283,7 +283,7 @@ def growth_notes(run):
     return [note for note in run.notes if "density control" in note]
 
 
-def test_notes_that_the_clock_overtakes_are_withdrawn():
+def test_notes_that_a_new_length_makes_wrong_are_withdrawn():
     run = noted(setup(steps=935))
     assert len(growth_notes(run)) == 1
     longer = with_length(run, 100, 3000)
@@ -297,7 +297,7 @@ def test_notes_that_the_clock_overtakes_are_withdrawn():
 
 
 @pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
-def test_the_user_is_reported_once_that_density_control_takes_place_after_all(length):
+def test_a_note_reports_once_that_density_control_takes_place_after_all(length):
     run, state = noted(setup(steps=935)), reached(0)
     while state.step < run.schedule.total:
         state.step += 1
@@ -309,13 +309,13 @@ def test_the_user_is_reported_once_that_density_control_takes_place_after_all(le
     assert text.startswith("density control after all: in ") and "from step 500 to step" in text
 
 
-def test_the_user_is_reported_where_density_control_is_left_out_later():
+def test_a_note_reports_that_a_shorter_length_leaves_density_control_out():
     run = noted(setup(steps=3000))
     Planned(((20, 900),)).revised(run, reached(20))
     assert run.hook.texts == list(growth_note(setup(steps=900)))
 
 
-def test_the_user_is_reported_of_no_step_behind_the_end():
+def test_the_note_on_density_control_names_no_step_after_the_end():
     run = noted(setup(steps=550, mode="absolute"))
     Planned(((20, 700),)).revised(run, reached(20))
     assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
@@ -370,7 +370,7 @@ def test_a_step_ahead_costs_more_where_photos_grow():
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "spectral", "strided"])
-def test_the_probe_tells_what_goes_with_the_pixels(monkeypatch, name, views):
+def test_the_probe_separates_the_cost_per_pixel(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     resolution = GROWING.get(name, run.selection.resolution)

@@ -109,7 +109,7 @@ def trained(setup, state, sink, pauses=()):
         ("evaluated", {"eval_every": 4}),
     ],
 )
-def test_whatever_is_kept_is_finite(kept, settings, step):
+def test_checkpoints_and_results_are_finite(kept, settings, step):
     sink = Watching()
     setup = watched(Poison(step), sink, **settings)
     state = first_state(setup)
@@ -121,7 +121,7 @@ def test_whatever_is_kept_is_finite(kept, settings, step):
     assert len(sink.rewound) == 1 and sink.rewound[0] < step
 
 
-def test_a_pause_right_after_a_bad_step_goes_back_behind_it():
+def test_a_pause_right_after_a_bad_step_rewinds_to_before_it():
     step = CHECK_EVERY + 3
     sink = Watching()
     setup = watched(Poison(step), sink)
@@ -131,7 +131,7 @@ def test_a_pause_right_after_a_bad_step_goes_back_behind_it():
     assert sink.shown == [("paused", 5, True), ("paused", step, True)]
 
 
-def test_a_signal_after_the_look_leaves_a_good_state():
+def test_a_signal_after_a_check_leaves_a_good_state():
     sink = Watching(stops_after=7)
     setup = watched(Poison(7), sink)
     state = first_state(setup)

@@ -1,4 +1,4 @@
-"""Devices that are not there: what is missing is told apart."""
+"""Errors for missing devices distinguish the possible causes."""
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ def build(monkeypatch):
         ("12.4", 2, "cuda:2", "devices cuda:0 to cuda:1", "choose one of them"),
     ],
 )
-def test_what_is_missing_is_reported_with_a_way_out(build, cuda, devices, name, found, todo):
+def test_a_missing_device_is_reported_with_a_remedy(build, cuda, devices, name, found, todo):
     build(cuda, devices)
     with pytest.raises(UserError) as raised:
         choose_device(name)

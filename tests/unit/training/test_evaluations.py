@@ -19,7 +19,7 @@ def test_usual_evaluations_are_far_from_resets_of_the_opacities(views):
 
 
 @pytest.mark.parametrize(("steps", "given"), [(20_000, {"eval_every": 2000}), (2000, {})])
-def test_else_they_are_at_multiples(steps, given):
+def test_default_evaluations_without_resets_are_at_multiples_of_a_tenth(steps, given):
     setup = assemble(RunConfig(steps=steps, **given), sample_scene(), "none")
     found = [step for step in range(1, steps + 1) if evaluates_after(setup, step)]
     assert found == list(range(steps // 10, steps, steps // 10))

@@ -87,7 +87,7 @@ def test_without_density_control_nothing_is_added():
     assert "29,996 more steps take about 8 h 20 min (one takes 1000 ms now)" in text
 
 
-def test_a_resumed_run_tells_what_is_left():
+def test_a_resumed_run_reports_the_remaining_time():
     ((_, text),) = texts(1.0, 30_000, "none", first=29_000)
     assert "996 more steps take about 17 min" in text
 

@@ -119,14 +119,14 @@ def test_the_strongest_come_first():
         ({"steps": 30_000, "growth": "budget"}, "drawn"),
     ],
 )
-def test_what_grows_is_divided_along_its_axis_in_short_runs_with_a_budget(settings, division):
+def test_short_budgeted_runs_split_gaussians_along_their_long_axis(settings, division):
     config = RunConfig.model_validate({"steps": 2_000, **settings})
     setup = assemble(config, sample_scene(), "none")
     assert setup.densifier.division == division
     assert resolved(setup).densifier.options["division"] == division
 
 
-def test_what_was_pruned_may_be_added_again():
+def test_pruned_gaussians_free_room_for_growth():
     setup = setup_of("adc", max_gaussians=80, growth="budget")
     state = first_state(setup)
     for _ in range(3):
@@ -158,7 +158,7 @@ def test_what_was_pruned_may_be_added_again():
         ({"backbone": {"name": "pixel"}}, "budget", "auto"),
     ],
 )
-def test_what_growth_a_run_has(settings, growth, bound):
+def test_growth_and_budget_follow_the_settings(settings, growth, bound):
     """And the resolved configuration asks for the same, in so many words."""
     config = RunConfig.model_validate({"steps": 2_000, **settings})
     setup = assemble(config, sample_scene(), "none")
@@ -313,7 +313,7 @@ def test_budgets_by_length():
 
 
 @pytest.mark.parametrize(("settings", "more"), [({}, 2), ({"beta2": 0.999}, 1)])
-def test_a_run_that_shows_photos_a_few_times_has_more_of_large_ones(settings, more, monkeypatch):
+def test_runs_with_few_passes_over_large_photos_have_a_larger_budget(settings, more, monkeypatch):
     monkeypatch.setattr(budgets, "SHORT_BUDGET", 50)
     setup = setup_of("adc", growth="budget", max_gaussians="auto", **settings)
     monkeypatch.setattr(budgets, "PIXELS", setup.scene.train_pixels / 4)
@@ -374,12 +374,12 @@ def test_budgets_as_written(text, value):
 
 
 @pytest.mark.parametrize("text", ["-3", "many", "1.5"])
-def test_budgets_that_are_none(text):
+def test_invalid_budgets_are_refused(text):
     with pytest.raises(ValidationError):
         RunConfig(max_gaussians=text)
 
 
-def test_room_is_none_between_edits():
+def test_no_growth_is_allowed_between_edits():
     setup = setup_of("adc")
     schedule = replace(setup.schedule, densify_until=2)
     state = SimpleNamespace(step=5)

@@ -79,7 +79,7 @@ def test_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatc
 
 @pytest.mark.parametrize("most", [0.2, 2.0])
 @pytest.mark.parametrize("seed", range(10))
-def test_late_steps_have_the_bits_of_steps_taken_at_once(monkeypatch, seed, most):
+def test_deferred_steps_have_the_bits_of_immediate_steps(monkeypatch, seed, most):
     monkeypatch.setattr(late, "MOST_ROWS", most)
     rng = np.random.default_rng(seed)
     shape = (int(rng.integers(1, 300)), *SHAPES[seed % len(SHAPES)])
@@ -144,7 +144,7 @@ def test_with_many_rows_a_step_is_taken_with_all(monkeypatch, shape, share):
     assert both.same()
 
 
-def test_ten_thousand_late_steps_have_the_bits_of_steps_taken_at_once(long_wait):
+def test_ten_thousand_deferred_steps_have_the_bits_of_immediate_steps(long_wait):
     assert long_wait[0].same()
 
 
@@ -157,7 +157,7 @@ def test_ten_thousand_late_steps_are_right_to_the_rounding_of_those_that_still_m
     assert way > 5e-3 and np.median(error / largest) < 1e-6
 
 
-def test_what_is_not_a_number_stays_visible():
+def test_a_nan_survives_deferred_steps():
     both = Both(torch.ones(20, 3))
     values = np.ones((2, 3), np.float32)
     values[0, 1] = np.nan
@@ -373,7 +373,7 @@ class Brightened(Vanilla):
         return replace(gaussians, opacities=gaussians.opacities * brightness.sigmoid())
 
 
-def test_what_a_backbone_passes_on_is_not_inherited():
+def test_passthrough_of_a_backbone_is_not_inherited():
     assert Brightened.passthrough == {} and Vanilla.passthrough
     setup = setup_of()
     own = replace(setup.selection, backbone=Brightened())
@@ -400,7 +400,7 @@ class Clip:
         return answer
 
 
-def test_what_an_operator_hands_on_is_not_inherited():
+def test_sparse_rows_of_an_operator_is_not_inherited():
     assert (
         not Clipped.sparse_rows
         and not GradDrop.sparse_rows
@@ -447,7 +447,7 @@ def behind():
         lambda state: Snapshot.of(state).parameters["x"],
     ],
 )
-def test_who_reads_a_tensor_gets_all_steps(read):
+def test_reading_a_tensor_applies_its_deferred_steps(read):
     state = behind()
     raw = state.tensors["x"].clone()
     assert state.late.names == {"x"} and state.current["y"] is state.tensors["y"]

@@ -36,7 +36,7 @@ def random_parameters(count, seed=0):
     return {"means": means, "codes": torch.arange(float(count)), "shared": torch.ones(2)}
 
 
-def test_it_is_mortons_order_bit_by_bit():
+def test_rows_are_in_morton_order():
     positions = torch.cat([torch.randn(500, 3), torch.randn(50, 3) * 1e3, torch.zeros(2, 3)])
     rows = along_curve(positions)
     assert rows.tolist() == sorted(range(552), key=lambda i: (code(positions[i].tolist()), i))
@@ -114,7 +114,7 @@ def test_a_run_is_in_order_after_each_of_its_edits():
     assert edits > 2
 
 
-def test_few_stay_in_their_order(monkeypatch):
+def test_a_small_number_of_rows_is_not_sorted(monkeypatch):
     monkeypatch.setattr(step, "FEWEST_SORTED", 51)
     parameters = random_parameters(50)
     assert in_order(parameters, BLOCKS, "means") is None

@@ -53,7 +53,7 @@ def test_frozen_whole_numbers_come_back():
         ({"scalars": {}}, "KeyError"),
     ],
 )
-def test_what_is_not_of_this_run_is_one_error(changes, found):
+def test_a_checkpoint_of_another_run_is_one_error(changes, found):
     with pytest.raises(UserError, match="does not fit the run") as caught:
         from_checkpoint(SETUP, replace(checkpoint(), **changes))
     assert found in caught.value.found

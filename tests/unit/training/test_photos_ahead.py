@@ -84,7 +84,7 @@ def test_a_photo_that_cannot_be_decoded_is_left_to_who_asks_for_it():
 
 def test_kernels_are_loaded_meanwhile():
     asked = []
-    config = RunConfig(steps=4, exposure={"name": "none"})
+    config = RunConfig(steps=4, exposure={"name": "none"}, plan="off")
     setup = assemble(config, watched(asked), "none")
     warm_up(setup)
     assert asked[0] == setup.scene.test_views[0].name

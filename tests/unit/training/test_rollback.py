@@ -199,7 +199,7 @@ def test_from_there_the_run_ends_as_if_nothing_had_happened():
 @pytest.mark.parametrize(
     "error", [KeyboardInterrupt(), SystemExit(3), MemoryError(), OSError(28, "full")]
 )
-def test_whatever_is_raised(error):
+def test_any_exception_in_a_hook_rewinds_to_the_last_good_state(error):
     setup = assembled(trap("aggregate_gradients", after, error))
     state = first_state(setup)
     with pytest.raises(type(error)):

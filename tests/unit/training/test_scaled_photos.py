@@ -135,7 +135,7 @@ def test_memory_is_bounded_and_what_does_not_fit_is_made_again():
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 24)), max_size=12), st.integers(0, 3))
 @example([(1, 1), (1, 3)], 1)  # on the way to one pixel lies the size that is wanted next
-def test_what_was_asked_for_before_changes_no_pixel(asked, room):
+def test_earlier_requests_change_no_pixel(asked, room):
     photos = ScaledPhotos(room)
     photos._room = room * 1000
     for index, width in asked:

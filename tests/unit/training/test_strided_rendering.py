@@ -211,9 +211,9 @@ USUAL = {
 
 
 @pytest.mark.parametrize("case", USUAL)
-def test_some_pixels_first_is_for_short_runs_of_plain_gaussians(case):
+def test_strided_rendering_is_the_default_in_short_runs_of_plain_gaussians(case):
     settings, expected = USUAL[case]
-    given = {"steps": 2000, **settings}
+    given = {"steps": 2000, "plan": "off", **settings}
     setup = assemble(RunConfig.model_validate(given), sample_scene(), "none")
     assert setup.selection.names["resolution"] == expected
 

@@ -106,7 +106,7 @@ def test_a_rasterizer_that_does_not_work_leaves_the_cpu(on_a_gpu, error, why):
     ],
     ids=str,
 )
-def test_what_does_not_fit_a_gpu_stays_on_the_cpu(on_a_gpu, settings, why):
+def test_runs_that_a_gpu_does_not_support_stay_on_the_cpu(on_a_gpu, settings, why):
     tried = on_a_gpu(*WORKS)
     device, (note,) = device_of(**settings)
     assert device == "cpu"

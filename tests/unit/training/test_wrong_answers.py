@@ -79,7 +79,7 @@ def test_an_answer_without_its_state_names_the_method(word, slot, name, method, 
 
 
 @pytest.mark.parametrize("answer", [None, (1, 2)])
-def test_what_a_backbone_decodes_are_gaussians(answer):
+def test_decode_must_return_gaussians(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "decode", answer)}))
     assert "Wrong.decode gave a wrong answer" in error.what
     assert error.expected == "Gaussians"
@@ -99,7 +99,7 @@ def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
 
 
-def test_what_a_backbone_has_prepared_is_all_that_its_blocks_name():
+def test_prepare_must_return_all_tensors_of_the_blocks():
     backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
     error = refused(setup_of({"backbone": backbone}))
     assert "Wrong.prepare makes other tensors" in error.what
@@ -121,7 +121,7 @@ def test_what_a_backbone_prepares_it_need_not_create():
 
 
 @pytest.mark.parametrize("answer", [3, ()])
-def test_what_a_start_adds_are_points(answer):
+def test_more_points_must_return_points(answer):
     error = refused(
         setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
     )
@@ -139,7 +139,7 @@ def test_what_a_start_adds_are_points(answer):
         ),
     ],
 )
-def test_what_is_fitted_to_the_scene_is_of_its_kind(monkeypatch, base, slot, name, answer):
+def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, name, answer):
     original, wrong = selecting.chosen, of_slot(slot, name, "fitted_to", answer)
 
     def built(kind, choice):
@@ -205,7 +205,7 @@ class Answers:
         Answers(term=RegularizeResult(torch.ones(3))),
     ],
 )
-def test_a_question_answered_with_something_else_names_the_plugin(plugin):
+def test_a_wrong_hook_result_names_the_plugin(plugin):
     error = refused(setup_of(stranger=plugin))
     assert "answers crossgrad_" in error.what
     assert "stranger" in error.where
