@@ -102,11 +102,11 @@ class Short:
         before = torch.cuda.memory_allocated()
         setup, state = self._begun(case)
         setup.rasterizer.self_test("cuda")
-        keeper = RollbackGuard(state)  # A run also holds a copy for rollback.
+        guard = RollbackGuard(state)  # A run also holds a copy for rollback.
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
         seconds = steady(setup, state, case.steps)
-        del keeper
+        del guard
         machine = facts()
         return {
             "ms_per_step": round(1e3 * seconds / case.steps, 2),

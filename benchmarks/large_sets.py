@@ -97,7 +97,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
     keep = fits(setup.scene, cache_mib)
     check_photos(setup.scene.views if keep else setup.scene.test_views, keep=keep)
     warm_up(setup)
-    state, foresight = first_state(setup), Prefetcher(setup)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
 
     def fail(error: Exception) -> None:
         raise error
@@ -108,7 +108,7 @@ def serve(scene: Path, max_size: int, cache_mib: int) -> None:
         for line in sys.stdin:
             start, load = perf_counter(), state.clock.load
             for _ in range(int(line)):
-                foresight.update(state)
+                prefetcher.update(state)
                 timed_step(setup, state)
             took, waited = perf_counter() - start, state.clock.load - load
             _answer(seconds=took, waited=waited, memory=_resident("VmRSS"), peak=_resident("VmHWM"))

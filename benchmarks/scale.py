@@ -240,7 +240,7 @@ class Run:
         self.setup = setup_of(cell, **options)
         self.state: TrainState = begin(self.setup)
         self.state.step = STEP
-        self.keeper = RollbackGuard(self.state)
+        self.guard = RollbackGuard(self.state)
 
     def step(self) -> tuple[float, float]:
         """Take a step, and return its CPU seconds and wall seconds."""

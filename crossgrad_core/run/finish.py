@@ -147,15 +147,15 @@ class RunLoop:
         ):
             setup.hook.crossgrad_run_start(run=self._info())
             self._catch_up()
-            state, keeper = self.state, RollbackGuard(self.state)
+            state, guard = self.state, RollbackGuard(self.state)
             while True:
-                ended = train(self.setup, state, self.session, self.stopper, length.due, keeper)
+                ended = train(self.setup, state, self.session, self.stopper, length.due, guard)
                 if ended != "paused":
                     self.ending = Ending(ended)
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    keeper.copy(state)  # No rollback before the step of a new length.
+                    guard.copy(state)  # No rollback before the step of a new length.
                 if revised.config is not self.setup.config:  # A planned length is written already.
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))

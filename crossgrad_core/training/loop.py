@@ -210,12 +210,12 @@ def train(
     sink: RunWriter,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None = None,
-    keeper: RollbackGuard | None = None,
+    guard: RollbackGuard | None = None,
 ) -> Ending:
     """Run the remaining steps of the schedule, or until `pauses` returns True after a step.
 
-    A `keeper` that is reused after a pause can restore states from before the pause. By default,
-    each call creates a new keeper.
+    A `guard` that is reused after a pause can restore states from before the pause. By default,
+    each call creates a new guard.
 
     Raises:
         TrainingFailedError: A value was not finite for the second time, or at the start; names
@@ -225,16 +225,16 @@ def train(
     """
     check_start(state)
     use_large_pages()
-    keeper = keeper or RollbackGuard(state)
+    guard = guard or RollbackGuard(state)
     try:
-        status = _steps(setup, state, sink, stopper, pauses, keeper)
+        status = _steps(setup, state, sink, stopper, pauses, guard)
     except TrainingFailedError:
         if not is_whole(state):
-            keeper.restore(state)
+            guard.restore(state)
         raise
     except BaseException as error:
         error.add_note(f"in step {state.step}")
-        keeper.restore(state)
+        guard.restore(state)
         raise
     if stopper.error is not None:
         raise stopper.error
@@ -247,22 +247,22 @@ def _steps(
     sink: RunWriter,
     stopper: Stopper,
     pauses: Callable[[TrainState], bool] | None,
-    keeper: RollbackGuard,
+    guard: RollbackGuard,
 ) -> Ending:
     total = setup.schedule.total
     last = min(total, setup.config.stop_after or total)
-    foresight = Prefetcher(setup)
+    prefetcher = Prefetcher(setup)
     while state.step < last and not stopper.requested:
-        foresight.update(state)
+        prefetcher.update(state)
         try:
             record = timed_step(setup, state)
             leaves = state.step == last or stopper.requested
-            keeper.commit(state, look=leaves or looks_after(setup, state.step))
+            guard.commit(state, look=leaves or looks_after(setup, state.step))
             if copies_after(setup, state.step):
-                keeper.copy(state)
+                guard.copy(state)
                 use_large_pages()
         except NonFiniteError as error:
-            _rewind(setup, state, sink, keeper, error)
+            _rewind(setup, state, sink, guard, error)
             continue
         check_dropped(setup, state, record)
         setup.hook.crossgrad_step_end(record=record)
@@ -271,10 +271,10 @@ def _steps(
         _tell_held_back(setup, record)
         _record(setup, state, sink)
         pausing = pauses is not None and state.step < last and pauses(state)
-        if pausing and _is_good(setup, state, sink, keeper):
+        if pausing and _is_good(setup, state, sink, guard):
             return "paused"
     # A signal may have arrived after the last check.
-    _is_good(setup, state, sink, keeper)
+    _is_good(setup, state, sink, guard)
     return "finished" if state.step >= total else "stopped"
 
 
@@ -296,21 +296,21 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     return state.last
 
 
-def _is_good(setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard) -> bool:
+def _is_good(setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard) -> bool:
     """Check a state before it is kept; if it is bad, rewind training. Return True if it is good."""
     try:
-        keeper.check(state)
+        guard.check(state)
     except NonFiniteError as error:
-        _rewind(setup, state, sink, keeper, error)
+        _rewind(setup, state, sink, guard, error)
         return False
     return True
 
 
 def _rewind(
-    setup: Setup, state: TrainState, sink: RunWriter, keeper: RollbackGuard, error: NonFiniteError
+    setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard, error: NonFiniteError
 ) -> None:
     rewound_before = state.rewinds > 0
-    keeper.rewind(state, setup.config.seed)
+    guard.rewind(state, setup.config.seed)
     if rewound_before:
         raise TrainingFailedError(f"{error}, for the second time") from error
     setup.hook.crossgrad_log(

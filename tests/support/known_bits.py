@@ -58,7 +58,7 @@ CASES: Mapping[str, Mapping[str, Any]] = {
     "bundled filled": {"max_size": 80, "initializer": "fill-gaps"},
     **{each: {"backbone": each, "operator": "symmetric"} for each in BACKBONES},
     "exposure": {"exposure": "affine", "views": 3},
-    "hurried": {"beta2": None, "backbone": {"name": "vanilla", "lr_scales": 0.0025}},
+    "few passes": {"beta2": None, "backbone": {"name": "vanilla", "lr_scales": 0.0025}},
     "mcmc": {"densifier": "mcmc", "resolution": "octaves", "views": 1},
 }
 

@@ -490,15 +490,15 @@ class Failing:
 def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     state = behind()
     state.rngs = make_streams(0)
-    keeper, kept = RollbackGuard(state), state.parameters["x"].clone()
+    guard, kept = RollbackGuard(state), state.parameters["x"].clone()
     state.touched = True
     state.late._under_way["x"] = Failing(state.tensors["x"])
-    keeper.commit(state)
+    guard.commit(state)
     # It is noticed when the tensor is wanted, and whenever it is wanted.
     for _ in range(2):
         with pytest.raises(LookupError):
             state.late.catch_up("x", state.tensors["x"], state.moments)
-    keeper.restore(state)
+    guard.restore(state)
     assert torch.equal(state.parameters["x"], kept)
 
 

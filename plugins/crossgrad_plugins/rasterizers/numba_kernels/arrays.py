@@ -127,13 +127,13 @@ class TileLists:
     Attributes:
         starts: [T + 1] int64, first entry of each tile.
         entries: [E, 2] int32, records and slots.
-        shelves: [N, SHELF] int32, the slots of each record.
+        buckets: [N, BUCKET] int32, the slots of each record.
         slots: Number of slots.
     """
 
     starts: Int64
     entries: Int32
-    shelves: Int32
+    buckets: Int32
     slots: int
 
 

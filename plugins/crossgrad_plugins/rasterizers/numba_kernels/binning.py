@@ -61,7 +61,7 @@ _FAR, _NEAR = 32, 16
 
 #: Data of a record for filling the lists.
 FIRST_SLOT, SLOTS, FIRST_ROW, LAST_ROW = 0, 1, 2, 3
-SHELF = 4
+BUCKET = 4
 
 
 @kernel
@@ -69,7 +69,7 @@ def collect(
     drawn: NDArray[np.int64],
     room: NDArray[np.int64],
     depths: NDArray[np.float64],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], int]:
     """Remove the gaps between chunks.
 
@@ -77,7 +77,7 @@ def collect(
         drawn: [chunks] records per chunk.
         room: [chunks] slots per chunk.
         depths: [N] depth of each record.
-        shelves: [N, SHELF] per record; the first slots become global slot numbers.
+        buckets: [N, BUCKET] per record; the first slots become global slot numbers.
 
     Returns:
         The drawn records [M], their depths [M] and the number of slots.
@@ -91,7 +91,7 @@ def collect(
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             items[k] = j
             keys[k] = depths[j]
-            shelves[j, FIRST_SLOT] += first_slot
+            buckets[j, FIRST_SLOT] += first_slot
             k += 1
         first_slot += room[chunk]
     return items, keys, first_slot
@@ -230,7 +230,7 @@ def find_tiles(
     boxes: NDArray[np.int32],
     boxed: bool,
     drawn: NDArray[np.int64],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     tile_of_slot: NDArray[np.int32],
     counts: NDArray[np.int32],
     depths: NDArray[np.float64],
@@ -245,7 +245,7 @@ def find_tiles(
         boxes: [N, 4] tile boxes per record.
         boxed: Whether to use all tiles of the boxes (records of the analytic response).
         drawn: [chunks] records per chunk.
-        shelves: [N, SHELF] per record, completed.
+        buckets: [N, BUCKET] per record, completed.
         tile_of_slot: [slots] written.
         counts: [PARTS, T] written: entries per part and tile; zero before.
         depths: [M] depths of the drawn records.
@@ -273,12 +273,12 @@ def find_tiles(
                         k, row = j - first, boxes[j, 2]
                         _spans(j * RECORD, k, row, records, ellipses, begins, ends, k * LANES)
                 for j in group:
-                    shelves[j, SLOTS] = _find(
+                    buckets[j, SLOTS] = _find(
                         j,
                         tile_columns,
                         records,
                         boxes,
-                        np.intp(shelves[j, FIRST_SLOT]),
+                        np.intp(buckets[j, FIRST_SLOT]),
                         tile_of_slot,
                         counts[part],
                         ellipses,
@@ -287,8 +287,8 @@ def find_tiles(
                         j - first,
                         boxed,
                     )
-                    shelves[j, FIRST_ROW] = boxes[j, 2]
-                    shelves[j, LAST_ROW] = boxes[j, 3] - 1
+                    buckets[j, FIRST_ROW] = boxes[j, 2]
+                    buckets[j, LAST_ROW] = boxes[j, 3] - 1
         job = next_job(jobs, PARTS + 1)
 
 
@@ -325,7 +325,7 @@ def fill_tiles(
     order: NDArray[np.int32],
     tile_columns: int,
     bands: NDArray[np.int64],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     tile_of_slot: NDArray[np.int32],
     starts: NDArray[np.int64],
     entries: NDArray[np.int32],
@@ -337,7 +337,7 @@ def fill_tiles(
         order: [M] records front to back.
         tile_columns: Tiles in a row of tiles.
         bands: [bands + 1] first row of tiles of each band.
-        shelves: [N, SHELF] per record.
+        buckets: [N, BUCKET] per record.
         tile_of_slot: [slots] from `find_tiles`.
         starts: [T + 1] first entry of each tile.
         entries: [E, 2] written: the record and the slot of each entry, tile by tile, front to back.
@@ -349,14 +349,14 @@ def fill_tiles(
         first_tile, end_tile = bands[band] * tile_columns, bands[band + 1] * tile_columns
         positions = starts[first_tile:end_tile].copy()
         for rank in range(count):
-            prefetch(shelves, SHELF * np.intp(order[min(rank + _FAR, count - 1)]))
+            prefetch(buckets, BUCKET * np.intp(order[min(rank + _FAR, count - 1)]))
             ahead = order[min(rank + _NEAR, count - 1)]
-            prefetch(tile_of_slot, np.intp(shelves[ahead, FIRST_SLOT]))
+            prefetch(tile_of_slot, np.intp(buckets[ahead, FIRST_SLOT]))
             j = order[rank]
-            if shelves[j, LAST_ROW] < bands[band] or shelves[j, FIRST_ROW] >= bands[band + 1]:
+            if buckets[j, LAST_ROW] < bands[band] or buckets[j, FIRST_ROW] >= bands[band + 1]:
                 continue
-            first_slot = np.intp(shelves[j, FIRST_SLOT])
-            for slot in range(first_slot, first_slot + shelves[j, SLOTS]):
+            first_slot = np.intp(buckets[j, FIRST_SLOT])
+            for slot in range(first_slot, first_slot + buckets[j, SLOTS]):
                 tile = np.intp(tile_of_slot[slot])
                 if first_tile <= tile < end_tile:
                     entry = positions[tile - first_tile]

@@ -21,8 +21,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import (
     in_lines,
 )
 from crossgrad_plugins.rasterizers.numba_kernels.binning import (
+    BUCKET,
     PARTS,
-    SHELF,
     collect,
     fill_tiles,
     find_tiles,
@@ -57,8 +57,8 @@ def forward(
     gaussians: GaussianArrays, camera: CameraArrays, background: Float32, options: DrawOptions
 ) -> Frame:
     """Render the Gaussians over a background [3]."""
-    projected, boxes, shelves, depths, room = _project(gaussians, camera, options)
-    lists = _bin(projected, boxes, shelves, depths, room, boxed=options.response == "analytic")
+    projected, boxes, buckets, depths, room = _project(gaussians, camera, options)
+    lists = _bin(projected, boxes, buckets, depths, room, boxed=options.response == "analytic")
     shape = (camera.height, camera.width)
     image = np.empty((*shape, 3), np.float32)
     alpha = np.empty(shape, np.float32)
@@ -159,7 +159,7 @@ def backward(
         gaussians.opacities,
         projected.drawn,
         projected.owners,
-        lists.shelves,
+        lists.buckets,
         written,
         partials,
         gradients.means,
@@ -245,7 +245,7 @@ def _directions(
         analytic is not None,
         projected.drawn,
         projected.owners,
-        lists.shelves,
+        lists.buckets,
         written,
         found,
         directions,
@@ -287,7 +287,7 @@ def marked_pixels(
 def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
     """Return the sums of the counts [slots] per Gaussian, [N]."""
     pixels = np.zeros_like(projected.radii)
-    parallel(count_pixels, projected.drawn, projected.owners, lists.shelves, counts, pixels)
+    parallel(count_pixels, projected.drawn, projected.owners, lists.buckets, counts, pixels)
     return pixels
 
 
@@ -318,7 +318,7 @@ def _project(
         limits=np.empty((count, 2), np.int32) if options.squares else None,
     )
     boxes = np.empty((count, 4), np.int32)
-    shelves = np.empty((count, SHELF), np.int32)
+    buckets = np.empty((count, BUCKET), np.int32)
     depths = np.empty(count, np.float64)
     room = np.empty(chunks, np.int64)
     parallel(
@@ -339,7 +339,7 @@ def _project(
         depths,
         boxes,
         projected.owners,
-        shelves,
+        buckets,
         projected.drawn,
         room,
     )
@@ -359,13 +359,13 @@ def _project(
             projected.records,
             projected.radii,
         )
-    return projected, boxes, shelves, depths, room
+    return projected, boxes, buckets, depths, room
 
 
 def _bin(
     projected: Projected,
     boxes: Int32,
-    shelves: Int32,
+    buckets: Int32,
     depths: NDArray[np.float64],
     room: Int64,
     *,
@@ -376,7 +376,7 @@ def _bin(
     rows = (camera.height + TILE_HEIGHT - 1) // TILE_HEIGHT
     if room.sum() > np.iinfo(np.int32).max:
         raise MemoryError(f"{room.sum()} pairs of a Gaussian and a tile are too many")
-    order, keys, slots = collect(projected.drawn, room, depths, shelves)
+    order, keys, slots = collect(projected.drawn, room, depths, buckets)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)
     parallel(
@@ -386,7 +386,7 @@ def _bin(
         boxes,
         boxed,
         projected.drawn,
-        shelves,
+        buckets,
         tile_of_slot,
         counts,
         keys,
@@ -395,5 +395,5 @@ def _bin(
     bands = np.empty(numba.get_num_threads() + 1, np.int64)
     starts = start_tiles(counts, columns, bands)
     entries = np.empty((int(starts[-1]), 2), np.int32)
-    parallel(fill_tiles, order, columns, bands, shelves, tile_of_slot, starts, entries)
-    return TileLists(starts, entries, shelves, slots)
+    parallel(fill_tiles, order, columns, bands, buckets, tile_of_slot, starts, entries)
+    return TileLists(starts, entries, buckets, slots)

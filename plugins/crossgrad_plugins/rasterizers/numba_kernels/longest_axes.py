@@ -95,7 +95,7 @@ def add_directions(
     analytic: bool,
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     written: NDArray[np.uint8],
     found: NDArray[np.float32],
     directions: NDArray[np.float32],
@@ -107,7 +107,7 @@ def add_directions(
         analytic: Whether the response is analytic.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
-        shelves: [N, SHELF] from binning.
+        buckets: [N, BUCKET] from binning.
         written: [slots] from `differentiate`.
         found: [slots * SUMS] from `bin_directions`.
         directions: [N, BINS, FIELDS] written for Gaussians with gradients, zero before.
@@ -119,8 +119,8 @@ def add_directions(
     while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
             total[:] = np.float32(0.0)
-            first = np.intp(shelves[j, FIRST_SLOT])
-            for slot in range(first, first + shelves[j, SLOTS]):
+            first = np.intp(buckets[j, FIRST_SLOT])
+            for slot in range(first, first + buckets[j, SLOTS]):
                 if written[slot]:
                     for k in range(SUMS):
                         total[k] += found[slot * SUMS + k]

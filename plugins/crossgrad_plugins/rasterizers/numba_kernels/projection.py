@@ -193,11 +193,11 @@ def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[n
 
 
 @device
-def _give_slots(first: int, end: int, boxes: NDArray[np.int32], shelves: NDArray[np.int32]) -> int:
+def _give_slots(first: int, end: int, boxes: NDArray[np.int32], buckets: NDArray[np.int32]) -> int:
     """Reserve a slot for each tile in the records' boxes; return the number of slots."""
     slots = 0
     for j in range(first, end):
-        shelves[j, FIRST_SLOT] = slots
+        buckets[j, FIRST_SLOT] = slots
         slots += np.int64(boxes[j, 1] - boxes[j, 0]) * np.int64(boxes[j, 3] - boxes[j, 2])
     return slots
 
@@ -287,7 +287,7 @@ def project(
     depths: NDArray[np.float64],
     boxes: NDArray[np.int32],
     owners: NDArray[np.int32],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     drawn: NDArray[np.int64],
     room: NDArray[np.int64],
 ) -> None:
@@ -313,7 +313,7 @@ def project(
         depths: [N] written per record.
         boxes: [N, 4] written per record: tile columns and rows [x0, x1), [y0, y1).
         owners: [N] written per record: index of its Gaussian.
-        shelves: [N, SHELF] first slots written per record: number of tiles in earlier boxes of the
+        buckets: [N, BUCKET] first slots written per record: number of tiles in earlier boxes of the
             chunk.
         drawn: [chunks] written: records of each chunk.
         room: [chunks] written: tiles in the boxes of each chunk.
@@ -372,5 +372,5 @@ def project(
                 owners,
             )
         drawn[chunk] = end - first
-        room[chunk] = _give_slots(first, end, boxes, shelves)
+        room[chunk] = _give_slots(first, end, boxes, buckets)
         chunk = next_job(jobs, chunks)

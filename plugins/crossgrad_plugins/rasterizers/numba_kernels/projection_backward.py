@@ -189,7 +189,7 @@ def _fill_block(
     scales: NDArray[np.float32],
     opacities: NDArray[np.float32],
     owners: NDArray[np.int32],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     written: NDArray[np.uint8],
     partials: NDArray[np.float32],
     sums: NDArray[np.float32],
@@ -207,7 +207,7 @@ def _fill_block(
     size = 0
     j = first_record
     while size < BLOCK and j < end:
-        first, count = np.intp(shelves[j, FIRST_SLOT]), np.intp(shelves[j, SLOTS])
+        first, count = np.intp(buckets[j, FIRST_SLOT]), np.intp(buckets[j, SLOTS])
         i = np.intp(owners[j])
         j += 1
         found = add_up(first, count, written, partials, sums)
@@ -268,7 +268,7 @@ def project_backward(
     opacities: NDArray[np.float32],
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     written: NDArray[np.uint8],
     partials: NDArray[np.float32],
     v_means: NDArray[np.float32],
@@ -294,7 +294,7 @@ def project_backward(
         opacities: [N].
         drawn: [chunks].
         owners: [N].
-        shelves: [N, SHELF] from binning.
+        buckets: [N, BUCKET] from binning.
         written: [slots] from `differentiate`.
         partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
         v_means: [N, 3] written, zero for Gaussians without gradients; so are all below.
@@ -327,7 +327,7 @@ def project_backward(
                 scales,
                 opacities,
                 owners,
-                shelves,
+                buckets,
                 written,
                 partials,
                 sums,

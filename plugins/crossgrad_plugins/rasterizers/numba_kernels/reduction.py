@@ -44,7 +44,7 @@ def count_pixels(
     jobs: Jobs,
     drawn: NDArray[np.int64],
     owners: NDArray[np.int32],
-    shelves: NDArray[np.int32],
+    buckets: NDArray[np.int32],
     counts: NDArray[np.int32],
     pixels: NDArray[np.int32],
 ) -> None:
@@ -54,7 +54,7 @@ def count_pixels(
         jobs: From `share`.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
-        shelves: [N, SHELF] from binning.
+        buckets: [N, BUCKET] from binning.
         counts: [slots] pixels per slot.
         pixels: [N] written for the drawn Gaussians; zero before.
     """
@@ -62,9 +62,9 @@ def count_pixels(
     chunk = next_job(jobs, chunks)
     while chunk < chunks:
         for j in range(chunk * CHUNK, chunk * CHUNK + drawn[chunk]):
-            first = np.intp(shelves[j, FIRST_SLOT])
+            first = np.intp(buckets[j, FIRST_SLOT])
             total = 0
-            for slot in range(first, first + shelves[j, SLOTS]):
+            for slot in range(first, first + buckets[j, SLOTS]):
                 total += counts[slot]
             pixels[owners[j]] = total
         chunk = next_job(jobs, chunks)

@@ -40,9 +40,9 @@ def setup_of(sampler, **changes):
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
     setup = setup_of(sampler)
-    state, foresight = first_state(setup), Prefetcher(setup)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
     for _ in range(12):
-        foresight.update(state)
+        prefetcher.update(state)
         expected = list(setup.photos_ahead.names[-1])
         assert len(expected) >= min(8, 12 - state.step)
         drawn = timed_step(setup, state).names
@@ -53,10 +53,10 @@ def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
 @pytest.mark.parametrize("sampler", [*SAMPLERS, "active"])
 def test_looking_ahead_touches_nothing(sampler):
     setup = setup_of(sampler)
-    state, foresight = first_state(setup), Prefetcher(setup)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
     for _ in range(6):
         before = deepcopy((state.states.get("sampler"), state.rngs, state.step))
-        foresight.update(state)
+        prefetcher.update(state)
         streams = {name: rng.bit_generator.state for name, rng in state.rngs.items()}
         assert streams == {name: rng.bit_generator.state for name, rng in before[1].items()}
         assert (state.states.get("sampler"), state.step) == (before[0], before[2])
@@ -65,12 +65,12 @@ def test_looking_ahead_touches_nothing(sampler):
 
 def test_a_step_that_drew_something_else_begins_the_guess_anew():
     setup = setup_of("random")
-    state, foresight = first_state(setup), Prefetcher(setup)
-    foresight.update(state)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
+    prefetcher.update(state)
     timed_step(setup, state)
     state.last = replace(state.last, views=(-1, -1))
     state.rngs["sampler"].random(3)
-    foresight.update(state)
+    prefetcher.update(state)
     expected = setup.photos_ahead.names[-1]
     assert tuple(expected[:2]) == timed_step(setup, state).names
 
@@ -84,9 +84,9 @@ def test_views_in_an_array_are_foreseen():
         return replace(draw, views=np.array(draw.views)), state
 
     object.__setattr__(setup.sampler, "sample", as_array)
-    state, foresight = first_state(setup), Prefetcher(setup)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
     for _ in range(3):
-        foresight.update(state)
+        prefetcher.update(state)
         drawn = timed_step(setup, state).names
         assert tuple(setup.photos_ahead.names[-1][:2]) == drawn
     assert len(setup.photos_ahead.names) == 3
@@ -103,14 +103,14 @@ def test_nothing_is_foreseen_of_views_that_are_not_there(views):
 
 def test_nothing_is_foreseen_of_a_sampler_that_fails():
     setup = setup_of("random")
-    state, foresight = first_state(setup), Prefetcher(setup)
+    state, prefetcher = first_state(setup), Prefetcher(setup)
 
     def fail(*_):
         raise ValueError
 
     object.__setattr__(setup.sampler, "sample", fail)
-    foresight.update(state)
-    foresight.update(state)
+    prefetcher.update(state)
+    prefetcher.update(state)
     assert setup.photos_ahead.names == []
 
 
