@@ -146,7 +146,7 @@ class Table:
 def no_figure(name: str, offered: list[str]) -> UserError:
     """Return the error for an unknown figure, with the names of the available figures."""
     return UserError(
-        "there is no such figure",
+        "unknown metric",
         where="--figure",
         expected=f"one of {', '.join(offered)}" if offered else "a figure that all runs measure",
         found=name,

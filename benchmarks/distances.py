@@ -202,7 +202,7 @@ def print_tables(
         runs: Arm -> scene and seed -> run, all with photos of one size.
 
     Raises:
-        UserError: The scene cannot be read, there is no such figure, or a run cannot be evaluated.
+        UserError: The scene cannot be read, the metric is unknown, or a run cannot be evaluated.
     """
     every = [run for own in runs.values() for run in own.values()]
     capture = Capture.read(given.on, every[0].config["data"]["max_size"])

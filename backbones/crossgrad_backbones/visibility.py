@@ -34,7 +34,7 @@ def depths_in_view(
         of its size on every side.
     """
     pose = camera.world_to_camera[:3]
-    # The border as a slope: |f x / z + c - size / 2| <= (0.5 + MARGIN) size, times z.
+    # The border |f x / z + c - size / 2| <= (0.5 + MARGIN) size, multiplied by z.
     half_width, half_height = ((0.5 + MARGIN) * size for size in (camera.width, camera.height))
     shift_x, shift_y = camera.cx - camera.width / 2, camera.cy - camera.height / 2
     across = _affine(columns, (camera.fx * pose[0] + shift_x * pose[2]) / half_width)

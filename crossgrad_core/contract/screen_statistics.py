@@ -68,7 +68,7 @@ def radii(record: RenderedView) -> Tensor:
 
 
 def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
-    """Return [N], 1 if the Gaussian touched a pixel, else 0; for `rows` only if given."""
+    """Return [N], 1 if the Gaussian touched a pixel, else 0; with `rows`, only these rows."""
     radii = record.screen.radii
     radii = radii if rows is None else radii.index_select(0, rows)
     return (radii > 0).to(record.gaussians.means)

@@ -128,7 +128,8 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
         _LOG.info(_COMPILED, _name(self._py_func))
         try:
             super().save_overload(sig, data)
-        except OSError as error:  # For example a full disk: the function itself is valid.
+        except OSError as error:
+            # Saving can fail, for example on a full disk; the compiled function is still valid.
             self.disable()
             _tell_unwritten(str(self._cache_path), str(error))
 

@@ -55,7 +55,7 @@ class Calibration:
         """
         if min(self.width, self.height) < 1 or max(self.width, self.height) > _LONGEST_SIDE:
             raise UserError(
-                "a camera has no pixels, or more than any photo",
+                "the size of a camera is zero, or larger than any photo",
                 where=where,
                 expected=f"sides of 1 to {_LONGEST_SIDE:,} pixels",
                 found=f"{self.width} x {self.height}",

@@ -60,7 +60,7 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
 
 
 def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
-    """The reason why the rule would have no effect is a text, empty if it has an effect."""
+    """`unused` returns a text: why the rule would have no effect, or nothing if it has one."""
     setup = _setup(make)
     reason = make().unused(setup.backbone, setup.scene)
     require(isinstance(reason, str), f"unused() answers {reason!r}, not a text")

@@ -85,7 +85,7 @@ def _content(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or not _is_of_photos(content):
         raise UserError(
-            "the file does not hold values of photos",
+            "the file does not contain parameters of photos",
             where=path,
             expected=f"an object with the format {PHOTO_VALUES_FORMAT} and photos",
             found=str(list(content))[:80] if isinstance(content, dict) else type(content).__name__,

@@ -167,5 +167,5 @@ def test_a_figure_that_no_run_has_is_one_message_before_anything_is_evaluated(
         printed(tmp_path / "runs", "--of", "city", "--on", place, "--figure", "lpips_vgg")
     assert ended.value.code == 2 and not evaluated.on
     said = capsys.readouterr().err
-    assert "there is no such figure" in said and "one of psnr, ssim" in said
+    assert "unknown metric" in said and "one of psnr, ssim" in said
     assert "Traceback" not in said

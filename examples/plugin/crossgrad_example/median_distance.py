@@ -30,5 +30,5 @@ class MedianDistance(Grouping):
             return tuple("near" if each <= threshold else "far" for each in distances)
 
         if len(set(labels(scene.train_views))) == 1:
-            raise UserError("all training cameras are equally far", where="grouping")
+            raise UserError("all training cameras are equally far from the scene", where="grouping")
         return GroupingRule(labels)

@@ -202,7 +202,7 @@ def _check_whole(results: "RunResults") -> None:
         )
     if (summary.get("overall") or {}).get("views") and not results.views:
         raise UserError(
-            "the figures of the held-out views are gone",
+            "the file with the metrics of the held-out views is missing",
             where=results.folder / "per_view.csv",
             expected="a row of each",
             found="no such file, or an empty one",

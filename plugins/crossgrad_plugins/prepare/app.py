@@ -215,7 +215,7 @@ def _check_lens(name: str) -> None:
     known = [each for each in pycolmap.CameraModelId.__members__ if each not in unknown]
     if name == _ALL_AROUND:
         raise UserError(
-            "360-degree photos have no pinhole camera to be undistorted to",
+            "360-degree photos cannot be undistorted to a pinhole camera",
             where="--lens",
             expected=", ".join(known),
             found=name,

@@ -111,7 +111,7 @@ def _split(
     for key in filter(None, (_TRAIN, held_out)):
         if not lists[key] & set(posed):
             raise UserError(
-                "no name of a list is that of a frame's photo",
+                "no name in a split list is the photo of a frame",
                 where=whole.where(key),
                 expected=f"names as the frames' file_path has them, such as {min(posed)}",
                 found=name_some(whole.texts(key)) or "no name",

@@ -18,7 +18,8 @@ PIXELS, FINER = 120_000, 0.4
 #: The additional power in runs with few passes, which cannot overfit, and the pixels of the largest
 #: photos (800 x 600) for which this power was measured.
 FEW_PASSES_FINER, FEW_PASSES_PIXELS = 0.5, 480_000
-#: The published length has no budget. Towards it, the budget is raised by at most this factor.
+#: The published length has no budget. The budget is raised by at most this factor when the length
+#: approaches it.
 OPENED: Final = 10.0
 
 

@@ -223,7 +223,7 @@ def test_figures_of_views_that_are_gone_are_reported(folder):
     (folder / "1-1" / "per_view.csv").unlink()
     with pytest.raises(UserError) as error:
         read_runs([folder], skip_broken=False)
-    assert "the figures of the held-out views are gone" in error.value.what
+    assert "the file with the metrics of the held-out views is missing" in error.value.what
     assert "crossgrad eval" in error.value.todo
     assert list(read_runs([folder], skip_broken=True).left_out) == ["1-1"]
 

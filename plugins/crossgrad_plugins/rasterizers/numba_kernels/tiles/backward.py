@@ -1,7 +1,8 @@
 """Gradients of the tiles' pixels, summed per entry (Gaussian and tile), front to back.
 
-S is the part of the loss' linear form behind the current Gaussian. Its start value is the gradient
-of the pixel times the pixel. c is the gradient times the Gaussian's colour. Then
+S is the contribution of all Gaussians behind the current one to the linearised loss. Its start
+value is the gradient of the pixel times the pixel. c is the gradient times the Gaussian's colour.
+Then
 
     dL/d(alpha) = T c - S / (1 - alpha),
 
