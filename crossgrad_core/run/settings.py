@@ -149,13 +149,25 @@ def _flat(layer: Mapping[str, object]) -> Settings:
 
 
 def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
-    """Return path of a setting -> the user's value, without None and empty lists."""
+    """Return path of a setting -> the user's value, without None and empty lists.
+
+    Raises:
+        UserError: A value is not a rule, or a rule is added and left out.
+    """
     places: dict[tuple[str, ...], object] = {}
     for name, value in options.items():
         if not (value is None or (isinstance(value, list) and not value)):
             place = _PLACES.get(name, tuple(name.split(".")))
             if place == (RULES,):
-                places |= {(RULES, rule): each for rule, each in _rules(name, value).items()}
+                rules = {(RULES, rule): each for rule, each in _rules(name, value).items()}
+                if twice := [rule for _, rule in places.keys() & rules.keys()]:
+                    raise UserError(
+                        "a rule is added and left out",
+                        where="--rule, --no-rule",
+                        found=listed(sorted(twice)),
+                        todo="leave one of the two options out",
+                    )
+                places |= rules
             else:
                 places[place] = _plain(value)
     return places

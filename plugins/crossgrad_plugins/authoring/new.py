@@ -122,8 +122,9 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
     }
     return {
         "pyproject.toml": _PROJECT.format(**words),
+        # The generator of a rule has the name under which the rule is installed.
         f"{module}.py": re.sub(rf"\b{model}\b", member, source).replace(
-            f'"{example.stem}"', f'"{name}"'
+            f'rngs["{example.stem}"]', f'rngs["{name}"]'
         ),
         f"tests/test_{module}.py": _TEST.format(**words),
     }

@@ -243,3 +243,9 @@ def test_a_run_with_all_our_rules_goes_on_with_the_same_bits():
     assert whole.states["weight-averaging"].values == {"count": 3}
     one, two = (eval_parameters(setup, state) for state in (whole, part))
     assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_a_rule_that_is_added_and_left_out_is_refused():
+    with pytest.raises(UserError, match="added and left out") as caught:
+        merged(None, {"rule": ["dropout"], "no_rule": ["floaters", "dropout"]}, ())
+    assert caught.value.found == "dropout"
