@@ -50,8 +50,8 @@ def test_inputs_that_once_failed_pass(target, name, tmp_path):
 
 @pytest.mark.parametrize("name", DEFECTS)
 def test_a_defect_that_is_put_back_is_found(name, tmp_path):
-    # What takes too long is known after half a second here.
-    target = replace(TARGETS[DEFECTS[name].target], seconds=0.5)
+    # What takes too long is known after a quarter of a second here.
+    target = replace(TARGETS[DEFECTS[name].target], seconds=0.25)
     bench = Bench(target, tmp_path / "bench")
     bench.warm_up(target.seeds())
     with DEFECTS[name].put_back():
