@@ -121,7 +121,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
 
 
 def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
-    """Return what an option is added to: a group of settings, or a component with its options."""
+    """Return the group of settings, or the component, to which a row adds an option."""
     value = getattr(config, name, None)
     return value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else {"name": AUTO}
 

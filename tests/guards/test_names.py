@@ -45,6 +45,8 @@ WITHDRAWN = {
     "second_look": "refine_poses",
     "soundness": "model_checks",
     "vaccinate": "align",
+    "max_scale_ratio": "rule scale-clamp",
+    "lr_tail_factor": "rule lr-tail",
     "usual_views": "default_views",
     "usual_grouping": "default_grouping",
     "usual_growth": "default_growth",
