@@ -159,8 +159,10 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
         if not (value is None or (isinstance(value, list) and not value)):
             place = _PLACES.get(name, tuple(name.split(".")))
             if place == (RULES,):
-                rules = {(RULES, rule): each for rule, each in _rules(name, value).items()}
-                if twice := [rule for _, rule in places.keys() & rules.keys()]:
+                rules: dict[tuple[str, ...], object] = {
+                    (RULES, rule): each for rule, each in _rules(name, value).items()
+                }
+                if twice := [place[-1] for place in places.keys() & rules.keys()]:
                     raise UserError(
                         "a rule is added and left out",
                         where="--rule, --no-rule",

@@ -171,7 +171,7 @@ def test_photos_that_the_file_lacks_keep_their_distance(varied, tmp_path, model)
 
 WRONG = {
     "no JSON": (b"{", "cannot be read"),
-    "another file": (b'{"status": "finished"}', "does not hold values"),
+    "another file": (b'{"status": "finished"}', "does not contain parameters"),
     "other photos": (
         b'{"format": 1, "exposure": "gain", "photos": {"x.png": {"stops": 0}}}',
         "of no training photo",

@@ -177,11 +177,15 @@ def test_lists_may_leave_out_suffixes_as_frames_may(tmp_path):
 @pytest.mark.parametrize(
     ("lists", "what", "where"),
     [
-        ({"train": ["images/z.png"]}, "no name of a list", "transforms.json: train_filenames"),
-        ({"train": []}, "no name of a list", "transforms.json: train_filenames"),
+        (
+            {"train": ["images/z.png"]},
+            "no name in a split list",
+            "transforms.json: train_filenames",
+        ),
+        ({"train": []}, "no name in a split list", "transforms.json: train_filenames"),
         (
             {"train": ["images/a.png"], "val": ["images/d"]},
-            "no name of a list",
+            "no name in a split list",
             "transforms.json: val_filenames",
         ),
         (

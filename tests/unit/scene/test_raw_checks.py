@@ -57,7 +57,7 @@ def test_positions_that_cannot_be_squared_are_refused(shift):
 @pytest.mark.parametrize(
     ("size", "params", "words"),
     [
-        ((2**63, 32), CAMERA.params, "more than any photo"),
+        ((2**63, 32), CAMERA.params, "larger than any photo"),
         ((48, 32), (1e-9, 50.0, 24.0, 16.0), "focal length"),
         ((48, 32), (50.0, 50.0, 1e300, 16.0), "camera parameter"),
         ((48, 32), (50.0, np.nan, 24.0, 16.0), "camera parameter"),
