@@ -8,6 +8,7 @@ starts in the background.
 import gc
 import os
 import signal
+from collections import defaultdict
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -49,11 +50,23 @@ def pytest_xdist_make_scheduler(config, log):
     return ByFileOrComponent(config, log)
 
 
+@pytest.hookimpl(tryfirst=True)  # Before pytest applies `-m`.
 def pytest_collection_modifyitems(items):
-    """Contracts first: no two processes compile a kernel that all later tests find compiled.
+    """Mark cases as slow that `sampled` leaves out, and sort the tests.
 
-    Guards last: they are short, so that no process waits long for the last one.
+    Contracts come first, so that no two processes compile a kernel that later tests load. Guards
+    come last, because they are short and no process then waits long for the last test.
     """
+    cases = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("sampled"):
+            cases[item.nodeid.partition("[")[0]].append(item)
+    for every in cases.values():
+        (count,) = every[0].get_closest_marker("sampled").args
+        kept = {len(every) * place // count for place in range(count)}
+        for place, item in enumerate(every):
+            if place not in kept:
+                item.add_marker(pytest.mark.slow)
 
     def place(item):
         if item.path.name == CONTRACTS:
