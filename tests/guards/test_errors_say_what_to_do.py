@@ -43,5 +43,5 @@ def test_every_error_says_what_to_do(path):
     assert not silent
 
 
-def test_the_guard_finds_errors():
+def test_the_guard_finds_more_than_100_errors():
     assert sum(len(raised(path)) for path in SOURCES) > 100
