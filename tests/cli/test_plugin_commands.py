@@ -99,7 +99,7 @@ def rows(out):
 
 
 @pytest.mark.usefixtures("installed")
-def test_help_lists_all_plugin_commands_without_importing_them(ran):
+def test_help_lists_all_plugin_commands_without_an_import(ran):
     code, out, err = ran("--help")
     found = rows(out)
     assert (code, err) == (0, "")

@@ -242,7 +242,7 @@ def test_a_value_that_is_not_a_component_is_refused_after_set(assignment):
 
 
 @pytest.mark.parametrize("slot", sorted(GROUPS))
-def test_every_slot_takes_a_name_a_mapping_a_class_or_an_instance(slot):
+def test_every_slot_accepts_a_name_a_mapping_a_class_or_an_instance(slot):
     name = "cagrad" if slot == "operators" else max(entries(slot))
     kind = load(slot, name)
     for given in (name, {"name": name}, kind, kind()):

@@ -38,7 +38,7 @@ def can_be_empty(value: ast.expr | None) -> bool:
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
-def test_every_error_says_what_to_do(path):
+def test_every_error_suggests_a_remedy(path):
     silent = [f"line {call.lineno}" for call in raised(path) if can_be_empty(told(call))]
     assert not silent
 

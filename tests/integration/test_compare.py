@@ -10,7 +10,7 @@ from crossgrad_core.run import app
 from crossgrad_plugins.compare.load_runs import read_runs
 
 
-def test_compare_reads_runs_as_they_are_written(tmp_path, capsys):
+def test_compare_reads_the_folders_that_run_writes(tmp_path, capsys):
     scene = write_tiny_scene(tmp_path / "scene", views=9)
     for views in ("1", "2"):
         out = str(tmp_path / "runs" / views)

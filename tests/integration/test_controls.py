@@ -226,7 +226,7 @@ def test_runs_with_few_passes_use_smaller_adam_betas(length, settings, beta2, vi
         ({"steps": 5, "beta1": 0.5, "recipe": {"name": "published"}}, 0.5),
     ],
 )
-def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, beta1):
+def test_a_shorter_run_averages_the_first_moment_over_fewer_steps(settings, beta1):
     setup = assembled(**{"views": 1, **settings})
     for step in (1, 5):
         assert rule_at(setup, step).betas[0] == pytest.approx(beta1, abs=1e-4)
@@ -290,7 +290,7 @@ def test_rate_factor_multiplies_the_first_step():
 
 
 @pytest.mark.parametrize("views", [2, 4, 10])
-def test_the_batch_rule_follows_the_views(views):
+def test_the_batch_rule_scales_with_the_number_of_views(views):
     setup, plain = (
         assembled(views=views, batch_rule=rule, beta2=0.999) for rule in ("sqrt", "none")
     )

@@ -263,7 +263,7 @@ def test_a_short_run_without_density_control_reports_so(scene, tmp_path):
     assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
 
 
-def test_growth_stops_at_max_gaussians_and_a_message_reports_it(scene, tmp_path):
+def test_growth_stops_at_max_gaussians_with_a_message(scene, tmp_path):
     # Every Gaussian is above a threshold of 1e-12, so the first edit wants to double them all.
     settings = {"steps": 60, **GROWTH, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
     settings["initializer"] = {"name": "points"}

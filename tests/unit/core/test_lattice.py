@@ -33,7 +33,7 @@ def test_cells_shrink_by_the_fork(fork):
     assert cells.tolist() == pytest.approx([0.5 / fork**level for level in range(5)], rel=1e-15)
 
 
-def test_a_lattice_site_is_the_nearest_and_its_position_maps_back_to_it():
+def test_lattice_sites_are_the_nearest_ones_and_their_positions_map_back_to_the_sites():
     rng = np.random.default_rng(0)
     points, levels = cloud(rng)
     grid = lattice()

@@ -278,7 +278,7 @@ def test_regimes_alternate_in_the_growth_order(seed, rows, regimes):
     assert found.tolist() == brute_places(rank, grows).tolist()
 
 
-def test_rasterizer_output_without_a_pixel_count_is_reported_as_its_error():
+def test_rasterizer_output_without_a_pixel_count_is_reported_as_a_fault_of_the_rasterizer():
     ctx = context()
     record = replace(recorded(ctx, 0), screen=Screen(torch.ones(40, dtype=torch.int32)))
     method = MultiViewDensityControl(count="running", share=1.0)

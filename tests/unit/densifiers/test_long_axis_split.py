@@ -99,7 +99,7 @@ def test_two_children_have_the_mean_spread_and_mass_of_their_parent(seed):
     assert mass.reshape(2, 3).sum(dim=0).numpy() == pytest.approx(before.numpy(), rel=1e-5)
 
 
-def test_children_lie_on_the_longest_axis():
+def test_children_are_placed_on_the_longest_axis():
     params = parameters()
     with torch.no_grad():
         params["quats"][:] = torch.tensor([1.0, 0, 0, 0])

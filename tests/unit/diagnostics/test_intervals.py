@@ -144,7 +144,7 @@ def test_intervals_contain_their_estimates():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_estimates_lie_inside_where_they_can(seed):
+def test_estimates_are_inside_their_intervals_if_possible(seed):
     rows, near = sample(seed)
     gramian, groups = rows @ rows.T, Groups(near)
     figures = variance_split(gramian, groups)

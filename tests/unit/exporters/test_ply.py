@@ -116,7 +116,7 @@ def test_the_header_has_the_property_order_of_inria(tmp_path: Path):
     assert not any(columns[name].any() for name in ("nx", "ny", "nz"))
 
 
-def test_f_rest_is_channel_major(tmp_path: Path):
+def test_f_rest_is_stored_channel_by_channel(tmp_path: Path):
     cloud = make_cloud(1)
     rest = np.zeros((1, 15, 3), dtype=np.float32)
     rest[0, :, 0], rest[0, :, 1], rest[0, :, 2] = range(100, 115), range(200, 215), range(300, 315)

@@ -191,7 +191,7 @@ def test_cell_colors_are_means_of_unmasked_pixels(size):
             np.testing.assert_array_equal(color, kept.mean(axis=0).round())
 
 
-def test_ground_without_points_is_filled_with_its_own_colours():
+def test_ground_without_points_is_filled_with_the_colours_of_the_ground():
     more = Filled(margin=0.0).more_points(ground_scene(LEFT))
     assert len(more.positions) > 10
     np.testing.assert_allclose(more.positions[:, 2], 0.0, atol=1e-6)
@@ -324,7 +324,7 @@ def test_the_margin_contains_only_regions_outside_all_training_photos():
 
 
 @pytest.mark.parametrize(("away", "hides"), [(0.5, True), (20.0, False)])
-def test_the_margin_continues_behind_points_that_hide_it_in_another_photo(away, hides):
+def test_the_margin_continues_behind_nearer_points_of_another_photo(away, hides):
     # A camera in the street looks over all the ground beyond the left edges, at a wall or far away.
     rng, street = np.random.default_rng(1), np.array([-6.0, 1.5, 0.3])
     wall = street + np.column_stack(

@@ -217,7 +217,7 @@ def test_linear_heads_without_a_trunk_are_refused(heads):
     assert len(reasons) == 1 and "metrics.lpips.trunk=FILE" in reasons[0]
 
 
-def test_the_error_about_missing_heads_suggests_how_to_install_them(trunks, monkeypatch):
+def test_the_error_about_missing_heads_names_the_package_to_install(trunks, monkeypatch):
     place = "crossgrad_plugins.metrics.lpips_distance.find_spec"
     monkeypatch.setattr(place, lambda package: None)
     # A path of its own, since weights are kept once they are read.

@@ -157,7 +157,7 @@ def test_a_whole_number_of_pixels_may_be_written_with_a_decimal_point(tmp_path, 
     assert (camera.width, type(camera.width)) == (30, int)
 
 
-def test_a_file_in_place_of_the_frames_folder_is_refused(tmp_path):
+def test_a_file_with_the_name_of_the_frames_folder_is_refused(tmp_path):
     (tmp_path / "renders").touch()
     with pytest.raises(UserError, match="something else is in the way"):
         video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")

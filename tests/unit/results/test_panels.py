@@ -117,7 +117,7 @@ def test_only_the_chosen_views_get_a_panel(tmp_path: Path, make_view):
 
 
 @pytest.mark.parametrize("link", [False, True])
-def test_a_file_in_place_of_the_panel_folder_is_refused(tmp_path: Path, make_view, link):
+def test_a_file_with_the_name_of_the_panel_folder_is_refused(tmp_path: Path, make_view, link):
     place = tmp_path / "renders"
     place.symlink_to(tmp_path / "nowhere") if link else place.touch()
     view = make_view("a/1.jpg", "a")

@@ -47,7 +47,7 @@ def with_photos(count):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
-def test_a_share_of_gaussians_is_dropped_and_the_opacity_of_the_rest_is_increased(share):
+def test_dropout_removes_a_share_of_gaussians_and_increases_the_other_opacities(share):
     setup = setup_of(rules={"dropout": {"share": share}})
     state = first_state(setup)
     whole = decoded(setup, state)

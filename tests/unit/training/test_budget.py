@@ -185,7 +185,7 @@ def test_growth_along_the_budget_curve_costs_the_primitives_that_it_adds():
     assert behind == pytest.approx(mean / (empty + 31_000))
 
 
-def test_budgeted_growth_is_never_estimated_above_unbounded_growth():
+def test_growth_to_a_budget_costs_at_most_the_cost_of_unbounded_growth():
     run, _ = along_the_curve(2000, 1)
     assert growth_ahead(run, PrimitiveCounts(1, 1), run.schedule, 0) == 2.0
 

@@ -38,5 +38,5 @@ def test_default_evaluations_without_resets_are_at_multiples_of_a_tenth(steps, g
     ],
     ids=str,
 )
-def test_opacities_are_reset_for_unbounded_growth_or_the_published_length(settings, every):
+def test_opacities_are_reset_if_growth_is_unbounded_or_the_length_is_published(settings, every):
     assert assemble(RunConfig(**settings), sample_scene(), "none").schedule.reset_every == every
