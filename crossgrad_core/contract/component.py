@@ -18,10 +18,10 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 class Component(BaseModel):
-    """Base class of everything that fills a slot.
+    """Base class of all components; a component fills a slot.
 
-    The fields are the options (typed, bounded, documented). A component never stores running state;
-    the state is passed in and returned as `PluginState`.
+    The fields are the options (typed, bounded, documented). A component never stores the state of a
+    run; the state is passed in and returned as `PluginState`.
 
     Attributes:
         slot: The slot that the component fills; set by the slot's base class.

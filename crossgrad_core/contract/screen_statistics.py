@@ -75,9 +75,10 @@ def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
 
 
 def seen(record: RenderedView) -> Tensor | None:
-    """Return [S] int64 rows of the Gaussians that touched a pixel, for sums over these rows.
+    """Return [S] int64 rows of the Gaussians that touched a pixel; sums need only these rows.
 
-    On a GPU, return None, which means all rows, because the host would wait for their number.
+    On a GPU, return None, which means all rows, because the host would have to wait for their
+    number.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:

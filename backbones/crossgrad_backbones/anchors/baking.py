@@ -77,7 +77,7 @@ def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The appearance of A anchors with k slots each in one camera.
+    """The appearance of A anchors with k slots each, as seen by one camera.
 
     Attributes:
         opacities: [A, k], 0 if nothing is drawn.

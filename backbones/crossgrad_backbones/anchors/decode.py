@@ -106,7 +106,7 @@ class _Back:
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
-    """Compute the gradients of the inputs.
+    """Compute the gradients of the inputs of the forward pass.
 
     Args:
         inputs: Inputs of the forward pass.
@@ -175,7 +175,7 @@ class _Decode(torch.autograd.Function):
 
 
 def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
-    """Return the Gaussians of positive opacity, differentiable in all tensors.
+    """Return the Gaussians with positive opacity, differentiable in all tensors.
 
     Args:
         view: The constant part.

@@ -49,11 +49,11 @@ class Network:
 
     @property
     def tensors(self) -> tuple[str, ...]:
-        """Names of its tensors."""
+        """The names of the network's tensors."""
         return tuple(f"{self.name}.{n}.{kind}" for n in LAYERS for kind in ("weight", "bias"))
 
     def block(self, kind: BlockKind, lr: LearningRate) -> Block:
-        """Return the block of all its tensors."""
+        """Return a block that contains all tensors of the network."""
         return Block(self.name, self.tensors, per_primitive=False, kind=kind, lr=lr)
 
     def created(self, rng: np.random.Generator) -> Parameters:
@@ -90,7 +90,7 @@ class Raw:
 
 @dataclass(frozen=True)
 class Heads:
-    """The networks that map an anchor's feature and viewing direction to its Gaussians.
+    """The networks that compute an anchor's Gaussians from its feature and the viewing direction.
 
     Attributes:
         offsets: k, Gaussians of an anchor.
@@ -194,7 +194,7 @@ class Heads:
 
 @dataclass(frozen=True)
 class Seen:
-    """The anchors that a view decodes.
+    """The anchors that are decoded for one view.
 
     Attributes:
         rows: [A] int64, their rows, without duplicates.
