@@ -32,7 +32,7 @@ _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """Return the present name of a setting; if `beside` contains that name, keep the old name."""
+    """Return the present name of a setting; keep the old name if `beside` contains the new one."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 

@@ -120,7 +120,7 @@ def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None
 
 
 def mean(statistics: Mapping[str, Tensor], total: str, count: str) -> Tensor:
-    """Return [P], the quotient of two sums; 0 where the count is 0."""
+    """Return [P], the quotient of two sums; 0 if the count is 0."""
     counts = statistics[count]
     means = statistics[total] / counts.clamp(min=torch.finfo(counts.dtype).tiny)
     return torch.where(counts > 0, means, torch.zeros_like(means))

@@ -1,4 +1,4 @@
-"""The running sum of the gradients of K views on a GPU; the host waits only when it is read.
+"""The running sum of the gradients of K views on a GPU; the host waits only when the sum is read.
 
 `SummedGradients` checks the gradients of each view when they are added. On a GPU, this would make
 the host wait K times for each tensor.

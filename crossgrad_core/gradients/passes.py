@@ -62,7 +62,7 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
 def column_remainders(
     columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return [B, K, K], the rounding residuals of `gramians`, sums of `column_gramians`.
+    """Return [B, K, K], the rounding residuals of `gramians`, which are sums of `column_gramians`.
 
     Args:
         columns: T columns.
@@ -97,7 +97,7 @@ def rounding_residuals(
 ) -> NDArray[np.float64]:
     """Return [B, K, K], the exact Gramians (to about 106 bits) minus the rounded `gramians`.
 
-    The result is NaN where a Gramian is not finite.
+    The result is NaN if a Gramian is not finite.
 
     Args:
         columns: T columns.

@@ -106,7 +106,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
-    """Return the backbone that the rasterizer draws, and the densifier that needs its outputs."""
+    """Return the backbone that the rasterizer renders, and the densifier that needs its outputs."""
     backbone = build(Backbone, config.backbone.name, config.backbone.options)
     choice = config.densifier or ComponentChoice(name=AUTO)
     name = backbone.default_densifier if choice.name == AUTO else choice.name

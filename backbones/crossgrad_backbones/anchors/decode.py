@@ -64,7 +64,7 @@ class _Back:
         return cls(heads, torch.zeros_like(inputs.features), first, second, *buffers)
 
     def sweep(self, inputs: Inputs, kept: Kept, fill: Callable[..., None]) -> None:
-        """Process all anchors in stretches; `fill(first, n)` writes `raw`."""
+        """Process all anchors in stretches; `fill(first, n)` writes `raw` for n anchors."""
         width, feature = self.second[0].shape[1], inputs.features.shape[1]
         begin = self.heads[0] * width
         mine = slice(begin, begin + self.hidden.shape[1])

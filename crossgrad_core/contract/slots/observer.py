@@ -1,4 +1,4 @@
-"""The observer slot: watches run events and may wrap the hooks."""
+"""The observer slot: a component observes the events of a run and may wrap hooks."""
 
 from typing import ClassVar
 
@@ -14,8 +14,8 @@ class Observer(Component):
     not count as training).
 
     Attributes:
-        needs_separate_gradients: Whether it reads the gradients of single views. The run then
-            stores these gradients separately, which costs memory and changes no bit of the
+        needs_separate_gradients: True if the observer reads the gradients of single views. The run
+            then stores these gradients separately, which costs memory and changes no bit of the
             training.
     """
 

@@ -60,6 +60,6 @@ class GaussiansResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class FinalEdit(DensifyResult):
-    """Result of `crossgrad_final_edit`: the edit of a finished run, and a line for its log."""
+    """Result of `crossgrad_final_edit`: the edit of a finished run, and a line for the log."""
 
     note: str
