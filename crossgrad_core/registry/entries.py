@@ -202,7 +202,7 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
 
 
 def failed_plugin(error: Exception) -> UserError | None:
-    """Return the error for an exception from another package's code; None for crossgrad's own."""
+    """Return the error for an exception from another package; None for crossgrad's own code."""
     others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
     found = [(entry, place) for entry in others if (place := raised_at(error, entry.package))]
     if not found:

@@ -162,7 +162,7 @@ def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> 
 
 
 def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
-    """Return the function (it may be a wrapper), which then adds the note to its own exceptions."""
+    """Return the function (it may be a wrapper) with the note added to the exceptions it raises."""
 
     def call(*arguments: object) -> object:
         try:
@@ -195,7 +195,7 @@ def _described(name: str, plugin: object) -> str:
 
 
 def _complete(answer: Answer) -> bool:
-    """Return True if the content of an answer has its type; a None inside is an error, too."""
+    """Return True if the content of an answer has its type; None inside an answer is also wrong."""
     match answer:
         case SampleResult():
             return bool(answer.draw)

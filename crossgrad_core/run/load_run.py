@@ -415,7 +415,7 @@ def require_checkpoint(folder: Path) -> None:
 def opened(
     folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
 ) -> tuple[Setup, TrainState]:
-    """Load a finished, stopped or still training run and its newest state, to look at them.
+    """Load a finished, stopped or still training run and its newest state, without writing.
 
     Args:
         folder: The run's folder.

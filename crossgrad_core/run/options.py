@@ -34,7 +34,7 @@ class Option:
 
     @property
     def name(self) -> str:
-        """Its name as a keyword: `max_size` for `--max-size`."""
+        """The option's name as a keyword: `max_size` for `--max-size`."""
         return self.flag.name or self.path[-1]
 
 

@@ -95,7 +95,7 @@ class Fingerprint(_Mark):
         format: Version of the layout.
         frame: The local frame.
         points: The SfM points.
-        lists: Name -> digest of the split lists, if any.
+        lists: Name -> digest of each split list.
         files: Path relative to the scene's folder -> file, for the files that the reader used,
             except photos and masks; None in a fingerprint of an earlier version.
         views: Name -> view.
@@ -216,8 +216,8 @@ class Difference:
 def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     """Return the differences between the former and the current scene; empty if they are equal.
 
-    Other training views also change the local frame and everything measured in it. In this case
-    only the cause is reported.
+    A change of the training views also changes the local frame and all values measured in it. In
+    this case only the change of the views is reported.
     """
     found = _views(was, now)
     if not any(each.weight is Weight.PLACE for each in found):
@@ -290,7 +290,7 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 
 def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Return differences of files except photos and masks; none if a run did not record them."""
+    """Return differences of files except photos and masks; empty if a run did not record them."""
     if was.files is None or now.files is None:
         return []
     names = was.files.keys() | now.files.keys()

@@ -26,8 +26,8 @@ _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 def keep_freed_memory() -> None:
     """Keep up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
-    By default glibc returns it to the system after every step. The kernel then clears each page
-    again when the next step first writes to it. Other C libraries stay unchanged.
+    By default, glibc returns the memory to the system after every step. The kernel would then clear
+    each page again when the next step first writes to it. Other C libraries are not affected.
     """
     heap = _heap()
     if heap is not None:
@@ -38,7 +38,7 @@ def keep_freed_memory() -> None:
 def use_large_pages() -> None:
     """Request large pages for the part of the heap that grew since the last call (Linux, glibc).
 
-    Steps read and write Gaussians at scattered places in arrays of many megabytes. With pages of
+    Steps read and write Gaussians at scattered positions in arrays of many megabytes. With pages of
     4 KiB, most accesses miss the processor's table of pages (TLB). This is only a request: the
     system may not support large pages, or may not provide them.
     """

@@ -82,7 +82,7 @@ class Backbone(Component):
 
     @property
     def gaussian_tensors(self) -> tuple[str, str, str] | None:
-        """Names of the tensors of positions, scales and rotations, if steps update them as a whole.
+        """Names of the tensors of positions, scales and rotations, if steps update all their rows.
 
         None if primitives are not Gaussians with axes, or if the update of some rows may be
         deferred.

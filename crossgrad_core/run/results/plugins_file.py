@@ -100,7 +100,7 @@ def history(packages: Packages) -> tuple[str, ...]:
 
 
 def without_outdated(notes: Iterable[str], packages: Packages) -> Iterator[str]:
-    """Drop notes that name one version of a package if several versions trained the run."""
+    """Remove notes that name a single version of a package if several versions trained the run."""
     outdated = tuple(
         f"from {name} {version}: "
         for name, package in packages.items()
@@ -177,7 +177,7 @@ def report_changed(packages: Packages | None) -> None:
 
 
 def _parts(value: object) -> Iterator[Component]:
-    """Yield the components in a value, including components in the options of others."""
+    """Yield the components in a value, including components in the options of other components."""
     if isinstance(value, Component):
         yield value
     inner: Iterable[object] = ()

@@ -73,7 +73,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
 
 
 class _Bounded(BufferedReader):
-    """A file from which no more bytes are read than it holds.
+    """A file that never returns more bytes than it contains.
 
     A chunk may claim any length, and a plain `read` would allocate that much memory at once.
 
@@ -136,7 +136,7 @@ def _check_pixels(image: "Image", path: Path) -> None:
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
-    """Open an image like `Image.open`, but without Pillow's pixel limit: ours is checked later."""
+    """Open an image like `Image.open`, but without Pillow's pixel limit; ours is checked later."""
     from PIL import Image
 
     Image.init()
@@ -152,7 +152,7 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
 
 
 def admit(head: bytes, path: Path) -> bool:
-    """Return True if a file is HEIC or HEIF; Pillow can then open it.
+    """Return True if a file is HEIC or HEIF; afterwards Pillow can open it.
 
     Args:
         head: The first bytes of the file.

@@ -47,8 +47,8 @@ class Sketches:
 
     Attributes:
         small: [V, 16, 16, 3] pixels, levels of 255.
-        sharpness: [V] differences between neighbours over differences between pixels farther apart;
-            NaN if the farther pixels hardly differ.
+        sharpness: [V] differences between neighbouring pixels divided by differences between more
+            distant pixels; NaN if the distant pixels hardly differ.
         light: [V] mean level of the pixels, 0 to 255.
     """
 
@@ -152,7 +152,7 @@ _BYTES_OF_A_PIXEL: Final = 4
 
 
 def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -> Scene:
-    """Check a scene and return it with notes on contradictions, and with the figures in `check`.
+    """Check a scene and return it with notes about contradictions and with the results in `check`.
 
     Args:
         scene: The scene.

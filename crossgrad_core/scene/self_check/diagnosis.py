@@ -1,4 +1,4 @@
-"""Diagnosis of a contradictory scene: the trial change that repairs it names the cause."""
+"""Diagnosis of a contradictory scene: the trial change that repairs the scene names the cause."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace

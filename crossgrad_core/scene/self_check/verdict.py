@@ -1,4 +1,4 @@
-"""The verdict on a scene: do its photos agree with its points, which photos do not, and why."""
+"""The verdict on a scene: whether its photos agree with its points, which do not, and why."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -144,7 +144,8 @@ class _Group:
         evidence: The points for the comparison.
         views: [V] rows of the views.
         agreement: Agreement of the unchanged photos.
-        recolored: True if the points' own colours are useless and photos replace them.
+        recolored: True if the points' own colours are useless, so that the photos' colours replace
+            them.
     """
 
     evidence: Evidence
