@@ -147,5 +147,5 @@ def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
 
 
 def _ranked(speeds: Mapping[str, float]) -> list[str]:
-    """Return the names, the fastest first, equally fast ones by name."""
+    """Return the names in order of decreasing speed; ties are sorted by name."""
     return sorted(speeds, key=lambda name: (-speeds[name], name))

@@ -59,7 +59,7 @@ class _Heap:
         self._asked = library.sbrk(0)
 
     def keep(self) -> None:
-        """Keep freed memory, and let the heap grow: memory that is not written to costs nothing."""
+        """Keep freed memory, and let the heap grow; memory that is never written costs nothing."""
         self._library.mallopt(TRIM_THRESHOLD, KEPT)
         self._library.mallopt(MMAP_THRESHOLD, LARGEST)
         self._library.mallopt(TOP_PAD, FIRST)

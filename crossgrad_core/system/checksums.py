@@ -143,7 +143,7 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 
 
 def warn_if_changed(path: Path) -> None:
-    """Warn about a file that differs from SHA256SUMS in its folder; another program may edit it."""
+    """Warn about a file that differs from SHA256SUMS; another program may have edited it."""
     if changed_files(path.parent, [path.name]):
         _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
 

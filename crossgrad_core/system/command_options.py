@@ -1,4 +1,4 @@
-"""Options of a command: made from the fields of a dataclass, grouped under headings.
+"""Options of a command, generated from the fields of a dataclass and grouped under headings.
 
 The help uses no rich, which would double the start-up time.
 """

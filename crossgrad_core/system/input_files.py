@@ -1,4 +1,4 @@
-"""Input files: only regular files of bounded size, so that none blocks or fills the memory.
+"""Input files: only regular files of bounded size are read, so none blocks or fills the memory.
 
 Links are followed; docs/reliability.md lists the locations to which names may point.
 """

@@ -263,7 +263,7 @@ def most_primitives_survive(make: Make[Densifier]) -> None:
 
 
 def same_seed_same_edits(make: Make[Densifier]) -> None:
-    """The edits depend only on the arguments, and randomness comes from `context.rng`."""
+    """The edits depend only on the arguments; random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one, other = DensifierRun.of(make()), DensifierRun.of(make())
         for step in _AROUND_EDITS:

@@ -43,7 +43,7 @@ class Stopper:
 
     Attributes:
         signal: Number of the first signal; None if there was no signal.
-        at_once: Whether there was a second signal; optional work is then skipped.
+        at_once: True after a second signal; optional work is then skipped.
         error: Error from outside the training step that ends the run; None without an error.
     """
 
@@ -65,9 +65,9 @@ class Stopper:
 
     @contextmanager
     def installed(self) -> Iterator["Stopper"]:
-        """Handle signals inside the block; does nothing outside the main thread.
+        """Handle signals inside the block; this does nothing outside the main thread.
 
-        Signals that the process ignores already (`nohup`, background jobs) stay ignored.
+        Signals that the process already ignores (`nohup`, background jobs) are still ignored.
         """
         before = self._before
         try:
@@ -218,8 +218,8 @@ def train(
     each call creates a new guard.
 
     Raises:
-        TrainingFailedError: A value was not finite for the second time, or at the start; names
-            step, views and block.
+        TrainingFailedError: A value was not finite for the second time, or at the start; the
+            message names step, views and block.
         BaseException: An error of a plugin, a photo, the memory or the disk, with the step as a
             note. After any exception, `state` is the last good state.
     """
@@ -339,12 +339,12 @@ def copies_after(setup: Setup, step: int) -> bool:
 
 
 def saves_after(setup: Setup, step: int) -> bool:
-    """Return True if a checkpoint is written after this step, which is not the last one."""
+    """Return True if a checkpoint is written after this step; False for the last step."""
     return step % setup.numbers.save_every == 0 and step < setup.schedule.total
 
 
 def evaluates_after(setup: Setup, step: int) -> bool:
-    """Return True if held-out views are evaluated after this step, which is not the last one."""
+    """Return True if held-out views are evaluated after this step; False for the last step."""
     every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
     # Opacities are also reset every tenth of the steps, and renders are poor right after a reset.

@@ -36,10 +36,10 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 
 
 def learns_in(step: int, every: int) -> bool:
-    """Return True if a tensor that learns in one of `every` steps learns in this one.
+    """Return True if a tensor with one update in `every` steps is updated in this step.
 
-    One step of each `every` steps is chosen by a hash. So no photo or regime is left out if a
-    sampler cycles through photos or regimes.
+    One step of each `every` steps is chosen by a hash. No photo or regime is therefore left out if
+    a sampler cycles through photos or regimes.
     """
     turn, place = divmod(step - 1, every)
     return place == hash32(turn) * every >> 32
@@ -71,10 +71,10 @@ class Scale:
 
 
 class OperatorScale:
-    """The factors c(K), the sums of an operator's weights for K equal gradients.
+    """The factors c(K), which are the sums of an operator's weights for K equal gradients.
 
     The operator is called once for each combination of K and labels, with K equal gradients of one
-    element per tensor, without state. The views differ in their labels only. This defines a scale
+    element per tensor, without state. The views differ only in their labels. This defines a scale
     for every operator: chains, one operator per block, element-wise operators and plugins.
 
     Args:
@@ -183,7 +183,7 @@ class Setup:
         return Numbers.of(self.in_force)
 
     def following(self, steps: int, start: int | None) -> dict[str, Any]:
-        """Return the values that length-dependent settings have for a total of `steps` steps.
+        """Return the length-dependent settings for a total of `steps` steps.
 
         Args:
             steps: Steps of the run.
@@ -298,7 +298,7 @@ class Setup:
 
     @cached_property
     def joint(self) -> bool:
-        """Whether one backward pass runs through the sum of the views' losses."""
+        """True if one backward pass runs through the sum of the views' losses."""
         return self.config.backward == "joint"
 
     @cached_property

@@ -31,7 +31,7 @@ def corner_of(step: int, slot: int, stride: int) -> Corner:
 
 
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
-    """Return the camera whose pixels are every n-th pixel of `camera`, from `corner` on.
+    """Return the camera whose pixels are every n-th pixel of `camera`, starting at `corner`.
 
     The centre of its pixel (i, j) is the centre of pixel (corner + n (i, j)) of `camera`.
     """
@@ -70,8 +70,8 @@ def _copied(pixels: Tensor) -> Tensor:
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
     """Return the Gaussians with the dilation of the full photo, in units of n times wider pixels.
 
-    With it, a render with `camera_of` has the same values as the full render at these pixels,
-    except for Gaussians so far outside the image that their positions are clamped.
+    A render with this dilation and `camera_of` has the same values as the full render at these
+    pixels, except for Gaussians so far outside the image that their positions are clamped.
     """
     if stride == 1:
         return gaussians

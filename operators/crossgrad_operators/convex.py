@@ -55,7 +55,7 @@ class CAGrad(Weighting):
         return self.c > 0
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.c > 0:
             return {}
         return {"rescale": "it divides by 1 where c = 0; leave it out"}

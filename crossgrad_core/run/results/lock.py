@@ -97,7 +97,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
 
 def writer_of(folder: Path) -> str | None:
-    """Describe the process that writes into the folder now; None if none does or is known."""
+    """Describe the process that currently writes into the folder; None without a known process."""
     try:
         with (folder / FILE).open("r+b") as file:
             return _named(_read(file)) if _take(file) == "by another" else None

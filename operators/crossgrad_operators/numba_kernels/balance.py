@@ -1,7 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
 
-Each kernel computes with 16 or 32 digits. It also returns the blocks for which rounding of the
-Gramian may be visible in a result of 16 digits.
+Each kernel computes with 16 or 32 digits. It also marks the blocks for which rounding of the
+Gramian may be visible in a 16-digit result.
 """
 
 import math
