@@ -153,7 +153,7 @@ class Progress:
 
     @property
     def due(self) -> bool:
-        """True if a line would be shown now; useful if the text is slow to make."""
+        """True if a line would be shown now; useful if the text is expensive to make."""
         return monotonic() - self._last >= self._pause
 
     def tell(self, text: str) -> None:

@@ -293,7 +293,7 @@ def _check_gradients(
 
 
 def _is_finite(tensor: Tensor) -> bool:
-    """Return True if finite or on a GPU, where the loss of the photo's next draw shows an error."""
+    """Return True if finite or on a GPU, where the next loss of the photo shows an error."""
     return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 
 

@@ -1,4 +1,4 @@
-"""Calls of rules: Gaussians of a view, learning rates, and parameters for evaluation."""
+"""Calls of rules: for Gaussians of a view, learning rates, and parameters in evaluations."""
 
 from dataclasses import replace
 from math import inf, prod

@@ -77,7 +77,7 @@ class DevicePhotos:
         return here or self._scaled.holds(view, camera)
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """See `ScaledPhotos.get`; `full` returns the photo in host memory."""
+        """Return the photo and mask on the GPU; `full` returns them in host memory."""
         size = camera.width, camera.height
         held = self._kept.get(view.name)
         if held is not None and held[0] == size:

@@ -1,4 +1,4 @@
-"""Strided rendering: one pixel of each n x n is rendered, at a position that varies by step."""
+"""Strided rendering: one pixel of each n x n block is rendered, at a varying position."""
 
 from dataclasses import replace
 from math import isclose

@@ -18,7 +18,8 @@ from crossgrad_core.plugin import (
 class Sum(MatrixOperator):
     """u = sum of g_k, equal to one backward pass through the sum of the losses.
 
-    No Gramian and no separate gradients are needed. Separate gradients give the same bits.
+    No Gramian and no separate gradients are needed. Separate gradients give the same bits as
+    accumulated gradients.
     """
 
     separate: ClassVar[bool] = False
@@ -61,7 +62,8 @@ def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
 class Mean(MatrixOperator):
     """u = (1/K) sum of g_k, where K counts all views of the step, also views without a gradient.
 
-    Under Adam it equals `sum` up to the optimizer's eps. No separate gradients are needed.
+    Under Adam it equals `sum` up to the optimizer's eps. Neither Gramians nor separate gradients
+    are needed.
     """
 
     separate: ClassVar[bool] = False

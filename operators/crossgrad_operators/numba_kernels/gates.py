@@ -20,7 +20,7 @@ MET = 1e-9
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
-    """Return the pairs [B, K, K] that have probably been conflicting, and update `moments`.
+    """Return the pairs [B, K, K] that have probably been in conflict, and update `moments`.
 
     Args:
         moments: [B, 3, K, K] raw exponential averages of the cosine and its square, and the number

@@ -5,11 +5,11 @@ positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such po
 linearly dependent, the multipliers are not unique, but the point is unique.
 
 The matrix of cosines is known up to rounding, which leaves its smallest eigenvalues unknown. A
-ridge on its diagonal therefore makes it definite. The ridge bounds the multipliers, and makes them
+ridge on its diagonal therefore makes it definite. The ridge bounds the multipliers and makes them
 continuous functions of the cosines. If the effect of the ridge matters, the step is repeated from
-its own result (proximal point iteration). At the end, a component along an eigenvector of
-eigenvalue l is missing only the share (ridge / (l + ridge))^ROUNDS. Directions that are far from
-dependent need no second round.
+its own result (proximal point iteration). At the end, the component along an eigenvector of
+eigenvalue l lacks only the share (ridge / (l + ridge))^ROUNDS. Directions that are far from
+linearly dependent need no second round.
 """
 
 from typing import NamedTuple
@@ -79,12 +79,13 @@ class Polyhedron(NamedTuple):
         barred: [K] True if rounding prevents a constraint from becoming active.
         chosen: [K] indices of the active constraints, at the front.
         point: [K] b + y.
-        gradient: [K] C (b + y) - h + ridge (y - centre). It is the slack if y = centre.
+        gradient: [K] C (b + y) - h + ridge (y - centre). The gradient is the slack if y = centre.
         factor: [K, K] Cholesky factor L of the active cosines with their ridge, and L^T above the
             diagonal.
         step: [K] change of the multipliers.
         room: [K] working memory of `substitute`.
-        ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may err.
+        ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may not be
+            enough.
         rounding: Bounds that follow from the number of digits.
     """
 

@@ -1,7 +1,7 @@
 """Reference implementations (oracles) of all methods in 50 digits, from their formulas.
 
 An oracle receives the exact Gramian of the views with a gradient, and returns their weights.
-Thresholds that are part of our definition of a method are part of its oracle: exact opposition up
+Thresholds that belong to our definition of a method also belong to its oracle: exact opposition up
 to 1 + cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
 """
 
@@ -229,7 +229,7 @@ def confgate(question: Question) -> Vector:
 
 
 def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
-    """Return whether a pair has probably been conflicting, including this step's cosine."""
+    """Return True if a pair has probably been in conflict, including this step's cosine."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
     tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]

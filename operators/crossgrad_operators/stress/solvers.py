@@ -1,8 +1,8 @@
 """Oracles in 50 digits that solve small optimization problems.
 
 The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
-exact active sets. Every answer is checked against the optimality conditions, which have only one
-solution, so the answer is the minimum. If the gradients are linearly dependent, the weights are not
+exact active sets. Every result is checked against the optimality conditions; they have only one
+solution, so the result is the minimum. If the gradients are linearly dependent, the weights are not
 unique, and the weights of independent gradients are returned.
 """
 
@@ -163,7 +163,7 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 
 
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
-    """Return whether the convex combination beta / sum beta proves that the result is zero.
+    """Return True if the convex combination beta / sum beta proves that the result is zero.
 
     x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k =
     sum x_k e_k.u is at most |sum x_k e_k| sqrt K, and so is the inverse of the largest beta.

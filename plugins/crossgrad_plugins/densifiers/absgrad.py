@@ -72,8 +72,8 @@ class AbsGradDensityControl(AxisSplit):
     def _by_quantile(self, gradient: Tensor, absolute: Tensor) -> Tensor:
         """Return [P] bool: g >= threshold, or ga >= its (1 - rho) quantile.
 
-        rho is the share of primitives with g >= threshold. If rho is 0, nothing grows. A primitive
-        that was never seen (ga = 0) does not grow either.
+        rho is the share of primitives with g >= threshold. If rho is 0, no primitive grows. A
+        primitive that was never visible (ga = 0) does not grow either.
         """
         moves = gradient >= self.grad_threshold
         if not bool(moves.any()):

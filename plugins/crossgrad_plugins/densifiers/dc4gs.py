@@ -58,9 +58,9 @@ GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
 def split_positions(scores: Tensor) -> Tensor:
     """Return [S] share p of the axis for the left child, in [1/12, 11/12].
 
-    The function searches the minimum of the polynomial of degree 4 through the scores, on a grid
-    and at the nodes. Of equal values the most central one is used, so equal scores split in the
-    middle.
+    The function searches for the minimum of the polynomial of degree 4 through the scores, on a
+    grid and at the nodes. Among equal values the most central one is used, so that equal scores
+    split in the middle.
 
     Args:
         scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.
@@ -88,9 +88,9 @@ class DirectionalConsistency(CloneSplit):
     """Clones by the mean gradient, and splits by (1 - R) ga if gradient directions disagree.
 
     R is the length of the mean direction of the pixels' gradients. ga is the norm of their absolute
-    values. Both are computed per view; (1 - R) ga is averaged over the renders in which the
-    Gaussian was visible. The children of a split are side by side on the longest axis. The cut is
-    at the position where both sides are most consistent.
+    values. Both are computed per view; the product (1 - R) ga is averaged over the renders in which
+    the Gaussian was visible. The children of a split are side by side on the longest axis. The cut
+    is at the position at which both sides are most consistent.
     """
 
     needs = frozenset({"directions"})

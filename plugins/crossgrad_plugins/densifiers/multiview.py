@@ -40,7 +40,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     gradient. Only a share of the usual pruning candidates is removed; candidates are drawn with
     weights that increase with their share in the error. After density control has ended, Gaussians
     that are faint or have nearly the largest error are removed at some points of the run. For
-    anchors: densifier `multiview-gate`.
+    anchors, use the densifier `multiview-gate`.
     """
 
     needs = frozenset({"abs_gradient", "count"})

@@ -48,7 +48,7 @@ def densifier_of(value: object) -> Densifier:
 
 
 class MultiViewGate(CountsMarkedPixels):
-    """Lets another densifier grow only primitives that several views show to be erroneous.
+    """A densifier that lets another densifier grow only primitives with errors in several views.
 
     A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels of
     a view on average. The other densifier decides how it grows and which primitives are pruned:
@@ -84,7 +84,7 @@ class MultiViewGate(CountsMarkedPixels):
         return self.count == "running" or self.of.observes
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         idle = self.idle_counting(renders=False)
         inner = set_for_nothing(self.of, replace(selection, densifier=self.of))
         if inner:
