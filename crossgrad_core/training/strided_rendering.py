@@ -25,7 +25,7 @@ def stride_of(scale: float, camera: Camera) -> int:
 
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
-    """Return the pseudo-random pixel of each n x n that a step renders of its view at `slot`."""
+    """Return the pseudo-random pixel of each n x n block that a step renders for `slot`."""
     place = hash32(hash32(step) + slot) * stride * stride >> 32
     return place % stride, place // stride
 

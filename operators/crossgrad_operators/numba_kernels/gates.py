@@ -75,7 +75,7 @@ def _scale(logs: Floats, active: Flags) -> None:
 
 @strict_device
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
-    """Fill in lengths [S] of the sums over each group, or zeros for mere rounding noise."""
+    """Fill in lengths [S] of the sums over each group; 0 for sums that are only rounding noise."""
     views = group.size
     longest = np.zeros(lengths.size)
     lengths[:] = 0.0

@@ -134,7 +134,7 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
 
 
 class _Combination:
-    """A sum of v_k g_k that grows by one term at a time, and its products with all gradients.
+    """A sum of terms v_k g_k that grows term by term, and its products with all gradients.
 
     Args:
         gramian: [n][n].

@@ -307,7 +307,7 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
 
 
 def _other_speed(runs: Sequence[Run], name: str) -> str:
-    """Return how the calibrated speed of the machine differs between runs; empty if it does not."""
+    """Return how the calibrated speed of the machine differs between runs; empty if it is equal."""
     known = [(run.number("environment", "calibration", name), run) for run in runs]
     rates = [(rate, run) for rate, run in known if rate is not None]
     if len(rates) < len(runs):

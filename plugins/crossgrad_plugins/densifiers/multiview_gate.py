@@ -1,4 +1,4 @@
-"""A gate around another densifier: primitives grow only by the errors of several views (FastGS)."""
+"""A gate around another densifier: errors of several views decide which primitives may grow."""
 
 from collections.abc import Mapping
 from dataclasses import replace

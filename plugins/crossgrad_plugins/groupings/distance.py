@@ -35,7 +35,7 @@ from crossgrad_plugins.groupings.split import (
 class Radial(Grouping):
     """near: distance from the mean training camera up to its median; far: larger distances.
 
-    Source: the paper, median radial split; Otsu's threshold is ours.
+    Source: the paper, median radial split; Otsu's threshold was added for crossgrad.
     """
 
     cut: Cut = Field("median", description=CUT)
@@ -95,9 +95,9 @@ class Terciles(Grouping):
 
 
 class Anchors(Grouping):
-    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: the rest.
+    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: all others.
 
-    The middle may be empty in a scene with very few cameras; near and far may not.
+    The group middle may be empty in a scene with very few cameras; near and far may not be empty.
 
     Source: the paper, operator variants.
     """

@@ -159,7 +159,7 @@ def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]
 
 
 def _parts(count: int, least: int) -> Iterator[range]:
-    """Yield index ranges to leave out, the longest first, so that at least `least` remain."""
+    """Yield removable index ranges, the longest first, so that at least `least` indices remain."""
     size = count // 2
     while size:
         for first in range(0, count, size):

@@ -138,7 +138,7 @@ def load_row(
 ) -> None:  # fmt: skip
     """Load s, d (relative to their centres) and the mask of a row into the rings.
 
-    Outside the image and at masked-out pixels, both images are 0.
+    Outside the image and at masked pixels, both images are 0.
     """
     first = CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
     count = CHANNELS * (box[3] - box[2] + 4 * RADIUS)
