@@ -12,11 +12,11 @@ ALL_MASKED = "every pixel is masked"
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """regime: The regime of the view.
+    """The metrics of one view.
 
     Attributes:
         name: Name of the view.
-        regime: Its regime.
+        regime: The regime of the view.
         values: Name of a metric -> value; None if the metric is undefined for the view.
         masked: True if all pixels of the view are masked.
     """

@@ -62,8 +62,7 @@ def divided_sum(context: AggregateContext, divisor: int) -> AggregateResult:
 class Mean(MatrixOperator):
     """u = (1/K) sum of g_k, where K counts all views of the step, also views without a gradient.
 
-    Under Adam it equals `sum` up to the optimizer's eps. Neither Gramians nor separate gradients
-    are needed.
+    Under Adam it equals `sum` up to the optimizer's eps. No separate gradients are needed.
     """
 
     separate: ClassVar[bool] = False

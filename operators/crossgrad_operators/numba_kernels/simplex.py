@@ -376,7 +376,7 @@ def _least_cosine(problem: Polyhedron) -> float:
 
 @strict_section
 def _cagrad(problem: Polyhedron, norms: Pairs, q: Pairs, c: float, result: Floats) -> None:
-    """Fill in the weights [K] of one block. The Gramians are not used."""
+    """Fill in the weights [K] of one block. The heights are r."""
     views, exact = len(norms), problem.rounding.exact
     _, count = longest_of(norms)
     cosine = _least_cosine(problem)

@@ -59,7 +59,7 @@ class Options:
         probes: Number of probes during the vanilla run, evenly spaced; the last probe is at its
             end.
         seconds: Training seconds of the vanilla run.
-        options: The options of the probes.
+        seed: Seed of the vanilla run and of the probes.
         signature: File for the labels of grouping `conflict-signature`, or None.
     """
 
@@ -86,7 +86,7 @@ def diagnose(
         run: Folder of a run to probe, or None.
         settings: Settings of the vanilla run in the format of `RunConfig` (data, device ...). For
             a run, only `device` and `threads` can be set.
-        options: How to probe.
+        options: The options of the probes.
         out: Output folder of the report.
         accept_scene: For a run: accept its scene even if parts of the scene have changed.
 
@@ -153,7 +153,7 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
 
     Args:
         config: Scene, data options, device and threads; components are replaced.
-        options: How to probe.
+        options: The options of the probes.
 
     Returns:
         The report. If training failed after the first probe, the report contains the probes before

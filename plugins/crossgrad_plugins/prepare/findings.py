@@ -90,7 +90,8 @@ def lost_photos(
         features: Name -> number of features.
         links: Pairs with verified matches.
         models: Photo names of each model, and True if the model is in the scene.
-        misplaced: Name of a photo taken out of a model -> its matches for and against its pose.
+        misplaced: Name of a photo that was taken out of a model -> its matches for and against its
+            pose.
     """
     partners: Counter[str] = Counter()
     for link in links:

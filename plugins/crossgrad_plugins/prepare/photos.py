@@ -91,7 +91,7 @@ def find_photos(
 
     Args:
         root: The folder.
-        settings: Gives the mask folder, and which photos share a calibration.
+        settings: Settings that give the mask folder, and the photos that share a calibration.
         tell: Called with the number of inspected photos and the number of all photos.
         fewest: Least number of photos. A pose requires at least two photos.
 
@@ -272,7 +272,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
 
 
 def _most_pixels(header: PhotoHeader) -> int:
-    """Return the greatest pixel count of a photo, which COLMAP decodes at full size."""
+    """Return the maximum pixel count of a photo, because COLMAP decodes photos at full size."""
     return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 

@@ -27,7 +27,7 @@ _BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
-    """Write the undistorted photos, their masks and, when all photos exist, the model.
+    """Write the undistorted photos and their masks, and then the model.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.

@@ -212,7 +212,7 @@ class _Draw(torch.autograd.Function):
 def _gradient(
     gaussians: GaussianArrays, rows: Tensor | None, name: str, array: NDArray[np.float32] | None
 ) -> Tensor | None:
-    """Return the gradient of one input, as sparse rows if this was requested."""
+    """Return the gradient of one input, as sparse rows if sparse rows were requested."""
     if array is None:
         return None
     values = torch.from_numpy(array)

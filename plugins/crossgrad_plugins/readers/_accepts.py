@@ -1,4 +1,4 @@
-"""Tests that tell which reader accepts a folder, without an import of the readers.
+"""Functions that tell which reader accepts a folder; they do not import the readers.
 
 The entry points of the group `crossgrad.readers.accepts` name these functions.
 """
@@ -51,7 +51,7 @@ def colmap(path: Path) -> bool:
 
 
 def matrixcity(path: Path) -> bool:
-    """Return whether the folder is a MatrixCity block, or contains such blocks."""
+    """Return True if the folder is a MatrixCity block or contains such blocks."""
     return any(holds(path / name, _ROTATION) for name in pose_files(path))
 
 
@@ -105,7 +105,7 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def is_held_out(name: str) -> bool:
-    """Return whether UC-GS holds out a photo with this name."""
+    """Return True if UC-GS holds out a photo with this name."""
     path = PurePosixPath(name)
     folders = (folder.lower() for folder in path.parts[:-1])
     named = _EVAL.search(path.name.lower()) is not None
@@ -143,9 +143,10 @@ class Kind:
         form: Format of the file, such as XML.
         program: Program that writes the file.
         suffix: Suffix of the file name, with the dot.
-        holds: Returns whether a file is of this kind, from its first bytes.
-        expected: Description of a correct file, for errors.
-        nearly: Returns whether a file is almost of this kind.
+        holds: Function that returns whether a file is of this kind, from the first bytes of the
+            file.
+        expected: Description of a correct file, for error messages.
+        nearly: Function that returns whether a file is almost of this kind.
     """
 
     form: str

@@ -77,8 +77,8 @@ def longest_axes(
         scales: [N, 3].
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
-        axes: [2 N] flat, written per record: a / |a|^2 with a the projected axis, one standard
-            deviation long, in pixels; 0 if it is seen end on.
+        axes: [2 N] flat, written per record: a / |a|^2, where a is the projected axis, one standard
+            deviation long, in pixels; 0 if the axis is seen end on.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)
@@ -104,7 +104,7 @@ def add_directions(
 
     Args:
         jobs: From `share`.
-        analytic: Whether the response is analytic.
+        analytic: True if the response is analytic.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         buckets: [N, BUCKET] from binning.

@@ -35,7 +35,7 @@ def coefficients_of(gaussians: Gaussians) -> Tensor | None:
 def harmonics(directions: Tensor, degree: int) -> Tensor:
     """Return [N, (degree + 1)^2] basis functions at unit vectors [N, 3].
 
-    Order and signs are as in 3DGS PLY files: per band l the orders m = -l..l, with the
+    Order and signs are as in 3DGS PLY files: for each band l the orders m = -l..l, with the
     Condon-Shortley phase.
     """
     x, y, z = directions.unbind(-1)

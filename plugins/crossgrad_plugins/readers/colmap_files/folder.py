@@ -58,7 +58,7 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
 
 def check_scene_folder(scene: Path) -> None:
-    """Refuse an unreadable folder, and the model's folder in place of the scene's folder.
+    """Refuse an unreadable folder, and a model's folder where a scene's folder is expected.
 
     Raises:
         UserError: The path is missing, is a file, is not readable, or is inside `sparse`.
