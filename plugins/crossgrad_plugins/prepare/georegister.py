@@ -117,7 +117,7 @@ def _line(
 def _aligned(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """Return the similarity between points [N, 3] with which most agree, and the agreeing ones."""
+    """Return the similarity with which most points [N, 3] agree, and the points that agree."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()

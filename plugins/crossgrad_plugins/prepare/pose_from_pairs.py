@@ -67,7 +67,7 @@ class PairView:
     features: NDArray[np.int64]
 
     def agreeing(self, pose: "pycolmap.Rigid3d") -> int:
-        """Return the number of matches that agree with a pose, or 0 if too few of the pair do."""
+        """Return the number of matches that agree with a pose, or 0 if too few agree."""
         near = int((off_lines((self.pose, pose), self.rays, self.focals) <= _PIXELS).sum())
         return near if near >= _AGREEING * len(self.features) else 0
 
@@ -205,7 +205,7 @@ class _Way:
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), -self.rotation @ center)
 
     def crossing(self, other: "_Way") -> float | None:
-        """Return the distance nearest to another half-line, or None if they do not meet."""
+        """Return the distance at which another half-line crosses this one, or None if none does."""
         turned = (np.trace(self.rotation @ other.rotation.T) - 1.0) / 2.0
         along = float(self.direction @ other.direction)
         if turned < _SAME_ROTATION or abs(along) > _SAME_DIRECTION:
@@ -298,7 +298,7 @@ def off_lines(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     focals: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return the distances [N] of matches from epipolar lines in pixels, the larger of two photos.
+    """Return the distances [N] of matches from epipolar lines in pixels: the larger of two photos.
 
     Args:
         poses: Poses of two photos, world to camera.

@@ -140,7 +140,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
 
 
 def _counter(frame: Frame) -> Callable[[Tensor], Tensor]:
-    """Return the function for `Screen.count`; it does not keep the images of the frame alive."""
+    """Return the function for `Screen.count`, which does not keep the frame's images alive."""
     drawn = frame.projected, frame.lists, frame.masks, frame.options
 
     def count(marked: Tensor) -> Tensor:

@@ -86,7 +86,7 @@ def uc_gs(path: Path, images: str = "images") -> bool:
 
 
 def pose_files(scene: Path) -> list[str]:
-    """Return the pose files of all blocks, or only the scene's own pose file if there is one."""
+    """Return the scene's own pose file if there is one, else the pose files of all blocks."""
     found = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
     return [TRANSFORMS_FILE] if TRANSFORMS_FILE in found else sorted(found)
 
@@ -169,7 +169,7 @@ class Kind:
         return [path for path in inside.files("*") if path.suffix.lower() == self.suffix]
 
     def one(self, inside: Inside, named: str | None) -> Path:
-        """Return the file named by `reader.file`, or else the only file that (almost) matches.
+        """Return the file named by `reader.file`, else the only file (almost) of this kind.
 
         Raises:
             UserError: There is no such file, there are several, or the name leads out of the scene.

@@ -217,7 +217,7 @@ def _terms(
 
 
 def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
-    """Return the photo folder (`.` for the scene's own) and the views named relative to it."""
+    """Return the photo folder (`.` for the scene's own), and the views named relative to it."""
     images = shared_folder(frame.photo for frame in frames)
     start = 0 if images == "." else len(images) + 1
     return images, tuple(

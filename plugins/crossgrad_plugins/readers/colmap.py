@@ -171,7 +171,7 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
 def _find_rows(
     points: NDArray[np.uint64], ids: NDArray[np.uint64], order: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the rows of the points with these ids, without ids that the model does not contain."""
+    """Return the rows of the points with these ids, without ids unknown to the model."""
     if not len(ids):
         return np.zeros(0, dtype=np.int64)
     # searchsorted is many times faster with sorted queries.

@@ -138,7 +138,7 @@ def _spans(
     ends: NDArray[np.float32],
     place: int,
 ) -> None:
-    """Write the first and last tile reached in eight rows of tiles (first > last: none).
+    """Write the first and last reached tile in eight rows of tiles (first > last means none).
 
     The record at `at` belongs to ellipse k of the group.
 
@@ -186,7 +186,7 @@ def _find(
     k: int,
     boxed: bool,
 ) -> int:
-    """Write the tiles that record j (number k of its group) reaches to its slots, and count them.
+    """Write the tiles that record j (number k of its group) reaches to slots, and count them.
 
     The spans of the first eight rows of tiles are already computed, unless the whole box is used.
 

@@ -71,7 +71,7 @@ def pinhole(
 
 @device
 def in_registers(pose: NDArray[np.float64]) -> Pose:
-    """Return a [3, 4] matrix as scalars, so that loops that write to memory need not reload it."""
+    """Return a [3, 4] matrix as scalars, which loops that write to memory need not reload."""
     return (
         (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
         (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
@@ -156,7 +156,7 @@ def times(a: Triple, b: Triple) -> Triple:
 
 @device
 def opacity_factor(raw_det: float, det: float) -> float:
-    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 if removed."""
+    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 means removed."""
     if not (raw_det > LEAST_DET and det > LEAST_DET):
         return 0.0
     return math.sqrt(raw_det / (det + LEAST_DET) + LEAST_DET)

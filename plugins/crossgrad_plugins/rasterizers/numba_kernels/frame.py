@@ -191,7 +191,7 @@ def backward(
 
 
 def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
-    """Return an array for the gradient of one field: zeros for all Gaussians, or the drawn rows."""
+    """Return an array for a field's gradient: zeros for all Gaussians, or the drawn rows."""
     if like is None:
         return None
     rows = frame.projected.rows

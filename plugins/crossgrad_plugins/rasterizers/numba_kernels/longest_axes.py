@@ -34,7 +34,7 @@ def _axis(
     quat: NDArray[np.float32],
     scale: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """Return a / |a|^2 with a the projection of the longest axis (one standard deviation), px."""
+    """Return a / |a|^2; a is the projected longest axis (one standard deviation), px."""
     pose = in_registers(camera.pose)
     x, y, z = to_camera(pose, (np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])))
     unit, _ = unit_quaternion(

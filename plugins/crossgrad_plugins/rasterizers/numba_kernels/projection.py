@@ -156,7 +156,7 @@ def _project_block(
     scales: NDArray[np.float32],
     found: NDArray[np.float64],
 ) -> None:
-    """Project the first `count` Gaussians, visible or not; branch-free, so it is vectorised.
+    """Project the first `count` Gaussians, visible or not, in a branch-free, vectorised loop.
 
     All arrays are flat, because LLVM must know the strides.
     """

@@ -199,7 +199,7 @@ def _fill_block(
     v_colors: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Fill a block with Gaussians that have gradients, and write gradients without projection.
+    """Fill a block with Gaussians that have gradients; write gradients that need no projection.
 
     Returns:
         The next record, and the number of Gaussians in the block; `numbers` receives their indices.

@@ -209,7 +209,7 @@ def first_tile(low: float) -> float:
 
 @device
 def last_tile(high: float) -> float:
-    """Return the last tile of the published grid at or before `high`, pixels; -1: none."""
+    """Return the last tile of the published grid at or before `high`, pixels, or -1 for none."""
     return max(np.floor((high - 0.5) / SQUARE), -1.0)
 
 

@@ -151,7 +151,7 @@ class PixelCounter:
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Return [P, G] of a tile: if alpha >= 1/255, if the Gaussian was blended, and its weight."""
+    """Return [P, G] arrays of a tile: alpha >= 1/255, the Gaussian was blended, its weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)

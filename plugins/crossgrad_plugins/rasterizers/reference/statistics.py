@@ -36,7 +36,7 @@ class Recorder:
     axes: Tensor | None = None
 
     def record(self, signed: Tensor, sums: Tensor) -> None:
-        """Store the gradients [V, 2] of the drawn rows, and the sums from their probes."""
+        """Store the gradients [V, 2] of the drawn rows, and the sums from the probe's gradients."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
             self.screen.abs_gradient = self._scattered(sums[:, :2])
@@ -58,7 +58,7 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """Return the same table [V, C], which the backward pass records, and a probe [V, R].
+    """Return the same table [V, C], recorded by the backward pass, and a probe [V, R].
 
     The first two columns are projected means. The probe is passed to the pixels like the means, but
     does not change the image. The gradient of the probe contains sums over pixels (see `offsets`).

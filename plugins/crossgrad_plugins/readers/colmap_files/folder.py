@@ -11,7 +11,7 @@ _PARENTS = ("sparse", "colmap/sparse")
 
 
 def find_models(scene: Path) -> list[Path]:
-    """Return the model folders of a scene: `sparse/0`, `sparse/1` ..., `sparse`, or the scene.
+    """Return a scene's model folders: `sparse/0`, `sparse/1` ..., `sparse`, or the scene itself.
 
     Models in `colmap/sparse` are included. The models are sorted by number.
     """

@@ -185,7 +185,7 @@ def _power(x: Lanes) -> Lanes:
 
 @device
 def _share(difference: Lanes, both: Lanes) -> Lanes:
-    """Return 1 - exp(-D) given D >= 0 and exp(-D), accurate to a few roundings also for small D."""
+    """Return 1 - exp(-D) from D >= 0 and exp(-D), to a few roundings also for small D."""
     series = _number(_SERIES[4])
     series = fma(series, difference, _number(_SERIES[3]))
     series = fma(series, difference, _number(_SERIES[2]))

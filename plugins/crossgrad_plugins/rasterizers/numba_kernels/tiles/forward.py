@@ -99,7 +99,7 @@ _DEPTHS = PATCHES * _STATE
 def _start(
     state: NDArray[np.float32], width: int, height: int, constants: NDArray[np.float32]
 ) -> np.uint64:
-    """Clear the state of a tile of width x height pixels; return its patches as bits."""
+    """Clear the state of a tile of width x height pixels; return the tile's patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
     x = load_wide(constants, OFFSETS) + splat_wide(np.float32(MIDDLE))
