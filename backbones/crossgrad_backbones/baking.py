@@ -35,7 +35,7 @@ def as_plain(
 
     Args:
         gaussians: Gaussians of another response.
-        cameras: One or more.
+        cameras: The cameras, at least one.
         blur: px^2.
         near: Near plane, local units.
     """

@@ -29,7 +29,7 @@ from crossgrad_core.plugin import (
 
 
 def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
-    """Return the steps at which `count` further levels open, the last at `span`.
+    """Return the steps at which `count` further levels open; the last level opens at `span`.
 
     The time between two openings shrinks by `factor`: a geometric series with the first term span
     (1 - q) / (1 - q^count), q = 1 / factor.
@@ -101,7 +101,7 @@ def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.b
 
     Args:
         coarser: [P] index of each point's site on the level before.
-        site: [P] index of its site on this level.
+        site: [P] index of each point's site on this level.
     """
     pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
     return np.bincount(pairs[:, 0])[coarser] > 1

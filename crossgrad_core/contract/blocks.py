@@ -67,8 +67,8 @@ class Block:
 
     Attributes:
         name: Name of the block.
-        tensors: Names of its tensors in `Parameters`. A block with one tensor uses the tensor's
-            name.
+        tensors: Names of the block's tensors in `Parameters`. A block with one tensor uses the
+            tensor's name.
         per_primitive: True if the first dimension of every tensor is the number of primitives.
         kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
         lr: Learning rate of all its tensors. 0 freezes the block: its tensors get no gradient, may
@@ -122,8 +122,8 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 class PluginState:
     """The state of one plugin between steps.
 
-    Its size must not depend on the number of steps, because every checkpoint contains it. Store
-    sums, or a window of at most 1,000 steps.
+    The size of the state must not depend on the number of steps, because every checkpoint contains
+    the state. Store sums, or a window of at most 1,000 steps.
 
     Attributes:
         values: Plain numbers, strings, lists and dictionaries (must survive JSON).

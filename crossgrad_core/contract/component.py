@@ -86,7 +86,7 @@ class ViewCounts:
     Attributes:
         minimum: Smallest K.
         maximum: Largest K; None for any.
-        multiple_of: K must be a multiple of this.
+        multiple_of: Number of which K must be a multiple.
     """
 
     minimum: int = 1

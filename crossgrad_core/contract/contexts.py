@@ -90,7 +90,9 @@ class ViewRecord(RenderedView):
 
 @dataclass(frozen=True)
 class StepRecord:
-    """The record of a step. Observers receive it; samplers receive the record of the last step.
+    """The record of a step.
+
+    Observers receive this record; samplers receive the record of the previous step.
 
     Attributes:
         step: 1-based number of the step.
@@ -419,7 +421,7 @@ class DensifyResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """The run at its start, for observers.
+    """The facts about a run at its start, for observers.
 
     Attributes:
         folder: The output folder; None if nothing is written.
@@ -507,12 +509,12 @@ class OperatorContext:
         present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
             columns of all other views are zero in the Gramian; an operator must give these views
             weight 0.
-        unit: Unit roundoff of the gradients' type. Results need no smaller relative error than
-            this.
+        unit: Unit roundoff of the gradients' type. A relative error smaller than the unit roundoff
+            is not required.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
             removed. Gramian plus residual gives twice the digits. The computation needs another,
             slower pass over the gradients; it is meant for Gramians that are so close to singular
-            that rounding affects the result. It is None if no residuals can be computed.
+            that rounding affects the result. None if no residuals can be computed.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

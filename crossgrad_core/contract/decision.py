@@ -14,7 +14,7 @@ class Decision:
 
     Attributes:
         setting: A setting of a run, or an option of a component, such as `densifier.division`.
-        value: Its value.
+        value: The value of the setting.
         because: The reason, in a few words.
         evidence: The facts or the results that support the reason.
         override: The option that sets another value; empty if the value is the published one, which

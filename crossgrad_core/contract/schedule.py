@@ -164,8 +164,9 @@ class Counting:
             if the run is long enough.
         schedule_length: Length that the schedule is written for; None for the length of the run
             or the published length.
-        min_refinements: Minimum number of density control edits in a run of any length. A short run
-            shortens warm-up and interval for this. Used if the schedule counts views.
+        min_refinements: Minimum number of density control edits in a run of any length. In a short
+            run, warm-up and interval are shortened to reach this number. Used if the schedule
+            counts views.
     """
 
     unit: Unit = "steps"
@@ -286,7 +287,7 @@ class Schedule:
 
     @property
     def published(self) -> bool:
-        """See `is_published`."""
+        """True if the schedule is published; see `is_published`."""
         return is_published(self.mode, self.counting.schedule_length)
 
     def counted(self, step: int) -> int:
@@ -431,7 +432,7 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
 
     Args:
         start: Wanted start.
-        last: Largest count of the last edit.
+        last: Largest allowed count of the last edit.
         every: Wanted interval.
         photos: The interval is at least this long if this leaves enough edits.
         edits: Wanted number of edits.

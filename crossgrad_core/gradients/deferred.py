@@ -96,7 +96,7 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K]: views with finite gradients, and with non-zero ones among these."""
+        """Two arrays [B, K]: views with finite gradients, and views with non-zero finite ones."""
         found = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(found).tolist() if found else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

@@ -173,7 +173,7 @@ class SummedGradients(Gradients):
     def _judged(
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return [B], True for finite block gradients, and [B], True for finite non-zero ones."""
+        """Return two arrays [B]: True for finite block gradients, and for finite non-zero ones."""
         names = [name for block in self._blocks for name in block.tensors]
         known = all_finite_and_present([view.get(name) for name in names])
         each = dict(zip(names, known, strict=True))

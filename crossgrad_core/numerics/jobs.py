@@ -8,11 +8,13 @@ A kernel takes jobs until none is left,
         job = next_job(jobs, count)
 
 and `parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into
-equal parts in advance and waits for every thread. If a core is busy or slow, this takes longer than
-one thread alone. Here, a helper thread that starts too late is skipped, and idle threads sleep.
+equal parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer
+than computing with one thread. Here, a helper thread that starts too late is skipped, and idle
+threads sleep.
 
 A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
-So in one kernel it reads the data that it wrote in the kernel before, which its core still caches.
+So in each kernel a thread reads the data that it wrote in the previous kernel, which its core still
+caches.
 
 The result of a job must not depend on the thread that runs it. Then the threads do not affect any
 bit.
@@ -77,7 +79,7 @@ def next_job(jobs: Jobs, count: int) -> int:
 def _jobs(threads: int) -> list[Jobs]:
     """Return for each thread: the number of threads, and the jobs taken from each thread's range.
 
-    The arrays share one memory block. A thread derives its own number from its array's length.
+    The arrays share one memory block. A thread derives its own number from the length of its array.
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
@@ -138,7 +140,8 @@ class Begun:
 class _Call:
     """A call for a helper, skipped if it is no longer needed when the helper starts.
 
-    It uses a bare lock, because a `Future` creates conditions for each call and for each wait.
+    The class uses a bare lock, because a `Future` creates conditions for each call and for each
+    wait.
 
     Args:
         call: The function to call.
@@ -154,7 +157,7 @@ class _Call:
         self._under_way = threading.Lock()
 
     def make(self) -> None:
-        """Execute the call; a helper thread calls this."""
+        """Execute the call; this function is called by a helper thread."""
         with self._under_way:
             if not self._needed:
                 return

@@ -112,7 +112,7 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
         emit: Emits the instructions from the `Site` and the operands' LLVM values.
         result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` stand for a vector
             of the same width as the operands' vectors.
-        operands: Numba types of the operands, in the same form; None stands for any array.
+        operands: Numba types of the operands, in the same form; None means any array.
     """
 
     def define(*given: Any) -> Any:

@@ -42,7 +42,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
-    """Return True if a call with all arguments, or only with the required ones, is possible."""
+    """Return True if a call with all arguments, or with the required ones only, is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
     positional = [each for each in passed if each.kind in _POSITIONAL]
     named = {each.name: None for each in passed if each.kind is Parameter.KEYWORD_ONLY}

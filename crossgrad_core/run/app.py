@@ -481,7 +481,7 @@ def _print_dry_run(setup: Setup) -> None:
 
 @contextmanager
 def as_in_a_command() -> Iterator[None]:
-    """Reset the global state of torch and numpy to that of a new process inside the block.
+    """Reset, inside the block, the global state of torch and numpy to that of a new process.
 
     Default type and device, `no_grad`, `inference_mode`, `np.errstate` and the number of threads
     would change the bits of a run, or make it fail. The caller's state is restored afterwards.

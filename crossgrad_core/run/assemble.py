@@ -93,7 +93,8 @@ def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tu
     Args:
         config: The configuration.
         path: The scene's folder.
-        accept: Continue although the scene contradicts itself; the configuration can also set this.
+        accept: True to continue although the scene contradicts itself; the configuration can also
+            set this.
 
     Raises:
         UserError: For the reasons of `read_scene`, or because the scene contradicts itself.
@@ -152,7 +153,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
     Args:
         config: The configuration.
-        scene: Its scene.
+        scene: The scene of the run.
         reader: Name of the reader that read the scene.
 
     Raises:

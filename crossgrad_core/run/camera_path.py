@@ -40,7 +40,7 @@ class CameraPath:
 
     Attributes:
         name: Part of the names of files.
-        cameras: One camera per frame.
+        cameras: The cameras, one per frame.
         fps: Frames per second.
     """
 
@@ -68,9 +68,9 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
     """Return cameras on a line from a far photo to a near photo of the same points.
 
-    The distance shrinks by the same factor in each frame. One end is among the farthest fifth of
-    the views, the other among the nearest fifth. The pair with the most common SfM points is used;
-    among equal pairs, the pair with the most similar viewing directions.
+    The distance shrinks by the same factor in each frame. One end of the path is among the farthest
+    fifth of the views, the other end among the nearest fifth. The pair with the most common SfM
+    points is used; among equal pairs, the pair with the most similar viewing directions.
 
     Args:
         views: The training views.

@@ -43,7 +43,7 @@ class Checkpoint:
         exp_avg: Tensor name -> Adam's first moment.
         exp_avg_sq: Tensor name -> Adam's second moment.
         adam_steps: Tensor name -> number of Adam steps taken.
-        plugins: Plugin name -> its state.
+        plugins: Plugin name -> state of the plugin.
         generators: Stream name -> `bit_generator.state` of its NumPy generator.
         scalars: Counters, clocks and other values that JSON can hold (tuples come back as lists).
     """
@@ -389,7 +389,7 @@ def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     Args:
         run: The run's folder.
         checkpoint: The checkpoint; tensors on any device.
-        keep: The rule for older checkpoints; by default the last two are kept.
+        keep: The rule for older checkpoints; by default the two newest checkpoints are kept.
 
     Returns:
         The checkpoint's folder.

@@ -42,7 +42,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
 
     Args:
         config: The configuration with only the user's settings.
-        scene: Its scene.
+        scene: The scene of the run.
 
     Raises:
         UserError: A component is wrong, or no rasterizer runs on the device.
@@ -81,8 +81,8 @@ def with_decisions(
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
     """Return the decided configuration, the table, and a function that makes the table again.
 
-    With `--plan auto`, the planner's decisions about the scene come first. The recipe treats them
-    like settings of the user.
+    With `--plan auto`, the planner's decisions about the scene come first. The recipe treats these
+    decisions like settings of the user.
 
     Raises:
         UserError: For the reasons of `facts_of`; or there is no planner, a photo cannot be decoded,
@@ -113,7 +113,7 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
     Args:
         config: The configuration with only the user's settings.
-        scene: Its scene.
+        scene: The scene of the run.
         start: Number of primitives at the start, if it is already known.
 
     Raises:

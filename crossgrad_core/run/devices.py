@@ -114,7 +114,7 @@ def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
 
 
 def _missing() -> list[str]:
-    """Return what each installed rasterizer lacks to run on the GPU, and how to install it."""
+    """Return what each installed rasterizer needs to run on the GPU, and how to install it."""
     told = []
     for name in entries("rasterizers"):
         try:

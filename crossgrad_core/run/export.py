@@ -74,7 +74,7 @@ def export_scene(
 
     Args:
         setup: The run.
-        state: Its state.
+        state: The state of the run.
         path: The file.
         camera: Name of the view for which view-dependent parts are baked; None for the average
             over the training views.

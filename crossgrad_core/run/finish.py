@@ -96,7 +96,7 @@ class RunLoop:
 
     Attributes:
         setup: The setup; a run that follows the clock replaces it.
-        state: The state; after an exception the last good state.
+        state: The state; after an exception, the last good state.
         session: The writer of the results.
         log: The run's log.txt.
         stopper: The requests to stop the run.
@@ -111,10 +111,10 @@ class RunLoop:
     ending: Ending = Ending("finished")
 
     def to_the_end(self, length: Length) -> Ending:
-        """Train, then save and describe the last state.
+        """Train, then save and describe the final state.
 
-        Each part is attempted separately: if one fails, the others still run, and the ending
-        reports the failure.
+        Each part is attempted separately: if one part fails, the other parts still run, and the
+        ending reports the failure.
         """
         self._attempt("", lambda: self._train(length))
         if self.ending.status == "finished":

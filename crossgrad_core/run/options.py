@@ -21,10 +21,10 @@ class Option:
     """An option of the command line.
 
     Attributes:
-        path: The setting that it changes, such as `("data", "split")`.
-        flag: Its name and appearance on the command line.
-        kind: Its type.
-        help: Its help text.
+        path: The setting that the option changes, such as `("data", "split")`.
+        flag: Name and appearance of the option on the command line.
+        kind: Type of the option.
+        help: Help text of the option.
     """
 
     path: tuple[str, ...]

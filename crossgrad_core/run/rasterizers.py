@@ -127,7 +127,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 
 
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
-    """Return name -> speed of the rasterizers that run on a device type, and notes on broken ones.
+    """Return name -> speed of a device's rasterizers, and notes on broken rasterizers.
 
     A rasterizer that declares its speed without an import is not imported.
     """

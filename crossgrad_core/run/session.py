@@ -43,7 +43,7 @@ class Session:
 
     Args:
         folder: The run's folder.
-        table: Its metrics.csv.
+        table: The metrics.csv of the run.
 
     Attributes:
         machine: Records the load of the machine while the run trains.

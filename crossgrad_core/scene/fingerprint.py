@@ -40,7 +40,7 @@ class FileMark(_Mark):
 
     Attributes:
         bytes: Size of the file in bytes.
-        sha256: Digest of its first and last 64 KiB; stored by runs of all versions.
+        sha256: Digest of the first and last 64 KiB of the file; stored by runs of all versions.
         whole: Digest of the whole file; None if `sha256` already covers the whole file, and in
             fingerprints of earlier versions.
     """
@@ -114,7 +114,7 @@ def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
 
     Args:
         scene: The scene.
-        root: Its folder.
+        root: The folder of the scene.
 
     Raises:
         UserError: A photo or mask cannot be read.
@@ -205,8 +205,8 @@ class Difference:
     """One difference between two fingerprints.
 
     Attributes:
-        weight: Its effect on a trained model.
-        text: Its description.
+        weight: The effect of the difference on a trained model.
+        text: The description of the difference.
     """
 
     weight: Weight

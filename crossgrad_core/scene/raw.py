@@ -52,8 +52,8 @@ class RawScene:
     """A scene as the input describes it; `crossgrad_core.scene.build` turns it into a `Scene`.
 
     Attributes:
-        root: The scene's folder. It may contain split lists and the default mask folder, and its
-            name is the scene's name.
+        root: The scene's folder. The folder may contain split lists and the default mask folder,
+            and its name is the scene's name.
         images: The folder of the photos; the siblings `<images>_2`, `_4` and `_8` may contain
             smaller copies.
         views: The posed photos, in any order.
@@ -149,7 +149,7 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
 def check_distances(
     raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
-    """Leave out points too far from the training cameras for single precision, and note this.
+    """Leave out points too far from the training cameras for single precision, and note it.
 
     Raises:
         UserError: A camera is too far away.

@@ -36,7 +36,7 @@ def keep_freed_memory() -> None:
 
 
 def use_large_pages() -> None:
-    """Request large pages for the part of the heap that grew since the last call (Linux, glibc).
+    """Request large pages for the heap that is new since the previous call (Linux, glibc).
 
     Steps read and write Gaussians at scattered positions in arrays of many megabytes. With pages of
     4 KiB, most accesses miss the processor's table of pages (TLB). This is only a request: the
@@ -67,7 +67,7 @@ class _Heap:
         self._library.mallopt(TOP_PAD, LATER)
 
     def use_large_pages(self) -> None:
-        """Request large pages from the end of the heap at the last call."""
+        """Request large pages from the end of the heap at the previous call."""
         end = self._library.sbrk(0)
         begin = -(-self._asked // LARGE_PAGE) * LARGE_PAGE
         if begin < end:

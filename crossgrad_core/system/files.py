@@ -183,7 +183,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until new names in the folder are on the disk, if the system supports this."""
+    """Wait until new names in the folder are on the disk, if the system supports such a wait."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

@@ -1,7 +1,7 @@
 """YAML as users expect it: `1e-3` is a number, `no` is a word, and a repeated key is an error.
 
-PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. It also builds
-values without limits: very long numbers, lists nested until the stack is full, and, through
+PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. PyYAML also
+builds values without limits: very long numbers, lists nested until the stack is full, and, through
 aliases, a billion copies of one list from a few hundred bytes. This module builds the values from
 PyYAML's parse tree, with bounds on their number and depth.
 """

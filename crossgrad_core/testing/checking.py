@@ -24,8 +24,8 @@ class Result:
 
     Attributes:
         check: Name of the check.
-        failure: Reason why it failed; None if it passed.
-        skipped: Reason why it does not apply; None if it applies.
+        failure: Reason why the check failed; None if it passed.
+        skipped: Reason why the check does not apply; None if it applies.
         where: `file:line` of the failure in the plugin, or the registration of the plugin by its
             package.
     """

@@ -150,7 +150,7 @@ def posed_view(
 
 
 def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()) -> Scene:
-    """Make a scene of these views; all views except those in `test` are training views."""
+    """Make a scene of the given views; all views except those in `test` are training views."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     train = tuple(i for i in range(len(views)) if i not in set(test))
     colors = np.zeros((len(cloud), 3), dtype=np.uint8)

@@ -118,8 +118,8 @@ _VIEWS, _STEPS = 8, 2
 class Prefetcher:
     """A prefetcher of photos: draws future views with copies of the sampler's stream and state.
 
-    The prediction only decides which photos are decoded first. It may be wrong for a sampler that
-    uses the losses of the last step. The state of the run is not changed.
+    The prediction only decides which photos are decoded first. The prediction may be wrong for a
+    sampler that uses the losses of the previous step. The state of the run is not changed.
 
     Args:
         setup: The run.
@@ -297,7 +297,10 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard) -> bool:
-    """Check a state before it is kept; if it is bad, rewind training. Return True if it is good."""
+    """Check a state before it is kept; if it is bad, rewind training.
+
+    Return True if the state is good.
+    """
     try:
         guard.check(state)
     except NonFiniteError as error:

@@ -38,8 +38,8 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 def learns_in(step: int, every: int) -> bool:
     """Return True if a tensor with one update in `every` steps is updated in this step.
 
-    One step of each `every` steps is chosen by a hash. No photo or regime is therefore left out if
-    a sampler cycles through photos or regimes.
+    A hash chooses one step of each `every` steps. No photo or regime is therefore left out if a
+    sampler cycles through photos or regimes.
     """
     turn, place = divmod(step - 1, every)
     return place == hash32(turn) * every >> 32

@@ -206,7 +206,7 @@ def _begun(setup: Setup) -> Scene:
 
 
 def _misfit(begun: Scene, known: int) -> str:
-    """Return what is wrong with the points after the first `known` ones; empty if all are valid."""
+    """Return the problem of the points after the first `known` ones; empty if all are valid."""
     points, sizes, opacities = begun.points[known:], begun.point_sizes, begun.point_opacities
     if sizes is None or opacities is None:
         return ""

@@ -92,11 +92,11 @@ class PhaseTimer:
 
     Attributes:
         phase_began: Time at which the present phase began.
-        total: Seconds from the start of the step to the end of the last phase, without excluded
+        total: Seconds from the start of the step to the end of the previous phase, without excluded
             seconds.
         spent: Phase -> seconds.
         cpu: CPU seconds of the process in the same time, without excluded seconds.
-        cpu_border: CPU time of the process at the end of the last phase.
+        cpu_border: CPU time of the process at the end of the previous phase.
     """
 
     phase_began: float = field(default_factory=perf_counter)
@@ -106,7 +106,7 @@ class PhaseTimer:
     cpu_border: float = field(default_factory=process_time)
 
     def lap(self, phase: Phase) -> None:
-        """End a phase: add the time since the end of the last phase to it."""
+        """End a phase: add the time since the end of the previous phase to its total."""
         now = perf_counter()
         seconds = now - self.phase_began
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
@@ -152,7 +152,7 @@ class TrainState:
         tensors: The parameters as stored in memory. Some rows may have deferred Adam steps, and a
             step may still run on other threads.
         moments: The optimizer's moments, under the same conditions.
-        rngs: Stream name -> its generator.
+        rngs: Stream name -> generator of the stream.
         states: Plugin name -> its state.
         step: Number of steps, including the present one.
         last: Record of the last complete step.
@@ -254,7 +254,7 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """Return what in a state a checkpoint cannot store; empty if it can store everything.
+    """Return what a checkpoint cannot store of a state; empty if it can store everything.
 
     For speed in each step, only names that are not in the state `known` are checked.
     """

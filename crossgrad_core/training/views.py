@@ -292,7 +292,7 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A rendered view with its graph. Its record does not contain the loss yet."""
+    """A rendered view with its graph. The record does not contain the loss yet."""
 
     record: ViewRecord
     gaussians: Gaussians

@@ -56,9 +56,9 @@ class Nash(Weighting):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
     Two views use a closed form. More views use damped Newton steps (decrement 1e-13). |u| would
-    always be sqrt(K). It is multiplied by the geometric mean of the norms, so that u scales with
-    the gradients and a single view is unchanged. The result is zero if the gradients are exactly
-    opposite.
+    always be sqrt(K). The solution is multiplied by the geometric mean of the norms, so that u
+    scales with the gradients and a single view is unchanged. The result is zero if the gradients
+    are exactly opposite.
 
     Source: Navon et al. 2022, "Multi-task learning as a bargaining game".
     """

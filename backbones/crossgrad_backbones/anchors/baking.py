@@ -146,7 +146,7 @@ def baked(
 
     Args:
         heads: The networks.
-        parameters: As for `decoded`.
+        parameters: The parameters, as for `decoded`.
         views: Cameras and the anchors that each camera sees.
         code: [C] appearance code, or None.
 

@@ -43,8 +43,8 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     """Return a mask [P] of the anchors whose own Gaussian would reach the image.
 
     An anchor is treated as an opaque, unrotated Gaussian whose scales are the scales of the
-    anchor's offsets. It is projected with the rasterizers' formulas. The anchor passes if the
-    bounding box of this Gaussian's footprint (alpha >= 1/255) contains a pixel centre.
+    anchor's offsets. The Gaussian is projected with the rasterizers' formulas. The anchor passes if
+    the bounding box of this Gaussian's footprint (alpha >= 1/255) contains a pixel centre.
 
     Args:
         positions: [P, 3] local units.

@@ -35,8 +35,8 @@ class Network:
     """A perceptron with one hidden layer and ReLU: Linear, ReLU, Linear.
 
     Attributes:
-        name: Name of its block; its tensors are `name.0.weight` [hidden, inputs], `name.0.bias`,
-            `name.2.weight` [outputs, hidden] and `name.2.bias`.
+        name: Name of the network's block; its tensors are `name.0.weight` [hidden, inputs],
+            `name.0.bias`, `name.2.weight` [outputs, hidden] and `name.2.bias`.
         inputs: Width of the input.
         hidden: Width of the hidden layer.
         outputs: Width of the output.
@@ -147,7 +147,8 @@ class Heads:
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None. It is equal for all anchors and enters the bias.
+            code: [C] appearance code, or None. The code is equal for all anchors and is added to
+                the bias.
         """
         weights, biases = [], []
         for network, far in zip(self.networks[:3], self.far, strict=True):
@@ -197,7 +198,7 @@ class Seen:
     """The anchors that are decoded for one view.
 
     Attributes:
-        rows: [A] int64, their rows, without duplicates.
+        rows: [A] int64 rows of the anchors, without duplicates.
         factor: [A] in [0, 1], factor of the opacities of each anchor; None for 1.
     """
 

@@ -19,7 +19,7 @@ FARTHEST = 2**40
 def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     """Return twice the median distance of the points to their nearest neighbour, local units.
 
-    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. That
+    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. This
     value depends on the unit of the input, so it is not reproduced here.
 
     Args:

@@ -25,7 +25,7 @@ class Backbone(Component):
         default_densifier: Name of the densifier that is used unless the user names another. In
             short runs of many photos, another densifier replaces the densifier of the published
             Gaussians.
-        response: How its Gaussians fill a pixel.
+        response: How the Gaussians of the backbone fill a pixel.
         plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
             standard PLY loses nothing.
         sets_dilation: True if the backbone's Gaussians set their own dilation, regardless of the
@@ -37,8 +37,8 @@ class Backbone(Component):
             the first step and after steps with edits, the primitives are sorted in memory by
             position: all rows of all per-primitive tensors are sorted together, and `prepare` is
             not called. At the end of a run, rows may be removed in the same way, after calls of
-            `decode` with some rows only (floaters). If it is empty, rows are moved or removed only
-            by edits.
+            `decode` with some rows only (floaters). If the list is empty, rows are moved or removed
+            only by edits.
         axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
             logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
             may then be updated along these axes, and the deviations may be bounded. Empty if

@@ -15,8 +15,9 @@ class Densifier(Component):
     """A method that collects per-view statistics in every step and edits the set of primitives.
 
     Attributes:
-        needs: Screen statistics that it needs in addition to the radii and the mean gradient
-            (`pixels`, `abs_gradient`, `directions`, `count`), while `schedule.collects(step)`.
+        needs: Screen statistics that the densifier needs in addition to the radii and the mean
+            gradient (`pixels`, `abs_gradient`, `directions`, `count`), while
+            `schedule.collects(step)`.
         tensors: Names of the parameter tensors that the backbone must provide.
         edits: True if the densifier ever edits the set of primitives.
         resets: True if the densifier resets opacities when the schedule requires it.

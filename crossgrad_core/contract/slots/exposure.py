@@ -38,7 +38,7 @@ class Fitted:
     Attributes:
         exposure: The exposure that the run uses.
         name: Name under which this exposure is installed; None if the choice did not change.
-        notes: The decision and its evidence.
+        notes: The decision on the exposure, and the evidence for it.
     """
 
     exposure: "Exposure"
@@ -49,10 +49,10 @@ class Fitted:
 class Exposure(Component):
     """A model that turns a render into the image that the camera of one photo would have taken.
 
-    Its parameters belong to photos, not to the scene, so operators do not receive their gradients.
-    After each step, each photo of the step takes a separate Adam step with its own step count, for
-    any number of views and every backbone. Then all values are projected. Checkpoints contain the
-    values.
+    The parameters of an exposure belong to photos, not to the scene, so operators do not receive
+    their gradients. After each step, each photo of the step takes a separate Adam step with its own
+    step count, for any number of views and every backbone. Then all values are projected.
+    Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"

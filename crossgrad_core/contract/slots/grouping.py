@@ -35,7 +35,7 @@ class Quantity:
     """The single number per view by which a grouping splits the views.
 
     Attributes:
-        name: Its description, such as "the log distance from the mean camera".
+        name: Description of the quantity, such as "the log distance from the mean camera".
         values: [V] float64 in the order of the given views; a value is not finite if the quantity
             is undefined for a view.
     """
@@ -108,7 +108,7 @@ class Regrouping(Grouping):
 
     @abstractmethod
     def refit(self, model: Model, rng: np.random.Generator) -> GroupingRule:
-        """Return the rule for the rest of the run.
+        """Return the grouping rule for the remaining steps of the run.
 
         Args:
             model: The model after step `refit_after`, which must not be changed.

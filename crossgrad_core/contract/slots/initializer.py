@@ -34,11 +34,11 @@ class MorePoints:
 class Initializer(Component):
     """A method that adds points to scenes with too few points; repeated calls give the same points.
 
-    It is used only in runs that start from the scene's own points (`--init points`).
+    An initializer is used only in runs that start from the scene's own points (`--init points`).
 
     Attributes:
-        alone: True if the initializer can make points for a scene without points. It raises an
-            error if it finds no points in such a scene.
+        alone: True if the initializer can make points for a scene without points. An initializer
+            raises an error if it finds no points in such a scene.
     """
 
     slot: ClassVar[str] = "initializers"

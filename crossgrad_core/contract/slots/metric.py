@@ -17,7 +17,7 @@ from crossgrad_core.contract.scene import View
 class Compared:
     """A held-out view and its photo, in the form in which results compare them.
 
-    Nothing in it may be changed.
+    Metrics must not change any of its contents.
 
     Attributes:
         view: The view.

@@ -55,11 +55,11 @@ class Operator(Component):
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Return True if it, or an operator that it contains, does nothing with `views` views."""
+        """Return True if the operator, or one that it contains, does nothing with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:
-        """Return True if its result depends on the labels of the views."""
+        """Return True if the result of the operator depends on the labels of the views."""
         return False
 
     @abstractmethod

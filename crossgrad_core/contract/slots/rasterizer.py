@@ -20,8 +20,8 @@ class Rasterizer(Component):
         max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
         near: Camera depth in local units; Gaussians with a nearer centre are not drawn.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        provides: Optional outputs that it can compute: `depth`, `pixels`, `abs_gradient`,
-            `directions`, `count`.
+        provides: Optional outputs that the rasterizer can compute: `depth`, `pixels`,
+            `abs_gradient`, `directions`, `count`.
         responses: Pixel responses that the rasterizer supports.
         devices: Torch device types that it supports.
         batched: True if `render_views` is faster than single renders. The views of a step are then
@@ -107,8 +107,9 @@ class Rasterizer(Component):
     ) -> list[Render]:
         """Render several views, each with its own Gaussians and background [3].
 
-        The results equal those of `render`. By default the views are rendered one after another; a
-        rasterizer for a GPU may render them together. One backward pass covers all views.
+        The results equal the results of `render`. By default the views are rendered one after
+        another; a rasterizer for a GPU may render them together. The backward pass for all views is
+        one call.
         """
         return [
             self.render(gaussians, camera, background, outputs)

@@ -100,7 +100,7 @@ class Facts:
 
     @property
     def short(self) -> bool:
-        """Whether the run is shorter than the published ones; True before its length is planned."""
+        """True if the run is shorter than the published runs; True before its length is planned."""
         return self.views is None or self.views < REFERENCE
 
     def schedule(self, unit: Unit) -> Schedule:

@@ -33,9 +33,9 @@ class Holder:
 
     Attributes:
         pid: Number of the process.
-        host: Name of its machine.
+        host: Name of the machine.
         since: Local time, to the second.
-        doing: Its work in the folder.
+        doing: What the process does in the folder.
     """
 
     pid: int

@@ -47,7 +47,7 @@ class Pairs:
     """Names and their files.
 
     Attributes:
-        files: Name -> its file.
+        files: Name -> file with this name.
         ambiguous: Name -> the files that fit it equally well.
     """
 
@@ -58,9 +58,10 @@ class Pairs:
 class FileNames:
     """Files below one folder, found by the names that other programs use for them.
 
-    A name matches the file with the same path. Otherwise it matches the file with the same base
-    name and the most similar path. Suffix, case and Unicode form may differ. A file in another
-    folder matches only if the name's own folder does not exist; if it exists, the file is missing.
+    A name matches the file with the same path. If there is no such file, a name matches the file
+    with the same base name and the most similar path. Suffix, case and Unicode form may differ. A
+    file in another folder matches only if the name's own folder does not exist; if it exists, the
+    file is missing.
 
     Args:
         names: Paths below the folder, with forward slashes.

@@ -1,8 +1,8 @@
 """A disk cache of photos in their training size, shared by all runs.
 
-A file holds one photo. Its name is a hash of everything that determines the pixels, so an entry
-never needs an update. An entry is written completely or not at all. It contains a checksum, and an
-entry with any unexpected property counts as missing.
+A file holds one photo. The name of the file is a hash of everything that determines the pixels, so
+an entry never needs an update. An entry is written completely or not at all. An entry contains a
+checksum, and an entry with any unexpected property counts as missing.
 """
 
 import logging

@@ -86,7 +86,7 @@ class PhotosAhead:
             self._changed.notify_all()
 
     def taken_cpu(self) -> float:
-        """Return the CPU seconds of photos decoded since the last call."""
+        """Return the CPU seconds of photos decoded since the previous call."""
         with self._changed:
             taken, self._cpu = self._cpu, 0.0
         return taken

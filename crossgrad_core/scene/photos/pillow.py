@@ -105,7 +105,8 @@ def is_deep(image: "Image") -> bool:
 def take_lower_bytes(image: "Image") -> None:
     """Make Pillow decode the lower bytes of a 16-bit colour photo; by default it uses the upper.
 
-    Pillow has no 16-bit colour modes. It reads the other byte if the byte order is swapped.
+    Pillow has no 16-bit colour modes. The function reads the other byte if the byte order is
+    swapped.
     """
     other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
     modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]

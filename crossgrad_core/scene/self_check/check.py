@@ -80,7 +80,7 @@ def findings_of(
     Args:
         scene: The scene.
         images: [H, W, 3] photos that were checked.
-        names: Their names.
+        names: Names of the photos.
     """
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
     yield from _equal_poses(poses, [view.name for view in scene.views])
@@ -156,7 +156,7 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
 
     Args:
         scene: The scene.
-        path: Its folder, for messages.
+        path: The folder of the scene, for messages.
         cache_mib: Memory for decoded photos. If the scene needs more, only evenly spaced photos are
             checked.
         accept: Continue even if the scene as a whole is contradictory.

@@ -118,7 +118,7 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
     Args:
         scene: The scene.
         views: Rows of the views.
-        pixels: Decodes their photos.
+        pixels: Decodes the photos of the views.
 
     Raises:
         UserError: A photo cannot be decoded.

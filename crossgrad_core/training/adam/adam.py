@@ -77,7 +77,7 @@ def counted(
         param: The tensor.
         state: Moments and step counts; changed.
         lr: Learning rate.
-        rule: As in `adam_step`.
+        rule: The Adam rule, as in `adam_step`.
         scale: Factor for the gradient.
     """
     if name not in state.steps:

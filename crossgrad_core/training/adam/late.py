@@ -2,8 +2,8 @@
 
 Such a row has a gradient of zero, but Adam still moves it by its decaying moments. The deferred
 steps are applied row by row when the row is next rendered, or to all rows when the tensor is read.
-They use the same float32 operations in the same order, so the bits are the same as without
-deferral.
+The deferred steps use the same float32 operations in the same order, so the bits are the same as
+without deferral.
 
 Steps run in the background on other threads while this thread continues with serial work. The
 tensor is not read before it is rendered or requested; a reader then waits for the step.

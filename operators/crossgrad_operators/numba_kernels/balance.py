@@ -1,7 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
 
-Each kernel computes with 16 or 32 digits. It also marks the blocks for which rounding of the
-Gramian may be visible in a 16-digit result.
+Each kernel computes with 16 or 32 digits. Each kernel also marks the blocks for which rounding of
+the Gramian may be visible in a 16-digit result.
 """
 
 import math
@@ -223,7 +223,9 @@ def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) ->
 
 @strict_kernel
 def bargain(cosines: Floats, beta: Floats) -> bool:
-    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps. Return False if it diverges.
+    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps.
+
+    Return False if the iteration diverges.
 
     The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of
     1 / (1 + decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so no

@@ -106,8 +106,8 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
 def smallest_pivot(cosines: Floats, count: int) -> float:
     """Return the last pivot, at least 0, of a Cholesky factorization that pivots by size.
 
-    It is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely more than
-    `count` times as large.
+    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely
+    more than `count` times as large.
     """
     rest = cosines[:count, :count].copy()
     pivot = 1.0

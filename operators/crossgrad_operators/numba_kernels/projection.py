@@ -1,6 +1,6 @@
 """Pairwise projections: each gradient is changed by its conflicts with each other gradient in turn.
 
-A vector v is a sum of unit gradients. Its coefficients are numbers of 16 or 32 digits.
+A vector v is a sum of unit gradients. The coefficients of the sum are numbers of 16 or 32 digits.
 """
 
 import numpy as np
@@ -170,7 +170,7 @@ def aligned_to_targets(
 
     Args:
         gramians: [B, K, K].
-        rounding_residuals: As in `projected`.
+        rounding_residuals: The rounding residuals, as in `projected`.
         present: [B, K].
         order: [K, K].
         targets: [B, K, K], changed in place.

@@ -39,7 +39,8 @@ class Question:
         labels: [n] group labels.
         ratios: [n] camera distances divided by the reference distance.
         rng: A generator in the same state as the operator's generator.
-        memory: Values that the oracle stored in the last step. The oracle may change them.
+        memory: Values that the oracle stored in the last step. The oracle may change the stored
+            values.
     """
 
     gramian: Matrix

@@ -104,7 +104,7 @@ class Facts:
     def partial(self) -> float:
         """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
 
-        It bounds the rounding errors of all products and additions, in units of u kappa.
+        The value bounds the rounding errors of all products and additions, in units of u kappa.
         """
         # Scale by the largest term, because its square may overflow in float64.
         unit = self.largest or 1.0

@@ -242,8 +242,8 @@ def mgda(question: Question) -> Vector:
 def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
     """Return coefficients x >= 0 with r.x = 1 of the shortest sum x_k e_k.
 
-    Up to a factor, they minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a solution even if
-    0 is a convex combination.
+    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a
+    solution even if 0 is a convex combination.
     """
     size = range(len(r))
     matrix = [[cosine[i][j] + r[i] * r[j] for j in size] for i in size]

@@ -180,7 +180,7 @@ class Subject:
     Attributes:
         name: Name of the operator.
         operator: The operator.
-        reference: Its 50-digit oracle or its rule for elements, if it has one.
+        reference: The operator's 50-digit oracle or its rule for elements, if there is one.
     """
 
     name: str

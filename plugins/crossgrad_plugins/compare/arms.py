@@ -139,8 +139,9 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
     """Return the settings with several values within a scene, the most important settings first.
 
-    A setting that only some runs have is ignored. Either it is an option of a component that the
-    other runs do not use, so that the component itself differs, or it belongs to another version.
+    A setting that only some runs have is ignored. Such a setting is either an option of a component
+    that the other runs do not use, so that the component itself differs, or belongs to another
+    version.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:

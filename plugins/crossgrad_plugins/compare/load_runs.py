@@ -289,6 +289,6 @@ def without_length(label: str) -> str:
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
-    """Return each folder's path relative to the last folder that contains all of them."""
+    """Return each folder's path relative to the innermost folder that contains all of them."""
     shared = os.path.commonpath([folder.parent for folder in folders])
     return {folder: folder.relative_to(shared).as_posix() for folder in folders}

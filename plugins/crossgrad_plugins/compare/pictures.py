@@ -44,7 +44,7 @@ class WorstView:
     """A held-out view.
 
     Attributes:
-        scene: Name of its scene.
+        scene: Name of the scene.
         name: Name of the view.
         regime: Regime of the view.
         mean: The main metric, averaged over arms and seeds.

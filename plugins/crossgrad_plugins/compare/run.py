@@ -57,7 +57,7 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """Its seed."""
+        """The seed of the run."""
         return int(self.config.get("seed") or 0)
 
     @property
@@ -67,12 +67,12 @@ class Run:
 
     @property
     def environment(self) -> Mapping[str, Any]:
-        """Its machine and code, from summary.json."""
+        """The machine and the code of the run, from summary.json."""
         return self.summary.get("environment") or {}
 
     @cached_property
     def settings(self) -> Settings:
-        """Its configuration as flat settings, without settings that do not separate arms."""
+        """The configuration as flat settings, without settings that do not separate arms."""
         return settings_of(self.config)
 
     @cached_property

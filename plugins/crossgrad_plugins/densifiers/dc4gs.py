@@ -74,7 +74,7 @@ def split_positions(scores: Tensor) -> Tensor:
 
 
 def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions [Q], central ones first, and the Lagrange weights [5, Q] there."""
+    """Return positions [Q], central positions first, and the Lagrange weights [5, Q] there."""
     places = np.concatenate([NODES, GRID])
     places = places[np.argsort(np.abs(places - 0.5), kind="stable")]
     weights = np.ones((len(NODES), len(places)))
@@ -147,7 +147,8 @@ def _child(
     """Return new values for the left or right children of parents [S], cut at `position` [S].
 
     The longest axis is six standard deviations long. The left child gets the share p of the axis
-    and of the opacity. Its centre is 3 (1 - p) standard deviations left of the parent's centre.
+    and of the opacity. The centre of the child is 3 (1 - p) standard deviations left of the
+    parent's centre.
     """
     share = 1.0 - position if right else position
     place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)

@@ -129,8 +129,8 @@ class CountsMarkedPixels(Densifier, ABC):
     def importance_of(self, state: PluginState) -> MultiViewScore:
         """Return the score of the counts of a state.
 
-        A mean is taken over the views that were rendered for the counts. In the running variant it
-        is taken over the renders that showed the primitive.
+        A mean is taken over the views that were rendered for the counts. In the running variant the
+        mean is taken over the renders that showed the primitive.
         """
         marked, error, visits = (state.per_primitive[name] for name in (MARKED, ERROR, VISITS))
         drawn = state.values.get(DRAWN)

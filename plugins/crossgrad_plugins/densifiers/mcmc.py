@@ -178,9 +178,9 @@ LAST_EDIT_SHARE = 25 / 30
 class MarkovChainMonteCarlo(Densifier):
     """Moves transparent Gaussians onto opaque ones, and adds 5 % per pass up to a cap.
 
-    It needs no screen statistics. Gaussians are samples of a distribution that training explores by
-    noise on the positions. Two regularisers make useless Gaussians transparent and small. It does
-    not clone, split, prune or reset opacities.
+    The densifier needs no screen statistics. Gaussians are samples of a distribution that training
+    explores by noise on the positions. Two regularisers make useless Gaussians transparent and
+    small. The densifier does not clone, split, prune or reset opacities.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})

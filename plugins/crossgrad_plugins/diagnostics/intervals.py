@@ -225,7 +225,7 @@ def split_intervals(
     studentised on the logarithmic scale.
 
     sigma_b^2 is quadratic in the distance theta of the group means, so its noise depends on theta.
-    Its interval holds every theta that the estimate does not reject with the standard error of
+    The interval holds every theta that the estimate does not reject with the standard error of
     *that* theta; the bootstrap is moved to theta for the critical values. The interval of the ratio
     is computed in the same way from theta - ratio sigma_w^2. The larger the part of sigma_w^2 in
     this noise, the larger the share of the error that is assigned to the upper end. The ends are

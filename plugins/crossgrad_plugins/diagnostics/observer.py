@@ -17,10 +17,10 @@ _PROBES = 8
 class Diagnostics(Observer):
     """An observer that measures the gradients of chosen views at an interval, at frozen parameters.
 
-    It writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's folder.
-    The views are drawn by the observer's own generator, so the result of training does not change.
-    A probe costs a forward and a backward pass of each probed view. This time does not count as
-    training time; the column `probe_seconds` contains it.
+    The observer writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's
+    folder. The views are drawn by the observer's own generator, so the result of training does not
+    change. A probe costs a forward and a backward pass of each probed view. This time does not
+    count as training time; the column `probe_seconds` contains it.
     """
 
     every: int | None = Field(

@@ -92,7 +92,7 @@ class Exponent:
 
     Attributes:
         value: The fitted exponent; NaN if it is undefined.
-        interval: Its confidence interval.
+        interval: Confidence interval of the exponent.
         views: Number of views with a non-zero gradient and distance.
     """
 
@@ -183,7 +183,7 @@ class _Part:
     Attributes:
         name: Name of the part.
         kind: Kind of the part.
-        members: Indices of its blocks in the measurement.
+        members: Indices of the part's blocks in the measurement.
     """
 
     name: str

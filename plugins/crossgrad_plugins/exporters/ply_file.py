@@ -106,7 +106,8 @@ def position_offset(similarity: Similarity) -> NDArray[np.float64]:
     """Return [3] the offset to subtract from input coordinates before rounding to float32.
 
     The offset is zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`.
-    Otherwise it is the centre of the scene, rounded to a power of ten of at most one local unit.
+    Otherwise the offset is the centre of the scene, rounded to a power of ten of at most one local
+    unit.
     """
     largest = np.float32(np.abs(similarity.offset).max())
     error = 0.5 * float(np.spacing(largest)) * similarity.scale  # local units

@@ -96,7 +96,7 @@ class OnEarth:
 
     @property
     def note(self) -> str:
-        """See `crossgrad_core.plugin.Georeference`."""
+        """One sentence for the user; see `crossgrad_core.plugin.Georeference`."""
         parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
         told = f"; residuals: {', '.join(parts)}" if parts else ""
         return (
@@ -146,8 +146,8 @@ class OnEarth:
     ) -> Placed:
         """Return Gaussians at `points` [N, 3], rotated and scaled by a similarity from the input.
 
-        They get a separate frame, which is rotated against the local frame and has the same size,
-        so that an exporter only moves and scales them.
+        The Gaussians get a separate frame, which is rotated against the local frame and has the
+        same size, so that an exporter only moves and scales them.
         """
         offset = frame.points(similarity.offset[None])[0]
         own = Similarity(offset, similarity.scale / frame.scale)

@@ -55,7 +55,7 @@ class Percentile(Grouping):
     """near: cameras up to the q-th percentile of the distance from the mean camera; far: the rest.
 
     Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
-    is not 50, this is a different objective, not only a different variance.
+    is not 50, the estimate belongs to a different objective, and not only its variance differs.
 
     Source: the paper, partition threshold study (30 and 70).
     """

@@ -124,7 +124,7 @@ def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return [...] share of the variance of values [..., N >= 2] between the two sides.
 
     The sides are separated by Otsu's threshold. The share is 1 for two values, and 3/4 for very
-    many evenly spread values. It is 0 if all values are equal.
+    many evenly spread values. The share is 0 if all values are equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """

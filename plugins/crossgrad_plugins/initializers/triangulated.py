@@ -201,7 +201,7 @@ def meet(first: Features, second: Features, pixels: float) -> Met:
     """Return the features that two photos have in common, and their triangulated points.
 
     Both descriptors are the nearest of each other by a clear margin. The point is in front of both
-    cameras. In both photos its projection is at most `pixels` from its feature.
+    cameras. The projection of the point is at most `pixels` from the feature in both photos.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]

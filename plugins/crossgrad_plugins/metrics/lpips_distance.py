@@ -79,7 +79,7 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
 
     Args:
         net: The network.
-        trunk: File with its pretrained weights.
+        trunk: File with the pretrained weights of the network.
         heads: File with the linear heads; None for the heads of an installed package.
         setting: The user's setting for the weights, such as `metrics.lpips`.
 

@@ -58,8 +58,8 @@ class SSIMOfSkimage(Metric):
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Return the SSIM as in the loss: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
 
-    The arguments are those of `psnr`. The result is the mean over the unmasked pixels; None if no
-    pixel counts.
+    The arguments are the same as those of `psnr`. The result is the mean over the unmasked pixels;
+    None if no pixel counts.
     """
     from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 
@@ -77,7 +77,7 @@ def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> f
     As in scikit-image, the mean excludes a border of 5 pixels, where windows extend beyond the
     image.
 
-    The arguments are those of `psnr`. The result is None if no pixel is left;
+    The arguments are the same as those of `psnr`. The result is None if no pixel is left;
     `SSIM_SKIMAGE_TOO_SMALL` is the reason.
     """
     height, width = image.shape[:2]

@@ -128,7 +128,7 @@ def plan(
 def advised(scene: Path) -> tuple[str, str]:
     """Return the length that the planner advises for a scene, and the training command.
 
-    No photo is decoded for this.
+    No photo is decoded.
 
     Raises:
         UserError: The scene cannot be read.

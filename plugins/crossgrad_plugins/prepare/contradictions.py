@@ -79,7 +79,7 @@ class _Counts:
     """Sums over pairs for each photo.
 
     Attributes:
-        size: One more than the largest number of a photo.
+        size: Largest number of a photo, plus one.
     """
 
     size: int

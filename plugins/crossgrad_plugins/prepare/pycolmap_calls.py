@@ -62,8 +62,8 @@ def waited(
 
     Args:
         what: Name of the call, for messages.
-        call: The call. Its argument is a token by which it can be cancelled.
-        far: Function that returns the progress as text. It is called every few seconds.
+        call: The call. The argument of the call is a token by which the call can be cancelled.
+        far: Function that returns the progress as text. The function is called every few seconds.
 
     Raises:
         UserError: Pycolmap failed. The error contains the reason.

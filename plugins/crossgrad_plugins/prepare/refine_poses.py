@@ -70,7 +70,7 @@ def looked_again(
         database: COLMAP's database with the verified matches.
         scratch: An empty folder.
         adjust: Function that continues mapping.
-        cancelled: Returns True if the call was cancelled. It is called for every photo.
+        cancelled: Returns True if the call was cancelled. The function is called for every photo.
 
     Returns:
         The models, and the settled photos of the largest model. The largest model is returned in

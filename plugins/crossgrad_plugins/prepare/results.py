@@ -28,8 +28,8 @@ class Part:
     """A model as mapping found it.
 
     Attributes:
-        photos: Names of its photos.
-        points: Number of its points.
+        photos: Names of the model's photos.
+        points: Number of the model's points.
         error: Mean reprojection error in pixels.
         unplaced: Reason why the model has no place on Earth. Empty if the model has a place on
             Earth.

@@ -16,7 +16,7 @@ class Labelled:
     """A camera, identified by its label.
 
     Attributes:
-        label: Label as in the file. It may contain folders and may lack the photo's suffix.
+        label: Label as in the file. The label may contain folders and may lack the photo's suffix.
         group: Label of the camera's group, or an empty text.
         sensor: Label of the camera's sensor.
         size: Width and height of the sensor's photos, in pixels.

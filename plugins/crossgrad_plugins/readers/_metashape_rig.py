@@ -1,10 +1,10 @@
 """Multi-camera systems of Metashape: poses of slave cameras, computed from their masters.
 
-A slave camera has no transform of its own. Its sensor contains a location and a rotation. The
-location is the slave's centre in the axes of the master, in the units of the chunk. The rotation
-turns the slave's axes into the master's axes. The transform of the slave is therefore the transform
-of the master * [rotation | location]. Source: Metashape Expert Manual, "The slave-sensor transform:
-composition rule",
+A slave camera has no transform of its own. The sensor of a slave camera contains a location and a
+rotation. The location is the slave's centre in the axes of the master, in the units of the chunk.
+The rotation turns the slave's axes into the master's axes. The transform of the slave is therefore
+the transform of the master * [rotation | location]. Source: Metashape Expert Manual, "The
+slave-sensor transform: composition rule",
 https://photogrammetrycommunity.github.io/metashape-expert-manual/workflow/camera-calibration/slave-sensor-transform-recipes/
 """
 

@@ -30,7 +30,7 @@ def raw_scene(
         images: Photo folder relative to the scene, `.` for the scene's own folder.
         views: The posed photos.
         points: Points in the same frame as the poses.
-        notes: Notes on what the reader did.
+        notes: Notes on the actions of the reader.
     """
     return RawScene(
         root=inside.scene,

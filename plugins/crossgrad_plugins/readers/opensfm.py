@@ -2,7 +2,8 @@
 
 Sources of the format: https://opensfm.org/docs/geometry.html (axes, camera models, pixels),
 https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates have
-their origin in the middle of the photo. Their unit is the longer side of the photo.
+their origin in the middle of the photo. The unit of normalised coordinates is the longer side of
+the photo.
 """
 
 from collections.abc import Sequence

@@ -69,8 +69,8 @@ class NearFar(Sampler):
 class ThreeWay(Sampler):
     """One near, one middle and one far view per step.
 
-    A step has three renders, so compare this sampler with others at equal rendered views, not at
-    equal steps.
+    A step has three renders, so compare this sampler with other samplers at equal rendered views,
+    not at equal steps.
 
     Source: the paper, partition threshold study; groups are thirds of the radial distance.
     """

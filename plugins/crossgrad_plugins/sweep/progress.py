@@ -26,7 +26,7 @@ class UnderWay:
 
     Attributes:
         job: The run.
-        record: The record of its start.
+        record: The record of the start of the run.
         row: The newest evaluation of the run, column -> text.
     """
 

@@ -79,7 +79,7 @@ def standings(
     Args:
         jobs: The runs.
         layout: The folder of the sweep.
-        records: The records of its workers.
+        records: The records of the sweep's workers.
         alive: True if a sweep is active in the folder.
     """
     last = {record.run: record for record in records}

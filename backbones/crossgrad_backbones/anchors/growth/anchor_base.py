@@ -168,7 +168,7 @@ class AnchorDensifier(Densifier):
 
         Args:
             context: The step.
-            parameters: Its parameters, detached.
+            parameters: The parameters of the anchors, detached.
             request: The requests of the offsets.
         """
 

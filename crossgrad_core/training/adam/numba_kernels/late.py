@@ -219,7 +219,7 @@ def _step_row(
 ) -> None:
     """Apply one step to a row of WIDE elements or more.
 
-    Its gradient is row `place` of `grad` if the row was rendered, else zero.
+    The gradient of the row is row `place` of `grad` if the row was rendered, else zero.
     """
     at, begin, g = row * width, place * width, splat_wide(_ZERO)
     # The last sixteen elements overlap with earlier ones, so compute them before these are written.

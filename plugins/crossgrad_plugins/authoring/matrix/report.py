@@ -76,7 +76,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
-    """Train a package's components with all others.
+    """Train a package's components with all other components.
 
     Args:
         package: Name of a distribution, or of an import package that holds plugins.

@@ -136,7 +136,7 @@ def band(
     """Return the cost, and the lowest, mean and highest metric over the seeds of an arm.
 
     A run's metric is interpolated between its evaluations. The arrays [n] cover the range of costs
-    that all runs have in common. They are empty if no run has a curve, or if the runs have no
+    that all runs have in common. The arrays are empty if no run has a curve, or if the runs have no
     common range.
     """
     runs = [run for (at, _), run in c.main[arm].items() if at == scene]

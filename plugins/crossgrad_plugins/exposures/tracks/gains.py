@@ -1,11 +1,11 @@
 """Relative brightness of the photos of a scene, by a robust fit to SfM tracks.
 
-Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. It is solved by
-iteratively reweighted least squares, with the points eliminated. The remaining matrix couples each
-photo with the photos that show common points. If these photos are few, as in a strip of hundreds of
-photos, the matrix is solved directly, because conjugate gradients would need many iterations. If
-they are many, conjugate gradients need few iterations and the direct solution is slow. If the
-photos form several parts without common points, each part has a mean of 0.
+Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. The system is
+solved by iteratively reweighted least squares, with the points eliminated. The remaining matrix
+couples each photo with the photos that show common points. If these photos are few, as in a strip
+of hundreds of photos, the matrix is solved directly, because conjugate gradients would need many
+iterations. If there are many such photos, conjugate gradients need few iterations and the direct
+solution is slow. If the photos form several parts without common points, each part has a mean of 0.
 """
 
 from collections.abc import Sequence

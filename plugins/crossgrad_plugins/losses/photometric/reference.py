@@ -4,7 +4,7 @@ This is the readable definition, and the reference for tests of the fused kernel
 
 Autograd launches more kernels, and most of them run for less time than their launch takes. The
 explicit gradient uses sums and differences, as the fused CPU kernel does (`numba_kernels.fused`).
-It filters twelve planes forward and nine backward, instead of fifteen each.
+The function filters twelve planes forward and nine backward, instead of fifteen each.
 """
 
 from functools import cache
@@ -38,8 +38,8 @@ def l1_ssim_loss(
 ) -> Tensor:
     """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over the unmasked pixels and channels.
 
-    A masked pixel is 0 in both images before SSIM's windows are summed. It contributes to neither
-    mean, and it receives exactly zero gradient. If no pixel counts, the loss is 0.
+    A masked pixel is 0 in both images before SSIM's windows are summed. A masked pixel contributes
+    to neither mean, and receives exactly zero gradient. If no pixel counts, the loss is 0.
 
     Args:
         image: [H, W, C] floating point; values may be outside [0, 1].

@@ -115,7 +115,8 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
 def terms_of(constants: NDArray[np.float32]) -> Terms:
     """Return the constants of `exp2`.
 
-    If they are loaded before a loop, they remain in registers on machines with 32 vector registers.
+    If the constants are loaded before a loop, they remain in registers on machines with 32 vector
+    registers.
     """
     return (
         load_wide(constants, 0),

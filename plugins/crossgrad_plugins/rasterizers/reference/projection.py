@@ -201,7 +201,7 @@ def _window(offset: Tensor, sigma: Tensor) -> Tensor:
     """Return the mass of a 1-D Gaussian in a window of one pixel.
 
     The window's centre is at `offset` from the mean. The mass is F(x + h) - F(x - h) with F(x) =
-    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. It is computed as a
+    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. The mass is computed as a
     product, so that precision is not lost for tails or for wide Gaussians.
     """
     x = -offset.abs() / sigma

@@ -1,8 +1,8 @@
 """The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
 
 x is the image and y the target; s = x + y and d = x - y. With s and d, SSIM needs four windowed
-means instead of five: M_s, M_d, E[s^2], E[d^2]. Its factors have no cancellation between the two
-images:
+means instead of five: M_s, M_d, E[s^2], E[d^2]. The factors of this form have no cancellation
+between the two images:
 
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 

@@ -249,7 +249,7 @@ def _sum_squares(
 def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
     """Return the window sums over the rows of a ring, around `row` and around the next row.
 
-    Both are computed together, because they share most of their data, which comes from the
+    Both sums are computed together, because they share most of their data, which comes from the
     second-level cache.
 
     Args:

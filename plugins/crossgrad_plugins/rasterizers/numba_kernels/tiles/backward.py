@@ -1,8 +1,8 @@
 """Gradients of the tiles' pixels, summed per entry (a Gaussian in a tile), front to back.
 
-Let S be the contribution of all Gaussians behind the current Gaussian to the linearised loss. Its
-start value is the gradient of the pixel times the pixel. c is the gradient times the Gaussian's
-colour. Then
+Let S be the contribution of all Gaussians behind the current Gaussian to the linearised loss. The
+start value of S is the gradient of the pixel times the pixel. c is the gradient times the
+Gaussian's colour. Then
 
     dL/d(alpha) = T c - S / (1 - alpha),
 

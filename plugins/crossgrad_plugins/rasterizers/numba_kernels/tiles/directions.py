@@ -4,8 +4,8 @@ This is a separate pass after the backward pass, for densifiers that need direct
 renders the tiles again and sums, per entry and bin, the fields of
 `crossgrad_core.contract.gaussians.Screen.directions`.
 
-The operations are those of `backward`, in the same order, so the gradients have the same bits. Only
-the operations for sums of other gradients are left out.
+The operations are the same as in `backward`, in the same order, so the gradients have the same
+bits. Only the operations for sums of other gradients are left out.
 """
 
 import numpy as np
