@@ -50,7 +50,7 @@ class LearningRate:
 
     @property
     def decays(self) -> bool:
-        """Whether the rate changes over the schedule."""
+        """True if the rate changes over the schedule."""
         return self.final is not None and self.initial not in {0.0, self.final}
 
     def at(self, progress: float) -> float:
@@ -99,7 +99,7 @@ class Block:
 
     @property
     def frozen(self) -> bool:
-        """Whether training leaves the block unchanged."""
+        """True if training leaves the block unchanged."""
         return self.lr.initial == 0.0
 
 
@@ -220,7 +220,7 @@ class Edit:
 
     @property
     def keeps_rows(self) -> bool:
-        """Whether all primitives stay and no row is fresh."""
+        """True if all primitives stay and no row is fresh."""
         return self.source is None and self.fresh is None
 
 

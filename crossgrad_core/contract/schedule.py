@@ -158,7 +158,7 @@ class Counting:
     """The unit in which a schedule counts, and the quantities that the unit requires.
 
     Attributes:
-        unit: Whether the schedule's numbers are views or steps.
+        unit: The unit of the schedule's numbers, views or steps.
         views: Number of views per step.
         photos: Number of training photos. An edit uses the statistics of at least this many views
             if the run is long enough.
@@ -184,7 +184,7 @@ class Schedule:
     """The schedule of one run, counted in views or in steps; `total` is always in steps.
 
     Attributes:
-        mode: Whether the published schedule was stretched with the run.
+        mode: `scaled` if the published schedule was stretched with the run, else `absolute`.
         total: Length of the run, in steps.
         length: The length that the schedule is written for: the run's own length if it was
             stretched.

@@ -56,7 +56,7 @@ class Stopper:
 
     @property
     def requested(self) -> bool:
-        """Whether training must stop after the present step."""
+        """True if training must stop after the present step."""
         return self.signal is not None or self.error is not None
 
     def fail(self, error: Exception) -> None:

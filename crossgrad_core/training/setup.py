@@ -277,7 +277,7 @@ class Setup:
 
     @cached_property
     def weighs(self) -> bool:
-        """Whether any plugin weighs pixels."""
+        """True if any plugin weighs pixels."""
         return bool(self.hook.crossgrad_pixel_weights.get_hookimpls())
 
     @cached_property
@@ -288,7 +288,7 @@ class Setup:
 
     @cached_property
     def separate(self) -> bool:
-        """Whether the gradients of the views are stored separately."""
+        """True if the gradients of the views are stored separately."""
         return self.operator.separate or bool(self.watchers)
 
     @cached_property
@@ -336,27 +336,27 @@ class Setup:
 
     @cached_property
     def regularizes(self) -> bool:
-        """Whether any plugin adds loss terms."""
+        """True if any plugin adds loss terms."""
         return bool(self.hook.crossgrad_regularize.get_hookimpls())
 
     @cached_property
     def shows_model(self) -> bool:
-        """Whether any plugin reads the model after a step."""
+        """True if any plugin reads the model after a step."""
         return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
     def acts_after_step(self) -> bool:
-        """Whether any plugin acts after the step."""
+        """True if any plugin acts after the step."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())
 
     @cached_property
     def follows_steps(self) -> bool:
-        """Whether any plugin updates a state after each complete step."""
+        """True if any plugin updates a state after each complete step."""
         return bool(self.hook.crossgrad_step_done.get_hookimpls())
 
     @cached_property
     def changes_rates(self) -> bool:
-        """Whether any plugin changes learning rates."""
+        """True if any plugin changes learning rates."""
         return bool(self.hook.crossgrad_rate_factor.get_hookimpls())
 
     @cached_property

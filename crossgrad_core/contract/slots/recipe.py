@@ -28,7 +28,7 @@ class Facts:
         device: Torch device type.
         planned: Steps that the run was planned with; None while only its seconds are known.
         total: Present number of steps, after the clock made the run longer or shorter.
-        mode: Whether the published schedule is stretched to the run.
+        mode: `scaled` if the published schedule is stretched to the run, else `absolute`.
         schedule_length: Length that the schedule is written for; None for the length of the run or
             the published length.
         views_per_step: Views of each step, K.

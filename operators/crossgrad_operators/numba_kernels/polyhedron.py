@@ -272,7 +272,7 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Return whether the ridge is not visible, because active directions are far from dependent.
+    """Return True if the ridge is not visible, because active directions are far from dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """

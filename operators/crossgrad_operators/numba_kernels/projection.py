@@ -61,13 +61,13 @@ def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def _is_opposite(cosine: Pair, exact: Exact) -> bool:
-    """Return whether 1 + cos is rounding noise."""
+    """Return True if 1 + cos is rounding noise."""
     return plus(ONE, cosine, exact)[0] <= OPPOSITE
 
 
 @strict_device
 def _conflicts(along: Pair, size: Pair, least: Pair, exact: Exact) -> bool:
-    """Return whether the cosine along / size is below -least."""
+    """Return True if the cosine along / size is below -least."""
     return along[0] < 0.0 and plus(along, product(least, size, exact), exact)[0] < 0.0
 
 

@@ -76,12 +76,12 @@ def cosines(gramian: Matrix) -> Matrix:
 
 
 def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
-    """Return whether sum x_k e_k is only rounding noise of exactly opposite directions."""
+    """Return True if sum x_k e_k is only rounding noise of exactly opposite directions."""
     return cancels(form(cosine, x), max(abs(v) for v in x))
 
 
 def cancels(square: Number, largest: Number) -> bool:
-    """Return whether a sum counts as zero, from its square and its longest summand's length."""
+    """Return True if a sum counts as zero, from its square and its longest summand's length."""
     return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
 

@@ -163,7 +163,7 @@ def comparable(facts: Facts) -> bool:
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Return whether zero is not near the hull of the directions."""
+    """Return True if zero is not near the hull of the directions."""
     return facts.distance >= APART
 
 

@@ -194,7 +194,7 @@ def aligned(question: Question) -> Vector:
 
 
 def _vanishes(cosine: Matrix, x: Vector) -> bool:
-    """Return whether a combination is zero. Two directions may also count as opposite."""
+    """Return True if a combination is zero. Two directions may also count as opposite."""
     largest = max(abs(v) for v in x)
     exactly = form(cosine, x) <= number(VANISHED) * largest**2
     return exactly or (len(x) == 2 and is_noise(cosine, x))  # noqa: PLR2004

@@ -264,7 +264,7 @@ class AxisSplit(CloneSplit):
 
     @property
     def by_size(self) -> bool:
-        """Whether `split_scale` also selects the statistic that decides about growth."""
+        """True if `split_scale` also selects the statistic that decides about growth."""
         return False
 
     @override

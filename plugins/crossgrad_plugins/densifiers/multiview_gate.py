@@ -74,13 +74,13 @@ class MultiViewGate(CountsMarkedPixels):
     @property
     @override
     def resets(self) -> bool:  # type: ignore[override]
-        """Whether the other densifier resets opacities."""
+        """True if the other densifier resets opacities."""
         return self.of.resets
 
     @property
     @override
     def observes(self) -> bool:  # type: ignore[override]
-        """Whether the gate or the other densifier gathers statistics of views."""
+        """True if the gate or the other densifier gathers statistics of views."""
         return self.count == "running" or self.of.observes
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:

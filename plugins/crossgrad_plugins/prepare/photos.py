@@ -123,7 +123,7 @@ def find_photos(
 
 
 def has_photos(root: Path) -> bool:
-    """Return whether a folder or its subfolders contain photos."""
+    """Return True if a folder or its subfolders contain photos."""
     return any(Path(name).suffix.lower() in _READ for name in _names(root))
 
 

@@ -133,7 +133,7 @@ def check_written(folder: Path) -> None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Return whether all files of a model exist and are not truncated."""
+    """Return True if all files of a model exist and are not truncated."""
     try:
         read_binary(folder)
     except UserError:

@@ -111,7 +111,7 @@ def _moved(here: Path, there: Path) -> None:
 
 
 def _is_written(photo: Path) -> bool:
-    """Return whether a photo file exists and is complete."""
+    """Return True if a photo file exists and is complete."""
     # A JPEG writer that cannot write aborts the process. Other files may be truncated.
     if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
         return photo.is_file()

@@ -38,12 +38,12 @@ _MOST: Final = 10_000
 
 
 def blender(path: Path, folder: str = ".") -> bool:
-    """Return whether the folder holds a NeRF synthetic scene."""
+    """Return True if the folder holds a NeRF synthetic scene."""
     return begins_with(path / folder / BLENDER_FILE, b"{")
 
 
 def colmap(path: Path) -> bool:
-    """Return whether the folder holds a COLMAP model."""
+    """Return True if the folder holds a COLMAP model."""
     try:
         return bool(find_models(path))
     except OSError:
@@ -56,17 +56,17 @@ def matrixcity(path: Path) -> bool:
 
 
 def metashape(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds a Metashape XML file of cameras."""
+    """Return True if the folder holds a Metashape XML file of cameras."""
     return bool(METASHAPE.find(Inside(path), file))
 
 
 def nerfstudio(path: Path, file: str = TRANSFORMS_FILE) -> bool:
-    """Return whether the folder holds a frames file of nerfstudio or instant-ngp."""
+    """Return True if the folder holds a frames file of nerfstudio or instant-ngp."""
     return begins_with(path / file, b"{") and not holds(path / file, _ROTATION)
 
 
 def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
-    """Return whether the folder holds an OpenSfM reconstruction."""
+    """Return True if the folder holds an OpenSfM reconstruction."""
     return any(begins_with(path / name, b"[") for name in names)
 
 
@@ -76,12 +76,12 @@ def photos_alone(path: Path) -> bool:  # noqa: ARG001 - no folder is prepared un
 
 
 def realitycapture(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds a RealityCapture CSV of camera parameters."""
+    """Return True if the folder holds a RealityCapture CSV of camera parameters."""
     return bool(REALITYCAPTURE.find(Inside(path), file))
 
 
 def uc_gs(path: Path, images: str = "images") -> bool:
-    """Return whether the folder holds a COLMAP model with photo names that mark held-out photos."""
+    """Return True if the folder holds a COLMAP model with photo names that mark held-out photos."""
     return colmap(path) and any(map(is_held_out, _photos_below(path / images)))
 
 

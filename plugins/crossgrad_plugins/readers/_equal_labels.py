@@ -130,7 +130,7 @@ def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None
 
 
 def _is_sure(camera: Labelled, name: str) -> bool:
-    """Return whether the label, the group or the sensor names the folder of a photo."""
+    """Return True if the label, the group or the sensor names the folder of a photo."""
     hints = (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,))
     return camera.label == name or any(
         hint and all(hint) and _in_folders([name], hint) for hint in hints

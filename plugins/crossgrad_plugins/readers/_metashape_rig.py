@@ -58,7 +58,7 @@ class Rig:
         return cls(offsets, transforms, sensors)
 
     def is_slave(self, camera: Element) -> bool:
-        """Return whether the pose of a camera is computed from a master and an offset."""
+        """Return True if the pose of a camera is computed from a master and an offset."""
         return camera.find("transform") is None and camera.get("master_id") is not None
 
     def pose(self, camera: Element) -> NDArray[np.float64] | None:

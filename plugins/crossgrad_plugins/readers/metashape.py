@@ -257,7 +257,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
 
 
 def _is_rolling(element: Element) -> bool:
-    """Return whether Metashape compensates the rolling shutter of a sensor."""
+    """Return True if Metashape compensates the rolling shutter of a sensor."""
     told = [each.get("value") for each in element.iterfind("property")
             if each.get("name") == _ROLLING]  # fmt: skip
     told += [each.get("value", each.text) for each in element.iterfind(_ROLLING)]

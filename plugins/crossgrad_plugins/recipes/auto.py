@@ -86,7 +86,7 @@ class Choice:
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether the backbone's Gaussians have their own axes and are rendered as published."""
+        """True if the backbone's Gaussians have their own axes and are rendered as published."""
         backbone = self.facts.backbone
         return bool(backbone.axes) and backbone.response == "plain"
 
@@ -143,7 +143,7 @@ class Choice:
 
     @cached_property
     def led(self) -> bool:
-        """Whether growth follows the schedule of a budget that suits the length."""
+        """True if growth follows the schedule of a budget that suits the length."""
         return self.growth == "budget" and self.length < REFERENCE
 
 

@@ -28,7 +28,7 @@ def test_packing_a_lattice_keeps_every_number():
 
 
 @pytest.mark.parametrize("fork", [2, 3])
-def test_cells_shrink_by_the_fork(fork):
+def test_cells_shrink_by_the_factor_fork_from_level_to_level(fork):
     cells = lattice(fork=fork).cells(torch.arange(5))
     assert cells.tolist() == pytest.approx([0.5 / fork**level for level in range(5)], rel=1e-15)
 

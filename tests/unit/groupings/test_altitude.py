@@ -73,7 +73,7 @@ def test_an_axis_without_direction_is_refused(axis):
         upward(nadir(), axis)
 
 
-def test_low_cameras_are_near():
+def test_low_cameras_get_the_label_near():
     scene = nadir()
     labels = Altitude().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near", "far", "far", "near") * 2

@@ -80,6 +80,6 @@ def test_a_black_render_keeps_its_plain_psnr():
     assert TrackExposedPSNR().measure(pair) == pytest.approx(psnr(pair.render, pair.photo))
 
 
-def test_structural_differences_still_count():
+def test_structural_differences_lower_the_psnr_after_exposure_correction():
     drawn, photo = smooth(), with_gain(smooth().flip(0), torch.tensor(-1.0))
     assert TrackExposedPSNR().measure(compared(drawn, photo)) < 25

@@ -97,7 +97,7 @@ def test_results_for_random_gradients_agree_with_fifty_digits(name, family, dtyp
         assert judged(name, family(rng)[:6], dtype) <= 8
 
 
-def test_soft_does_not_change_a_conflict_at_its_threshold():
+def test_the_soft_operator_does_not_change_a_conflict_at_its_threshold():
     """The cosine is -1/4 exactly, and the rule jumps there."""
     rows = [[1.0, 0, 0, 0, 0], [-1.0, 3, 2, 1, 1]]
     for scale in (1.0, 3.0, 7.0):

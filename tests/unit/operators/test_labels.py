@@ -38,7 +38,7 @@ def test_anchors_need_near_and_far_views():
     assert objections("gradnorm", "random-split") == []
 
 
-def test_anchors_need_pairs():
+def test_the_anchors_operator_requires_two_views():
     assert objections("anchors", "anchors-30", "anchors", views=4) == [
         "operator anchors needs K = 2 (--views); K is 4"
     ]

@@ -94,7 +94,7 @@ def test_every_learning_rate_comes_from_a_tuned_arm(modules, grids):
     )
 
 
-def test_the_budget_is_twelve_core_hours(modules, grids):
+def test_the_grids_of_the_paper_need_at_most_twelve_core_hours(modules, grids):
     plan, total = modules.data.read_plan(), 0.0
     for name, grid in grids.items():
         cells = len(grid.scenes) * len(grid.seeds)

@@ -150,6 +150,6 @@ def test_reducing_photos_gives_the_bits_of_scikit_image(old, new, kind, seed):
     np.testing.assert_array_equal(resize(image, width, height), np.rint(whole).clip(0, 255))
 
 
-def test_one_side_may_be_enlarged():
+def test_resizing_may_enlarge_one_side_of_a_photo():
     whole = skimage_resize(RGB.astype(np.float32), (50, 30), anti_aliasing=True)
     np.testing.assert_array_equal(resize(RGB, 30, 50), np.rint(whole).clip(0, 255))

@@ -127,7 +127,7 @@ def test_the_checksum_of_an_entry_is_verified_again_only_after_other_use(
     assert len(sums) == 2
 
 
-def test_an_entry_of_another_size_does_not_count(store, folder):
+def test_an_entry_of_another_size_is_not_used(store, folder):
     store.decoded(large(1))
     other = large(1, target=(HEIGHT - 1, WIDTH))
     store.decoded(other)

@@ -11,7 +11,7 @@ def split(names, root, given=None, **options):
     return split_views(names, SceneOptions(**options), root, given)
 
 
-def test_every_eighth_by_name_is_held_out(tmp_path):
+def test_every_eighth_photo_by_name_is_held_out(tmp_path):
     result = split(NAMES[::-1], tmp_path)
     assert result.test == ("00.jpg", "08.jpg", "16.jpg", "24.jpg")
     assert len(result.train) == 24
@@ -52,7 +52,7 @@ def by_parity(_train):
     return {name: ("even", "odd")[k % 2] for k, name in enumerate(NAMES)}
 
 
-def test_stratified_takes_every_eighth_of_each_regime(tmp_path):
+def test_the_stratified_split_holds_out_every_eighth_photo_of_each_regime(tmp_path):
     result = split_views(NAMES, SceneOptions(split="stratified"), tmp_path, label=by_parity)
     assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
     assert len(result.train) == 24 and result.regimes == by_parity(())

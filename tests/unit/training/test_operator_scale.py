@@ -97,7 +97,7 @@ def test_every_granularity_has_the_same_scale(granularity):
 
 
 @pytest.mark.parametrize("name", entries("operators"))
-def test_one_view_changes_no_bit(name):
+def test_the_scale_of_an_operator_for_a_single_view_is_exactly_one(name):
     operator = build("operators", name, {})
     if 1 in admitted(operator.views):
         scale = scale_of(operator, 1)

@@ -52,7 +52,7 @@ def test_each_pixel_is_the_mean_of_the_area_that_it_covers(width, height, mask):
         assert (found == expected)[sure].all()
 
 
-def test_a_full_mask_becomes_no_mask():
+def test_a_mask_without_masked_pixels_is_dropped():
     assert reduced(IMAGE, torch.ones(23, 37, dtype=torch.bool), 9, 9)[1] is None
 
 

@@ -173,7 +173,7 @@ def meetings(
         value: The value.
         values: The values of each factor.
         usual: Completes a row in which some values are given.
-        admits: Returns True if a row can work.
+        admits: Function that returns True if the components of a row can be combined.
     """
     missing = {(i, each) for i, some in enumerate(values) if i != place for each in some}
     for turn in range(max(map(len, values))):

@@ -97,7 +97,7 @@ def _row_hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Return whether the footprint covers a pixel centre in image row `y`."""
+    """Return True if the footprint covers a pixel centre in image row `y`."""
     dy = y + 0.5 - v
     left_over = (reach - dy * dy * inverse_c) * variance
     if not left_over >= 0.0:
@@ -119,7 +119,7 @@ def _hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Return whether the footprint covers any pixel centre in the image rows y0 to y1."""
+    """Return True if the footprint covers any pixel centre in the image rows y0 to y1."""
     middle = clamped(np.floor(v), y0, y1)
     if _row_hits(middle, u, v, inverse_c, slope, variance, reach, width):
         return True
@@ -327,7 +327,7 @@ def _covers(
     reach: tuple[float, float],
     opacity: float,
 ) -> bool:
-    """Return whether the analytic response touches pixel (x, y)."""
+    """Return True if the analytic response touches pixel (x, y)."""
     dx, dy = x + 0.5 - u, y + 0.5 - v
     along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
     if abs(along) > reach[0] or abs(across) > reach[1]:

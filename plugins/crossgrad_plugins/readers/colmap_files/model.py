@@ -189,7 +189,7 @@ _COUNT = struct.Struct("<Q")
 
 
 def has_model(folder: Path) -> bool:
-    """Return whether a folder contains the cameras and images of a COLMAP model."""
+    """Return True if a folder contains the cameras and images of a COLMAP model."""
     return _has(folder, "bin") or _has(folder, "txt")
 
 
