@@ -393,7 +393,7 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
 
 
 def require_checkpoint(folder: Path) -> None:
-    """Refuse a folder that has no trained state yet; nothing is written there.
+    """Refuse a folder that has no trained state yet; nothing is written to the folder.
 
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.

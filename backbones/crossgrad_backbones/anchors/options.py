@@ -115,7 +115,7 @@ def created_codes(scene: Scene, codes: Tensor) -> Parameters:
 
 
 def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> Tensor:
-    """Return the code [C] of a training view during training, and the mean code otherwise.
+    """Return the code [C] of a training view during training, else the mean code.
 
     Scaffold-GS evaluates a held-out view with the code of the training view of the same index.
     The two views have nothing in common, so this implementation uses the mean code instead.

@@ -44,7 +44,8 @@ class Lattice:
         root_cell: [] edge of a cell of level 0, local units.
         fork: [] number of cells of the next level along an edge.
         levels: [] number of levels.
-        distance: [] standard distance D, local units: L* = log_fork(D / distance) is 0 there.
+        distance: [] standard distance D, local units: L* = log_fork(D / distance) is 0 at this
+            distance.
         lead: [] number of levels beyond L* that a camera sees: 0 if L* is rounded down, 1/2 if it
             is rounded to the nearest level, 1 if it is rounded up.
         visible_share: [] anchors that at most this share of the cameras sees are pruned.

@@ -123,7 +123,7 @@ class Backbone(Component):
         """Return the parameters with derived tensors updated.
 
         This is called before the first step and after every topology edit. A backbone that stores
-        derived tensors without gradient (filters, levels) computes them again here.
+        derived tensors without gradient (filters, levels) computes them again in this method.
         """
         return parameters
 

@@ -26,7 +26,8 @@ class Loss(Component):
             render: [H, W, 3] floating point; values may lie outside [0, 1].
             photo: [H, W, 3] uint8 (255 means 1) or floating point, on the render's device.
             mask: [H, W] bool, True where the pixel counts; None if every pixel counts. A pixel that
-                does not count adds nothing to the loss, and the render gets no gradient there.
+                does not count adds nothing to the loss, and the render gets no gradient in this
+                pixel.
             weights: [H, W] float32, not negative: relative weight of each pixel. Only the ratios of
                 the weights have an effect; None gives all pixels equal weight.
         """

@@ -50,7 +50,7 @@ class Metric(Component):
     def described(self) -> Figure:
         """Return the description of the metric with its options; by default `figure`.
 
-        The fields `definition` and `undefined` may depend on the options, the name may not.
+        The fields `definition` and `undefined` may depend on the options, but the name must not.
         """
         return self.figure
 

@@ -22,7 +22,7 @@ PLAN: Final = "plan.json"
 
 @dataclass(frozen=True)
 class Layout:
-    """The paths in a scene folder. A file or folder gets its name only when it is complete.
+    """The paths in a scene folder. A file or folder gets its final name only when it is complete.
 
     Attributes:
         scene: The scene's folder.

@@ -42,7 +42,7 @@ class Watch:
     Attributes:
         layout: Folder of the sweep.
         before: State of each run when the sweep started.
-        ended: Id of a run -> record of its last end since then.
+        ended: Id of a run -> record of its last end since the start of the sweep.
         under_way: The active runs.
     """
 
