@@ -1,6 +1,6 @@
-"""crossgrad from Python: `import crossgrad_core as cg`, `cg.run(...)`, `cg.resume`, `cg.open`.
+"""The Python interface: `import crossgrad_core as cg`, `cg.run(...)`, `cg.resume`, `cg.open`.
 
-Everything is imported when it is first used; docs/python.md shows it at work.
+Each name is imported when it is first used; docs/python.md shows examples.
 """
 
 from importlib import import_module

@@ -5,7 +5,7 @@ from crossgrad_core.system.interrupts import ended_quietly
 
 
 def main() -> None:
-    """Runs the command line; an interrupt is answered before anything large is imported."""
+    """Run the command line; an interrupt is handled before anything large is imported."""
     let_idle_threads_sleep()
     with ended_quietly():
         from crossgrad_core.cli.main import main as command

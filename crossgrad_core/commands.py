@@ -4,7 +4,7 @@ Importing this module is quick. Slow modules (torch, numba) are imported when a 
 called or a class below is accessed, so that a command reports within two seconds that it has
 started. Import this module at the top, call `announce()` first, and import `crossgrad_core.plugin`
 (the types of scenes, models and components) in the modules that do the work. The names listed here
-keep their meaning within a minor version; see docs/plugins.md.
+keep their meaning within a minor version (see docs/plugins.md).
 """
 
 from collections.abc import Mapping
@@ -221,7 +221,7 @@ _LATE: Final = {
 
 
 def __getattr__(name: str) -> object:
-    """Return the class or function of this name; import its module."""
+    """Return the class or function of this name; its module is imported first."""
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, there = _LATE[name].partition(":")
@@ -275,7 +275,7 @@ def configured(settings: Mapping[str, Any]) -> "RunConfig":
 
 
 def chosen(config: "RunConfig") -> "list[tuple[str, ComponentChoice]]":
-    """Return slot and choice of each component that a configuration names.
+    """Return the slot and the choice of each component that a configuration names.
 
     A chain of operators gives one entry for each of its links.
     """
@@ -308,9 +308,9 @@ def fingerprint(scene: "Scene", config: "RunConfig") -> str:
 
 
 def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
-    """Return the scene of a configuration, checked, and the name of the reader that read it.
+    """Return the checked scene of a configuration, and the name of the reader that read it.
 
-    Sets the number of CPU threads first.
+    The number of CPU threads is set first.
 
     Raises:
         UserError: No reader accepts the folder, the reader cannot read it, or the scene contradicts
@@ -326,10 +326,10 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
 
 
 def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
-    """Like `assemble`, but also refuse settings and labels without effect, as a new run does.
+    """Assemble a run like `assemble`, but also refuse settings and labels that have no effect.
 
     Raises:
-        UserError: As `assemble`, or a setting would change nothing.
+        UserError: For the reasons of `assemble`, or because a setting would change nothing.
     """
     from crossgrad_core.recipe import table
     from crossgrad_core.run import assemble as assembling
@@ -344,14 +344,14 @@ def assemble_new(config: "RunConfig", scene: "Scene", reader: str) -> "Setup":
 
 
 def resolved(setup: "Setup") -> dict[str, Any]:
-    """Return the configuration that a run writes: components with all options, as plain data."""
+    """Return the configuration that a run writes: plain data with all options of all components."""
     from crossgrad_core.run import resolve
 
     return resolve.resolved(setup).model_dump(mode="json")
 
 
 def available_cores() -> tuple[int, ...]:
-    """Return the numbers of the cores that this process may use, at most its container's quota."""
+    """Return the cores that this process may use, limited by the quota of its container."""
     import os
 
     from crossgrad_core.system import cores
@@ -371,9 +371,9 @@ def available_memory() -> int | None:
 
 
 def summary_of(folder: Path) -> dict[str, Any] | None:
-    """Return the content of a run's summary.json; None if missing or damaged.
+    """Return the content of a run's summary.json; None if the file is missing or damaged.
 
-    Imports no torch.
+    This function does not import torch.
     """
     from crossgrad_core.run.results.summary import FILE as SUMMARY
     from crossgrad_core.run.results.summary import read_summary
@@ -396,7 +396,7 @@ def with_steps(setup: "Setup", steps: int) -> "Setup":
 def affordable_steps(setup: "Setup", seconds: float) -> int:
     """Return how many steps fit into `seconds` of training.
 
-    The kernels are compiled first; this time does not count.
+    The kernels are compiled first; the time for compiling does not count.
 
     Raises:
         TrainingFailedError: The trial steps failed.

@@ -32,13 +32,13 @@ _RENAMED: Final = {"views": "views_per_step"}
 
 
 def current_name(setting: str, beside: Container[str] = ()) -> str:
-    """Return the present name of a setting; if `beside` contains that name, keep the old name."""
+    """Return the present name of a setting; keep the old name if `beside` contains the new one."""
     new = _RENAMED.get(setting, setting)
     return setting if new in beside else new
 
 
 class ComponentChoice(BaseModel):
-    """A component by name with its options; the component itself validates the options."""
+    """The name of a component and its options, which the component itself validates."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
@@ -338,7 +338,7 @@ class RunConfig(BaseModel):
     @field_validator("rules", mode="before")
     @classmethod
     def _rules(cls, value: object) -> object:
-        """Return the options of each rule; `true` or no value means a rule with its defaults."""
+        """Return the options of each rule; `true` or an empty value selects a rule's defaults."""
         if not isinstance(value, Mapping):
             return value
         return {name: {} if each in (True, None) else each for name, each in value.items()}

@@ -1,4 +1,4 @@
-"""The plugins that the core names: the defaults of a run, and examples in help and in messages.
+"""The plugins that the core names: the defaults of a run, and examples in help texts and messages.
 
 No other file of the core names a plugin.
 """

@@ -16,8 +16,8 @@ class UserError(Exception):
     Args:
         what: The problem, as a sentence without a full stop.
         where: The file, option or plugin concerned.
-        expected: The value that would have been right.
-        found: The value that was there instead.
+        expected: The value that would have been correct.
+        found: The value that was found instead.
         todo: The next step for the user.
     """
 
@@ -56,10 +56,13 @@ class IncompatibleSelectionError(UserError):
 
 
 class RunFailedError(Exception):
-    """Training failed; raised by `crossgrad_core.run` and `resume`. Existing results are kept.
+    """Training failed; the functions `crossgrad_core.run` and `resume` raise this error.
+
+    Existing results are kept.
 
     Args:
-        folder: The run's folder: results so far, log.txt, and checkpoints to continue from.
+        folder: The run's folder, with the results so far, log.txt, and checkpoints to continue
+            from.
         error: The reason of the failure.
     """
 

@@ -1,6 +1,6 @@
 """The public API for plugin authors: everything that a plugin needs, in one module.
 
-The names in `__all__` keep their meaning within a minor version; see docs/plugins.md.
+The names in `__all__` keep their meaning within a minor version (see docs/plugins.md).
 """
 
 from pydantic import Field

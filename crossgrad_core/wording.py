@@ -1,4 +1,4 @@
-"""Small pieces of error messages. Imports nothing heavy."""
+"""Small pieces of error messages. This module imports nothing heavy."""
 
 import re
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ _UNSHOWABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u206
 
 
 def showable(text: str) -> str:
-    """Return text in a form that a terminal can show; line feeds stay."""
+    """Return text in a form that a terminal can show; line feeds are kept."""
     return _UNSHOWABLE.sub(lambda match: ascii(match.group())[1:-1], text)
 
 
@@ -40,7 +40,7 @@ def count(number: int, noun: str) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return names as `a, b, c`; `none` if there are no names."""
+    """Return names as `a, b, c`; `none` without names."""
     return ", ".join(names) or "none"
 
 

@@ -17,9 +17,10 @@ PIXEL_VARIANCE = 1.0 / 12.0
 
 
 class AnalyticSplatting(Vanilla):
-    """The 3DGS representation, rendered with the response `analytic` and without dilation.
+    """The 3DGS representation, rendered with the pixel response `analytic` and without dilation.
 
-    Source: Analytic-Splatting, methods of section 4; its optional filters are left out.
+    Source: Analytic-Splatting, methods of section 4; the optional filters of the paper are not
+    implemented.
     """
 
     response: ClassVar[Response] = "analytic"

@@ -23,18 +23,19 @@ def as_plain(
     """Convert Gaussians so that plain rendering gives the same image as their own response.
 
     A response adds the variance `blur` to the 2-D covariance S and preserves the volume, that is
-    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. The difference is
-    subtracted from the 3-D variances beforehand; at depth z a pixel is z / f local units wide. With
-    S' for the reduced S, the opacity is multiplied by sqrt(det S / det(S' + dilation)), the ratio
-    of footprints.
+    opacity times sqrt(det S). A viewer's dilation is larger than `blur`. The difference between
+    both values is subtracted from the 3-D variances beforehand; at depth z, a pixel is z / f local
+    units wide. With S' for the reduced S, the opacity is multiplied by sqrt(det S / det(S' +
+    dilation)), the ratio of footprints.
 
-    The size uses the camera with the finest pixels at a Gaussian. The opacity uses the camera with
-    the largest ratio. Means over the cameras would make Gaussians too thin and too faint if they
-    are near some cameras and far from others. A Gaussian that no camera sees is unchanged.
+    The 3-D variances are computed for the camera with the finest pixels at a Gaussian. The opacity
+    is computed for the camera with the largest ratio. Means over the cameras would make Gaussians
+    too thin and too faint if they are near some cameras and far from others. A Gaussian that no
+    camera sees is unchanged.
 
     Args:
         gaussians: Gaussians of another response.
-        cameras: One or more.
+        cameras: The cameras, at least one.
         blur: px^2.
         near: Near plane, local units.
     """

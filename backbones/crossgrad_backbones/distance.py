@@ -34,11 +34,11 @@ LEAST_SPREAD = 1e-6
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A tensor of vanilla that depends on the camera distance.
+    """A tensor of the vanilla backbone that depends on the camera distance.
 
     Attributes:
-        weights: Name of its weights [N, ..., 2].
-        base: The block to which the weights add.
+        weights: Name of the tensor of weights [N, ..., 2].
+        base: The block to which the weighted terms are added.
         shape: Shape of a primitive's weights; the product with D broadcasts to the base's shape.
     """
 
@@ -128,13 +128,13 @@ class DistanceConditioned(Vanilla):
     """The 3DGS representation with scales, opacities and colours linear in D = (z, z^2).
 
     z is the logarithm of the camera's distance from the mean training camera, standardised. Each
-    Gaussian adds w . D to its log scales (the same to all three), to its opacity logit and to each
-    coefficient of SH band 0, with separate weights w. The weights start at 0, so that the model
-    equals vanilla bit for bit. Two penalties on the weights grow linearly over the run: their
-    squared length, and the squared derivative by z of the terms that they add. Blocks: the blocks
-    of vanilla, `distance_scales` [N, 1, 2], `distance_opacities` [N, 2], `distance_f_dc`
-    [N, 1, 3, 2], and `distances` [7]. Source: the paper, Distance-Conditioned Attributes; encoding
-    and default values are ours.
+    Gaussian adds w . D to its log scales (the same term for all three scales), to its opacity logit
+    and to each coefficient of SH band 0, with separate weights w for each of them. The weights
+    start at 0, so that the model equals vanilla bit for bit. Two penalties on the weights grow
+    linearly over the run: their squared length, and the squared derivative by z of the terms that
+    they add. Blocks: the blocks of vanilla, `distance_scales` [N, 1, 2], `distance_opacities` [N,
+    2], `distance_f_dc` [N, 1, 3, 2], and `distances` [7]. Source: the paper, Distance-Conditioned
+    Attributes; the encoding and the default values were chosen for crossgrad.
     """
 
     plain: ClassVar[bool] = False
@@ -215,7 +215,7 @@ class DistanceConditioned(Vanilla):
     def _seen_from(
         self, parameters: Mapping[str, Tensor], cameras: Sequence[Camera]
     ) -> dict[str, Tensor]:
-        """Return vanilla's parameters for the mean encoding of these cameras."""
+        """Return the parameters of vanilla for the mean encoding of these cameras."""
         encoding = encoded(parameters[SCALE], cameras).to(parameters["means"])
         sums = {
             each.base: parameters[each.base] + added(parameters[each.weights], encoding)

@@ -41,14 +41,14 @@ def filter_widths(means: Tensor, cameras: Sequence[Camera], near: float, *, pari
     """Return the standard deviation [N] of each Gaussian's filter, local units.
 
     The value is sqrt(VARIANCE) z / f, the minimum over the cameras that see the mean. Gaussians
-    that no camera sees get the largest width of all other Gaussians (0 without other Gaussians).
+    that no camera sees get the largest width among all other Gaussians (0 if there are no others).
 
     Args:
         means: [N, 3] local units.
         cameras: The training cameras.
         near: Near plane, local units.
-        parity: Divide the least depth by the longest focal length of all cameras, even if another
-            camera sees the Gaussian, as the published code does.
+        parity: Divide the least depth by the longest focal length of all cameras, as the published
+            code does, even if that camera does not see the Gaussian.
     """
     focal = max(camera.fx for camera in cameras) if parity else None
     finest = finest_pixels(means, cameras, near, focal)
@@ -120,7 +120,7 @@ DILATION = 0.1
 
 
 class MipSplatting(Vanilla):
-    """The 3DGS representation, filtered so that no Gaussian is finer than the photos resolve.
+    """The 3DGS representation with a filter, so that no Gaussian is finer than the photos resolve.
 
     Blocks: the blocks of vanilla, and `filter` [N], the standard deviation of each Gaussian's 3-D
     filter, which is derived from the training cameras and has no gradient. Density control uses the
@@ -185,7 +185,7 @@ class MipSplatting(Vanilla):
 
     @override
     def capped_opacities(self, parameters: Mapping[str, Tensor], cap: float) -> Tensor:
-        """Cap the filtered opacity, and divide the filter's factor out again."""
+        """Cap the filtered opacity, then divide by the filter's factor to get the stored value."""
         kept = kept_opacity(parameters["scales"], parameters["filter"])
         # If an opacity of 1 stays below the cap, the logit is infinite, so there is no limit.
         limit = torch.logit((cap / kept).clamp(max=1.0))
@@ -201,7 +201,8 @@ class MipSplatting(Vanilla):
 def renews(schedule: Schedule, step: int) -> bool:
     """Return True if the filter is recomputed after a step without an edit.
 
-    As published: every 100 of 30,000 steps after density control ends, until 100 before the end.
+    As published, it is recomputed every 100 of 30,000 steps between the end of density control and
+    100 steps before the end.
     """
     every = max(1, schedule.lr_until // 300)
     last = schedule.counted(schedule.total) - every

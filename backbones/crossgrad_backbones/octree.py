@@ -29,10 +29,10 @@ from crossgrad_core.plugin import (
 
 
 def opening_steps(span: float, count: int, factor: float) -> tuple[float, ...]:
-    """Return the steps at which `count` further levels open, the last at `span`.
+    """Return the steps at which `count` further levels open; the last level opens at `span`.
 
-    The time between openings shrinks by `factor` each time: a geometric series with the first term
-    span (1 - q) / (1 - q^count), q = 1 / factor.
+    The time between two openings shrinks by `factor`: a geometric series with the first term span
+    (1 - q) / (1 - q^count), q = 1 / factor.
     """
     q = 1.0 / factor
     terms = [q**i for i in range(count)]
@@ -97,22 +97,22 @@ def init_anchors(points: NDArray[np.float64], lattice: Lattice, *, everywhere: b
 
 
 def _parted(coarser: NDArray[np.int64], site: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return a mask [P]: True if the points of a point's coarser site are on several finer sites.
+    """Return a mask [P]: True if the points in a point's coarser site are on several finer sites.
 
     Args:
         coarser: [P] index of each point's site on the level before.
-        site: [P] index of its site on this level.
+        site: [P] index of each point's site on this level.
     """
     pairs = np.unique(np.stack([coarser, site], axis=1), axis=0)
     return np.bincount(pairs[:, 0])[coarser] > 1
 
 
 def visible_share(shares: Tensor, asked: float) -> float:
-    """Return the pruning threshold: anchors seen by a larger share of the cameras stay.
+    """Return the pruning threshold; an anchor stays if more than this share of the cameras sees it.
 
     Args:
         shares: [A] share of the cameras that see the level of each anchor.
-        asked: The option; a negative value selects the mean share of all anchors.
+        asked: The value of the option; a negative value selects the mean share of all anchors.
     """
     return float(shares.mean()) if asked < 0.0 else asked
 
@@ -185,7 +185,7 @@ class Octree(AnchorBackbone):
 
     @override
     def fitted_to(self, scene: Scene) -> tuple["Octree", tuple[str, ...]]:
-        """Note that anchors that repeat a coarser anchor are left out."""
+        """Add a note that anchors which repeat a coarser anchor are left out."""
         if self.plant_everywhere:
             return self, ()
         note = (
@@ -251,7 +251,7 @@ class Octree(AnchorBackbone):
     def bake(
         self, parameters: Mapping[str, Tensor], phase: Phase, cameras: Sequence[Camera]
     ) -> Gaussians:
-        """Bake like the base class, without the anchors whose level no camera uses."""
+        """Bake like the base class, but omit anchors whose level no camera uses."""
         used = torch.stack([self.used(parameters, c, phase).mask for c in cameras]).any(0)
         names = {name for block in self.blocks() if block.per_primitive for name in block.tensors}
         rows = {n: t[used] if n in names else t for n, t in parameters.items()}

@@ -1,4 +1,4 @@
-"""Pixel-GS: the Gaussians of 3DGS with density control by pixels (Zhang et al. 2024)."""
+"""Pixel-GS: the Gaussians of 3DGS with density control that counts pixels (Zhang et al. 2024)."""
 
 from collections.abc import Mapping
 from typing import ClassVar

@@ -49,7 +49,7 @@ class Vanilla(Backbone):
     lr_f_rest: float = Field(2.5e-3 / 20, ge=0, description="learning rate of the higher SH bands")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.sh_degree > 0:
             return {}
         return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave it out"}
@@ -80,8 +80,8 @@ class Vanilla(Backbone):
     def fitted_to(self, scene: Scene) -> tuple["Vanilla", tuple[str, ...]]:
         """Leave out spherical-harmonics bands that the number of views cannot support.
 
-        A Gaussian is seen from at most as many directions as there are training views. A band
-        improves the result only if there are at least as many views as coefficients.
+        A Gaussian is seen from at most as many directions as there are training views. A band can
+        improve the result only if there are at least as many views as coefficients.
         """
         if "sh_degree" in self.model_fields_set:
             return self, ()

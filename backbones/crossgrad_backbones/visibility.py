@@ -1,4 +1,4 @@
-"""Visibility of Gaussians in cameras by their centres, and the size of a pixel there."""
+"""Visibility of Gaussians by their centres, and the size of a pixel at each centre."""
 
 from collections.abc import Sequence
 
@@ -47,8 +47,9 @@ def depths_in_view(
 def _affine(columns: tuple[Tensor, Tensor, Tensor], row: Tensor) -> Tensor:
     """Return one coordinate [N] of transformed points.
 
-    It is computed element by element. A matrix product may round a row differently at another
-    position, and values of a primitive must not change if other primitives are added or removed.
+    The coordinate is computed element by element. A matrix product may round a row differently at
+    another position, and values of a primitive must not change if other primitives are added or
+    removed.
     """
     x, y, z = columns
     a, b, c, d = row.tolist()

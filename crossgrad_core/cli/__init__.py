@@ -1,1 +1,1 @@
-"""The command line. Its modules import nothing heavy until a command runs."""
+"""The command line. The modules of the command line import nothing heavy until a command runs."""

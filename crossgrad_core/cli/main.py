@@ -81,7 +81,7 @@ def _plain(error: typer.BadParameter) -> str:
 
 
 class PluginCommand(TyperCommand):
-    """A placeholder for a command of a plugin until it is called."""
+    """A placeholder for a plugin command; the command is imported when it is called."""
 
     def __init__(self, entry: registry.Entry) -> None:
         super().__init__(entry.name, callback=None, short_help=summary(entry))
@@ -90,7 +90,7 @@ class PluginCommand(TyperCommand):
     def make_context(
         self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: Any
     ) -> "Context":
-        """Return the context of the command itself; import the command first.
+        """Return the context of the plugin's command, which is imported first.
 
         Raises:
             UserError: Several packages offer the name, or the command cannot be imported.

@@ -1,4 +1,4 @@
-"""`crossgrad run`: train, evaluate, export. Its options are made from the schema of a run."""
+"""`crossgrad run`: train, evaluate, export. The options are generated from the schema of a run."""
 
 from collections.abc import Callable, Iterator, Mapping
 from inspect import Parameter, Signature
@@ -30,7 +30,8 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
         given: Option name -> value; None, False and empty lists if the user did not give it.
 
     Raises:
-        UserError: There are such options; the message names them as the user typed them.
+        UserError: The resumed run would ignore an option; the message names the option as the user
+            typed it.
     """
     typed = list(_typed(given))
     if typed:

@@ -19,8 +19,8 @@ def outlast_readers() -> None:
     """Make stdout and stderr ignore failed writes, and escape characters that are not plain text.
 
     Otherwise a closed pipe (`| head`), a lost terminal or a full disk would end hours of training
-    at the next progress line. A folder name that the terminal's encoding lacks would do the same.
-    The messages of a run are also in its log.txt.
+    at the next progress line. A folder name with characters outside the terminal's encoding would
+    do the same. The messages of a run are also in its log.txt.
     """
     _occupy()
     sys.stdout = _lasting(sys.stdout)
@@ -54,7 +54,10 @@ def _occupy() -> None:
 
 
 def _lasting(stream: TextIO | None) -> TextIO:
-    """Return a stream over the same file that never fails; other kinds (a Windows console) stay."""
+    """Return a stream to the same file that never fails.
+
+    Streams of other kinds (a Windows console) are returned unchanged.
+    """
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")
     if not isinstance(stream, io.TextIOWrapper):

@@ -169,7 +169,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
 
 
 def _check_together(option: tuple[str, object], other: tuple[str, object], why: str) -> None:
-    """Refuse an option that would do nothing together with another one."""
+    """Refuse an option that would have no effect together with another option."""
     if option[1] is not None and other[1] is not None:
         raise UserError(
             f"{option[0]} does nothing beside {other[0]}: {why}",

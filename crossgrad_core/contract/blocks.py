@@ -17,14 +17,14 @@ Parameters: TypeAlias = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class LearningRate:
-    """A log-linear learning rate from `initial` to `final` over the schedule's length; 0 stays 0.
+    """A log-linear learning rate from `initial` to `final` over the schedule; a rate of 0 stays 0.
 
     Attributes:
         initial: Rate at the first step.
         final: Rate at the end of the schedule; None means `initial`.
         few_passes: Factor for this rate in a run with few passes over the photos
             (docs/schedules.md), in addition to the factors for all rates of the backbone.
-            Positive.
+            The factor must be positive.
 
     Source: 3DGS; lr(t) = exp((1-u) ln a + u ln b), u = clip(t / T, 0, 1).
     """
@@ -34,7 +34,7 @@ class LearningRate:
     few_passes: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check that a schedule can follow the rates.
+        """Check that the rates are valid for a schedule.
 
         Raises:
             ValueError: A rate is negative or not finite, or decays to 0, or `few_passes` is not
@@ -50,7 +50,7 @@ class LearningRate:
 
     @property
     def decays(self) -> bool:
-        """Whether the rate changes over the schedule."""
+        """True if the rate changes over the schedule."""
         return self.final is not None and self.initial not in {0.0, self.final}
 
     def at(self, progress: float) -> float:
@@ -67,14 +67,14 @@ class Block:
 
     Attributes:
         name: Name of the block.
-        tensors: Names of its tensors in `Parameters`. A block with one tensor uses the tensor's
-            name.
+        tensors: Names of the block's tensors in `Parameters`. A block with one tensor uses the
+            tensor's name.
         per_primitive: True if the first dimension of every tensor is the number of primitives.
         kind: Geometry, appearance or neutral (for granularity `kind` and per-block dispatch).
         lr: Learning rate of all its tensors. 0 freezes the block: its tensors get no gradient, may
             have any type, and are used in topology edits and checkpoints only.
-        rests: True if its tensors are details of the colour, such as spherical harmonics of higher
-            degrees, that need not learn in every step.
+        rests: True if the block's tensors hold details of the colour, such as spherical harmonics
+            of higher degrees, that need not learn in every step.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Block:
     rests: bool = False
 
     def __post_init__(self) -> None:
-        """Check the fields early, before an error would appear later in training.
+        """Check the fields here, so that an error does not appear only during training.
 
         Raises:
             ValueError: The kind is not one of `BlockKind`.
@@ -99,7 +99,7 @@ class Block:
 
     @property
     def frozen(self) -> bool:
-        """Whether training leaves the block unchanged."""
+        """True if training leaves the block unchanged."""
         return self.lr.initial == 0.0
 
 
@@ -122,14 +122,15 @@ Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | Non
 class PluginState:
     """The state of one plugin between steps.
 
-    Its size must not depend on the number of steps, because every checkpoint contains it. Store
-    sums, or a window of at most 1,000 steps.
+    The size of the state must not depend on the number of steps, because every checkpoint contains
+    the state. Store sums, or a window of at most 1,000 steps.
 
     Attributes:
         values: Plain numbers, strings, lists and dictionaries (must survive JSON).
         tensors: Tensors of any shape.
-        per_primitive: Tensors whose first dimension is the number of primitives. Topology edits
-            gather their rows together with the parameters (rows of new primitives start at zero).
+        per_primitive: Tensors whose first dimension is the number of primitives. A topology edit
+            gathers the rows of these tensors together with the parameters (rows of new primitives
+            start at zero).
     """
 
     values: Mapping[str, Json] = field(default_factory=dict)
@@ -196,8 +197,8 @@ class Rows:
 class Edit:
     """A change of the set of primitives and of their values.
 
-    New primitive j copies every per-primitive row of old primitive `source[j]`: parameters,
-    optimizer moments, statistics. This single gather can duplicate, split, relocate, remove and
+    New primitive j copies all per-primitive rows of old primitive `source[j]`: parameters,
+    optimizer moments and statistics. This single gather can duplicate, split, relocate, remove and
     append primitives. `fresh` marks rows that start with zero moments and statistics.
 
     Attributes:
@@ -214,12 +215,12 @@ class Edit:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the edit changes nothing and counts nothing."""
+        """True if the edit changes nothing and counts nothing."""
         return self.keeps_rows and not self.values and not self.counts
 
     @property
     def keeps_rows(self) -> bool:
-        """Whether all primitives stay and no row is fresh."""
+        """True if all primitives stay and no row is fresh."""
         return self.source is None and self.fresh is None
 
 
@@ -228,7 +229,7 @@ NO_EDIT = Edit()
 
 
 def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Tensor]) -> str:
-    """Return a description of what in an edit does not fit the parameters; empty if all fits."""
+    """Return the reason why an edit does not fit the parameters; empty if it fits."""
     before = primitives_of(blocks, parameters)
     if wrong := _no_set(edit, before):
         return wrong
@@ -388,11 +389,12 @@ class AdamRule:
 
         Args:
             views: K, at most `MOST_VIEWS`.
-            age: Number of steps that would draw the run's views with K views each, divided by the
-                run's number of steps; not 1 if K changed.
+            age: Number of steps that would render the run's views with K views each, divided by the
+                run's number of steps; it differs from 1 only if K changed.
             betas: Decays with one view per step.
 
-        Source: gsplat; Malladi et al. 2022 (square-root scaling), K views for K batches.
+        Source: gsplat; Malladi et al. 2022 (square-root scaling), with K views in place of K
+        batches.
         """
         first, second = (max(0.0, 1.0 - views * (1.0 - beta)) for beta in betas)
         return cls((first, second), EPS / sqrt(views), age)

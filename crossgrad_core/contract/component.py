@@ -18,10 +18,10 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 class Component(BaseModel):
-    """Base class of everything that fills a slot.
+    """Base class of all components; a component fills a slot.
 
-    The fields are the options (typed, bounded, documented). A component never stores running state;
-    the state is passed in and returned as `PluginState`.
+    The fields are the options (typed, bounded, documented). A component never stores the state of a
+    run; the state is passed in and returned as `PluginState`.
 
     Attributes:
         slot: The slot that the component fills; set by the slot's base class.
@@ -86,7 +86,7 @@ class ViewCounts:
     Attributes:
         minimum: Smallest K.
         maximum: Largest K; None for any.
-        multiple_of: K must be a multiple of this.
+        multiple_of: Number of which K must be a multiple.
     """
 
     minimum: int = 1

@@ -53,7 +53,7 @@ class RenderedView:
         view: The view.
         camera: The camera of the render: the view's camera, resized if `scale` is not 1.
         scale: Side length of the render divided by the side length of the photo as trained.
-        gaussians: The Gaussians that were drawn.
+        gaussians: The Gaussians that were rendered.
         screen: Screen statistics in pixels of the render, with gradients if a backward pass has
             run. `contract.screen_statistics` converts them to units of the full photo.
         image: [H, W, 3] the image that is compared with the photo: the render after exposure.
@@ -90,7 +90,9 @@ class ViewRecord(RenderedView):
 
 @dataclass(frozen=True)
 class StepRecord:
-    """The record of a step. Observers receive it; samplers receive the record of the last step.
+    """The record of a step.
+
+    Observers receive this record; samplers receive the record of the previous step.
 
     Attributes:
         step: 1-based number of the step.
@@ -169,7 +171,7 @@ class RenderOnRequest(Protocol):
 
 
 def no_renders(*_asked: object, **_named: object) -> RequestedRender:
-    """Raise RuntimeError: the default for contexts that cannot render views."""
+    """Raise a RuntimeError; this is the default for contexts that cannot render views."""
     raise RuntimeError("this context belongs to no run: there is nothing to render views with")
 
 
@@ -193,7 +195,7 @@ class StepContext:
         states: State of every plugin by the plugin's name; read only.
         rng: The random generator of the hook. Every random number of a plugin must come from it.
         photo: Returns the photo and the mask of a view on the run's device. The time for decoding
-            counts as loading time; `view.photo` would decode in training time.
+            then counts as loading time; with `view.photo` it would count as training time.
     """
 
     step: int
@@ -288,10 +290,10 @@ class AggregateContext(StepContext):
 
     @property
     def separate(self) -> SeparateGradients:
-        """The separate gradients of each view.
+        """The gradients of each view, kept separate.
 
         Raises:
-            TypeError: The gradients were accumulated, because no plugin needs separate gradients.
+            TypeError: The gradients were accumulated because no plugin requires separate gradients.
         """
         if isinstance(self.gradients, SeparateGradients):
             return self.gradients
@@ -328,7 +330,7 @@ class DensifyContext(StepContext):
         backbone: The backbone.
         rasterizer: The rasterizer, for statistics of views that this step did not render.
         views: The rendered views of the step with their screen statistics.
-        share: Number of `views` divided by the number of all views of the step; 1 unless
+        share: Number of `views` divided by the number of all views of the step; it is 1 unless
             `--densify-views` changes it.
         means_lr: Current learning rate of the primitives' positions.
         room: How many primitives may still be added (`--max-gaussians`, memory guard).
@@ -356,7 +358,7 @@ class AfterStepContext(StepContext):
         parameters: The parameters. Only the returned edit may change them.
         backbone: The backbone.
         means_lr: Current learning rate of the primitives' positions.
-        edited: Whether density control has already changed the set of primitives in this step.
+        edited: True if density control has already changed the set of primitives in this step.
     """
 
     parameters: Mapping[str, Tensor]
@@ -419,7 +421,7 @@ class DensifyResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """The run at its start, for observers.
+    """The facts about a run at its start, for observers.
 
     Attributes:
         folder: The output folder; None if nothing is written.
@@ -442,7 +444,9 @@ class RunInfo:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The model between two steps, for plugins that measure it. Nothing in it may be changed.
+    """The model between two steps, for plugins that measure it.
+
+    Plugins must not change any of its contents.
 
     Attributes:
         phase: The phase in which training decodes; `phase.step` is the last complete step.
@@ -505,11 +509,12 @@ class OperatorContext:
         present: [B, K] bool, views whose gradient of the block is finite and not zero. The rows and
             columns of all other views are zero in the Gramian; an operator must give these views
             weight 0.
-        unit: Unit roundoff of the gradients' type. No result needs a smaller relative error.
+        unit: Unit roundoff of the gradients' type. A relative error smaller than the unit roundoff
+            is not required.
         rounding_residuals: Computes [B, K, K], the parts of the Gramians that rounding to float64
-            removed. Gramian plus residual gives twice the digits. This needs another, slower pass
-            over the gradients; it is for Gramians so close to singular that their rounding affects
-            the result. None if unknown.
+            removed. Gramian plus residual gives twice the digits. The computation needs another,
+            slower pass over the gradients; it is meant for Gramians that are so close to singular
+            that rounding affects the result. None if no residuals can be computed.
         scales: K scales at which losses and gradients were computed; empty if all are 1.
     """
 

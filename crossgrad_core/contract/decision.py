@@ -1,4 +1,4 @@
-"""One row of the table of decided settings, and the length of the run that it depends on."""
+"""One row of the table of decided settings, and the run length on which decisions depend."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ class Decision:
 
     Attributes:
         setting: A setting of a run, or an option of a component, such as `densifier.division`.
-        value: Its value.
+        value: The value of the setting.
         because: The reason, in a few words.
         evidence: The facts or the results that support the reason.
         override: The option that sets another value; empty if the value is the published one, which
@@ -30,7 +30,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Length:
-    """The length of a run as far as decisions depend on it.
+    """The run length, as far as decisions depend on it.
 
     Attributes:
         planned: Steps that the run was planned with.
@@ -48,5 +48,5 @@ Decide: TypeAlias = Callable[[Length], tuple[Decision, ...]]
 
 
 def repeats(_: Length) -> tuple[Decision, ...]:
-    """Return the empty table of a run that repeats another run: no setting is left to decide."""
+    """Return the empty table of decisions for a run that repeats another run."""
     return ()

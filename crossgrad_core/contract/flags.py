@@ -18,11 +18,11 @@ class Flag:
     """The command-line option of a setting; type and help text come from the field.
 
     Attributes:
-        metavar: The placeholder for its value in the help text.
+        metavar: The placeholder for the option's value in the help text.
         heading: Heading under which the help text lists the option, one of `HEADINGS`; empty for
             an argument.
-        name: Its name without dashes, if it differs from the name of the setting.
-        common: True if `--help` shows it; `--help-all` shows every option.
+        name: Name of the option without dashes, if it differs from the name of the setting.
+        common: True if `--help` shows the option; `--help-all` shows every option.
     """
 
     metavar: str

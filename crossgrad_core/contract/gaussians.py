@@ -16,11 +16,12 @@ _FLOATS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest"
 
 @dataclass(frozen=True)
 class OnDemand:
-    """Tensors whose rows are updated on demand: only requested rows are up to date.
+    """Tensors whose rows are updated on demand; a row is up to date only after a request.
 
     Attributes:
         fields: The fields of the Gaussians that contain these tensors.
-        bring: Updates rows in place; its argument is [R] int32 rows, each once, or None for all.
+        bring: Updates rows in place; its argument is [R] int32 rows without duplicates, or None for
+            all rows.
     """
 
     fields: frozenset[str]
@@ -89,7 +90,7 @@ class Gaussians:
         return self.mapped(torch.Tensor.detach)
 
     def misfit(self) -> str | None:
-        """Return the first misfit, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
+        """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
         if (self.colors is None) == (self.sh_dc is None):
             return "both or none of colors and sh_dc are given"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree
@@ -115,14 +116,14 @@ class Gaussians:
         return None
 
     def whole(self) -> "Gaussians":
-        """Return the same Gaussians for code that does not support rows on demand."""
+        """Return the same Gaussians with all rows up to date, for code without on-demand rows."""
         return self if self.on_demand is None else _Whole(**vars(self))
 
 
 class _Whole(Gaussians):
     """Gaussians that update all rows of a tensor when the tensor is read.
 
-    Every kind of copy is a plain `Gaussians` object whose rows are all up to date.
+    Every kind of copy gives a plain `Gaussians` object whose rows are all up to date.
     """
 
     @override
@@ -149,28 +150,28 @@ class _Whole(Gaussians):
 class Screen:
     """Per-Gaussian screen statistics of one render.
 
-    The gradient fields are None until the render's backward pass has run.
+    The gradient fields are None before the backward pass of the render.
 
     Attributes:
         radii: [N] int32, pixels; 0 if the Gaussian touches no pixel.
         pixels: [N] int32, pixels in which the Gaussian was blended; None unless requested.
         mean_gradient: [N, 2] gradient of the loss by the projected mean, per pixel unit.
-        abs_gradient: [N, 2] the same gradient with absolute values summed over pixels; None unless
-            requested.
+        abs_gradient: [N, 2] like `mean_gradient`, but with the absolute values summed over the
+            pixels; None unless requested.
         directions: [N, 6, 5] the pixels' gradients by the projected mean, in 6 bins along the
             longest axis; None unless requested. The axis is the axis of the largest scale (the
-            first one of equal scales), projected to the image plane. Let a be the undilated
-            projection of one standard deviation along it. A pixel whose centre has the offset d
-            from the projected mean is at t = d . a / |a|^2, or at t = 0 if a is shorter than
-            1e-6 px. The upper ends of the bins are -2, -1, 0, 1, 2 and infinity. Each bin contains
-            5 numbers of its pixels whose gradient is not 0: the sum of the directions (x and y;
-            unit vectors of the gradient in NDC units, that is times width and height), the sums of
-            |x| and |y| of the gradient itself (per pixel unit; summed over all bins they are
-            `abs_gradient`), and the number of these pixels.
+            first one of equal scales), projected to the image plane. Let a be the projection,
+            without dilation, of one standard deviation along this axis. A pixel whose centre has
+            the offset d from the projected mean is at t = d . a / |a|^2, or at t = 0 if a is
+            shorter than 1e-6 px. The upper ends of the bins are -2, -1, 0, 1, 2 and infinity. Each
+            bin contains 5 numbers of its pixels whose gradient is not 0: the sum of the directions
+            (x and y; unit vectors of the gradient in NDC units, that is times width and height),
+            the sums of |x| and |y| of the gradient itself (per pixel unit; summed over all bins
+            they are `abs_gradient`), and the number of these pixels.
         count: [H, W] bool -> [N] int32, in how many of these pixels the Gaussian was blended; None
-            unless requested. It keeps the data of the render alive that it needs.
+            unless requested. The function keeps the data of the render in memory that it needs.
         rows: [R] int64, sorted; contains every Gaussian with a radius above 0. None if the
-            rasterizer gives no such list.
+            rasterizer provides no such list.
     """
 
     radii: Tensor

@@ -35,7 +35,7 @@ class Gradients(ABC):
         """Return [B, K], True for views whose gradient of the block is finite."""
 
     def is_judged(self, name: str, gradient: Tensor) -> bool:
-        """Return True if this gradient tensor object is known to be finite and needs no new check.
+        """Return True if this gradient tensor is already known to be finite and needs no check.
 
         Args:
             name: Name of the parameter tensor.
@@ -50,11 +50,12 @@ class Gradients(ABC):
         The bits are the same as with accumulation in the backward passes.
 
         Args:
-            divisor: The sums are divided by this number; K gives the mean without a further pass.
+            divisor: The sums are divided by this number; with K the result is the mean, without a
+                further pass over the data.
 
         Returns:
             Tensor name -> sum; None for tensors that no view touches, or whose views are all
-            non-finite. Sparse, with sorted rows, if the views' gradients are sparse
+            non-finite. The sums are sparse, with sorted rows, if the views' gradients are sparse
             (`Gaussians.on_demand`).
         """
 
@@ -111,7 +112,7 @@ class SeparateGradients(Gradients):
 
         Returns:
             Tensor name -> sum; None for tensors that no view touches, or whose views are all
-            non-finite. Sparse if the result of `total` is sparse.
+            non-finite. The sums are sparse if the result of `total` is sparse.
         """
 
     @abstractmethod

@@ -24,7 +24,7 @@ _NARROW: Final = 1e-12
 class MatrixOperator(Operator):
     """An operator that replaces the K gradients G of each block by M G and adds the rows of M G.
 
-    It can be a link of a chain and can be used for single blocks.
+    Such an operator can be a link of a chain and can be used for single blocks.
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -37,7 +37,7 @@ class MatrixOperator(Operator):
         state: PluginState,
         rng: np.random.Generator,
     ) -> tuple[NDArray[np.float64], PluginState]:
-        """Return the matrices M.
+        """Return the matrices M for the gradients of each block.
 
         Args:
             gramians: [B, K, K] float64, symmetric positive semi-definite up to rounding.
@@ -61,8 +61,9 @@ class GramianOperator(MatrixOperator):
     """An operator whose matrices depend on the Gramians.
 
     Attributes:
-        granularity: Extent of one Gramian: each block's tensors, all geometry / all appearance
-            blocks, all blocks, or each Gaussian's row of a block.
+        granularity: The parts of the gradient that share one Gramian: each block, all geometry
+            blocks and all appearance blocks, all blocks together, or each Gaussian's row of a
+            block.
     """
 
     sparse_rows: ClassVar[bool] = True
@@ -112,7 +113,7 @@ class Weighting(GramianOperator):
 
 
 def diagonals(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return diagonal matrices [B, K, K] that apply one weight of `weights` [B, K] per gradient."""
+    """Return diagonal matrices [B, K, K] whose diagonals are the weights [B, K]."""
     blocks, views = weights.shape
     matrices = np.zeros((blocks, views, views))
     matrices.reshape(blocks, -1)[:, :: views + 1] = weights
@@ -130,10 +131,10 @@ def aggregate_by_gramians(
     This takes one pass for the Gramians of all blocks, one small solve, and one pass for the
     weighted sums.
 
-    The result counts the blocks (Gramians, under other granularities) with at least one of these:
-    a view with a gradient that is exactly zero or absent (`zero`), a pair of non-zero gradients
-    without a common element (`disjoint`), a view left out because it is not finite (`dropped`), a
-    pair with a negative dot product (`conflict`).
+    The result counts the blocks (Gramians, under other granularities) in which one of four events
+    occurred: a view has an exactly zero or no gradient (`zero`), two non-zero gradients have no
+    common element (`disjoint`), a view was left out because its gradient is not finite (`dropped`),
+    or two gradients have a negative dot product (`conflict`).
 
     Raises:
         UserError: The operator returned weights that are not finite.
@@ -212,7 +213,10 @@ def operator_context(
 def _kinds(
     names: Sequence[str], blocks: Sequence[Block], granularity: Granularity
 ) -> tuple[BlockKind, ...]:
-    """Return the kinds of blocks. A group is named by its kind; `all` is neutral."""
+    """Return the kinds of blocks.
+
+    A group of blocks is named by its kind; the group `all` is neutral.
+    """
     known: dict[str, BlockKind] = {
         "geometry": "geometry",
         "appearance": "appearance",

@@ -1,6 +1,6 @@
 """The hooks: specifications that plugins implement or wrap.
 
-Three hooks of a training step stop at the first result, which the selected component returns:
+Three hooks of a training step are first-result hooks, which the selected component answers:
 `crossgrad_sample_views`, `crossgrad_aggregate_gradients` and `crossgrad_densify`. Any other plugin
 may wrap them (`@hookimpl(wrapper=True)`) to watch the call or replace its result. A first-result
 hook must return a value; None is an error.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class HookSpecs:
-    """All hooks in the order in which a run calls them."""
+    """All hooks, in the order in which a run calls them."""
 
     @hookspec
     def crossgrad_validate_selection(self, selection: "Selection") -> "list[str] | None":
@@ -90,8 +90,8 @@ class HookSpecs:
         """Return a loss term in addition to the photometric loss, per view or per step.
 
         All plugins answer this hook, once per view (`context.gaussians` given) and once per step
-        (`context.gaussians` is None). The result None means that there is no term. The gradients
-        are added after aggregation.
+        (`context.gaussians` is None). None means that there is no term. The gradients are added
+        after aggregation.
         """
 
     @hookspec(firstresult=True)

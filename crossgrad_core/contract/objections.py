@@ -85,7 +85,7 @@ def _of_the_resolution(selection: Selection) -> Iterator[str]:
 
 
 def unused_options(component: Component, selection: Selection) -> Mapping[str, str]:
-    """Return options of a component that would change nothing: name -> reason and remedy."""
+    """Return the options of a component that would have no effect: name -> reason and remedy."""
     idle: dict[str, str] = {}
     if isinstance(component, GramianOperator) and not component.reads_gramians():
         idle["granularity"] = "this operator looks at no Gramians; leave it out"

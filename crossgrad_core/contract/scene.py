@@ -19,7 +19,7 @@ from crossgrad_core.errors import UserError
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x_local = (x_input - offset) * scale, in float64; the rotation is the identity.
+    """The map x_local = (x_input - offset) * scale, in float64, without a rotation.
 
     Attributes:
         offset: [3] float64, input frame.
@@ -68,7 +68,7 @@ class Georeference(Protocol):
 
     @property
     def note(self) -> str:
-        """One sentence: the location and its accuracy, or why the location is not known."""
+        """One sentence with the location and its accuracy, or why the location is not known."""
         ...
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
@@ -90,7 +90,7 @@ class Unplaced:
     """The georeference of a scene whose location is not known.
 
     Attributes:
-        why: What is missing.
+        why: The reason why the location is not known.
     """
 
     why: str = "neither its files nor its photos tell where on Earth it is"
@@ -101,7 +101,7 @@ class Unplaced:
         return f"not georeferenced: {self.why}"
 
     def placed(self, gaussians: Gaussians, similarity: Similarity, coordinates: str) -> Placed:
-        """See `Georeference`."""
+        """Refuse every placement; see `Georeference`."""
         if coordinates == INPUT:
             return Placed(gaussians, similarity)
         if coordinates == LOCAL:
@@ -147,10 +147,10 @@ _OF_POINTS: Final = 0.9
 
 
 def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return [N], True for cameras ten times farther away than all others and than most points.
+    """Return [N], True for cameras ten times farther away than other cameras and most points.
 
-    A camera that photographs the scene from far away is not stray, because the points show the size
-    of the scene.
+    A camera that photographs the scene from far away is not an outlier, because the points show the
+    size of the scene.
 
     Args:
         centers: [N, 3] camera centres.
@@ -178,7 +178,7 @@ def stray_rows(centers: NDArray[np.float64], points: NDArray[np.float64]) -> NDA
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """An undistorted calibration; pixels, pixel centres at +0.5.
+    """An undistorted calibration in pixels; pixel centres are at +0.5.
 
     Attributes:
         width: Pixels.
@@ -232,7 +232,7 @@ class Camera(Pinhole):
         return torch.tensor(rows, dtype=torch.float64)
 
     def local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return [N, 3] points of the local frame in camera coordinates; the third is the depth."""
+        """Return points [N, 3] of the local frame in camera coordinates; column 2 is the depth."""
         pose = self.world_to_camera.numpy()
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
@@ -263,7 +263,7 @@ class Photo(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera with its photo, its unique name (path below the image folder) and its regime.
+    """A camera with its photo, its unique name (the path below the image folder) and its regime.
 
     Attributes:
         name: Path relative to the image folder with forward slashes.
@@ -293,13 +293,13 @@ class Scene:
         point_colors: [P, 3] uint8 RGB.
         similarity: Maps the local frame back to the input frame.
         notes: Changes to the input, with reasons (undistorted, resized, images left out ...).
-        point_sizes: [P] standard deviations of the first Gaussians, local units; NaN if the
-            distance to neighbours decides. None means NaN at all points.
-        point_opacities: [P] opacities of the first Gaussians; NaN if the backbone's rule decides.
-            None means NaN at all points.
+        point_sizes: [P] standard deviations of the initial Gaussians, local units; NaN if the
+            distance to the neighbours decides. None means NaN at all points.
+        point_opacities: [P] opacities of the initial Gaussians; NaN if the rule of the backbone
+            decides. None means NaN at all points.
         georeference: Location of the scene on Earth.
         files: Files that the scene was read from, except photos and masks.
-        check: Figures of the consistency check of the scene; None before the check.
+        check: Results of the consistency check of the scene; None before the check.
     """
 
     name: str
@@ -358,12 +358,12 @@ class Scene:
 
     @cached_property
     def robust_centers(self) -> NDArray[np.float64]:
-        """[M, 3] training camera centres without stray ones, local frame."""
+        """[M, 3] training camera centres without outliers, local frame."""
         return self.centers[~stray_rows(self.centers, self.points)]
 
     @cached_property
     def middle(self) -> NDArray[np.float64]:
-        """[3] mean of the training camera centres without stray ones, local frame."""
+        """[3] mean of the training camera centres without outliers, local frame."""
         return np.asarray(self.robust_centers.mean(axis=0))
 
     @cached_property
@@ -393,7 +393,7 @@ def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]
     """Return [V], the distance of each camera from the mean training camera centre, local units.
 
     Rounding errors are removed: a camera at this centre has distance 0, and distances that differ
-    by rounding only become equal.
+    only by rounding become equal.
     """
     return without_rounding(scene, np.linalg.norm(centers_of(views) - scene.middle, axis=1))
 
@@ -401,9 +401,10 @@ def radial_distances(scene: Scene, views: Sequence[View]) -> NDArray[np.float64]
 def without_rounding(scene: Scene, lengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return lengths [V] between camera centres, rounded to 2^-40 of the largest coordinate.
 
-    In regular camera layouts, equal distances differ by the rounding of the mean camera centre. A
-    cut at the median, a rank or a logarithm would depend on this rounding. If the coordinates of
-    the scene's input are so large that their own rounding is coarser, that rounding decides.
+    In regular camera layouts, equal distances differ by the rounding error of the mean camera
+    centre. A threshold at the median, a rank or a logarithm would depend on this rounding error. If
+    the input coordinates of the scene are so large that their rounding error is larger, the lengths
+    are rounded to that error.
     """
     largest = float(np.abs(scene.centers).max(initial=0.0))
     given = float(np.abs(scene.similarity.to_input(scene.centers)).max(initial=0.0))
@@ -423,7 +424,7 @@ def footprint(camera: Camera, points: NDArray[np.float64], seen: NDArray[np.int6
     """Return the median of f / z [pixels per local unit] over a camera's observed SfM points.
 
     If the camera observed fewer than 3 points in front of it, all points in its image are used
-    instead; NaN if there are none.
+    instead; the result is NaN without any point.
 
     Args:
         camera: The camera, in the size of the photo as trained.

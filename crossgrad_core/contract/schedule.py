@@ -1,4 +1,4 @@
-"""The schedule of a run, counted in drawn views or in steps."""
+"""The schedule of a run, counted in rendered views or in steps."""
 
 from bisect import bisect_left
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ class ViewsPerStep:
         return start + max(0, -((self.views(start) - views) // count))
 
     def moved(self, wanted: "ViewsPerStep", step: int) -> "ViewsPerStep":
-        """Return these values of K with the change points of another run, if they are still ahead.
+        """Return these values of K with the change points of another run, if these are still ahead.
 
         Args:
             wanted: K of a run of another length.
@@ -149,23 +149,24 @@ LEAST_INTERVAL = 8
 
 
 def is_published(mode: ScheduleMode, reference: int | None) -> bool:
-    """Return True if a schedule uses the published numbers, whatever the length of the run."""
+    """Return True if a schedule uses the published numbers for any length of the run."""
     return mode == "absolute" and reference is None
 
 
 @dataclass(frozen=True)
 class Counting:
-    """The unit in which a schedule counts, and the numbers that this requires.
+    """The unit in which a schedule counts, and the quantities that the unit requires.
 
     Attributes:
-        unit: Whether the schedule's numbers are views or steps.
+        unit: The unit of the schedule's numbers, views or steps.
         views: Number of views per step.
         photos: Number of training photos. An edit uses the statistics of at least this many views
             if the run is long enough.
         schedule_length: Length that the schedule is written for; None for the length of the run
             or the published length.
-        min_refinements: Minimum number of density control edits in a run of any length. A short run
-            shortens warm-up and interval for this. Used if the schedule counts views.
+        min_refinements: Minimum number of density control edits in a run of any length. In a short
+            run, warm-up and interval are shortened to reach this number. Used if the schedule
+            counts views.
     """
 
     unit: Unit = "steps"
@@ -180,10 +181,10 @@ IN_STEPS = Counting()
 
 @dataclass(frozen=True)
 class Schedule:
-    """All schedule lengths of one run, counted in views or in steps; `total` is in steps.
+    """The schedule of one run, counted in views or in steps; `total` is always in steps.
 
     Attributes:
-        mode: Whether the published schedule was stretched with the run.
+        mode: `scaled` if the published schedule was stretched with the run, else `absolute`.
         total: Length of the run, in steps.
         length: The length that the schedule is written for: the run's own length if it was
             stretched.
@@ -202,7 +203,8 @@ class Schedule:
         sh_wait: Count before which the SH degree does not grow.
         counting: The unit of the counts.
         pace: K of every step.
-        edits_before: Edits before `densify_from` in a run whose length followed the clock.
+        edits_before: Number of edits before `densify_from` in a run whose length followed the
+            clock.
         min_refinements: Minimum number of edits that a change of length keeps, if the run is long
             enough.
     """
@@ -285,7 +287,7 @@ class Schedule:
 
     @property
     def published(self) -> bool:
-        """See `is_published`."""
+        """True if the schedule is published; see `is_published`."""
         return is_published(self.mode, self.counting.schedule_length)
 
     def counted(self, step: int) -> int:
@@ -322,12 +324,12 @@ class Schedule:
 
     @property
     def grows(self) -> bool:
-        """Whether density control makes or made any edit in this run."""
+        """True if density control makes or made an edit in this run."""
         return self.edits_before + self.edits() > 0
 
     @property
     def first_edit(self) -> int:
-        """The first step in which density control edits, if it makes any edit."""
+        """The first step in which density control makes an edit; None without edits."""
         return self.step_of(self.next_edit(0))
 
     def next_edit(self, count: int) -> int:
@@ -343,10 +345,10 @@ class Schedule:
         """Return this schedule with the length of another schedule, from the end of a step on.
 
         The ends of the run, of the learning-rate decay and of density control move if they are
-        still ahead, and so does a change of K. Intervals stay, so that no event happens twice or
-        is left out. Density control does not restart after its end, and open levels and drawn
-        harmonics stay. If a minimum number of edits is set, the remaining edits are planned
-        again: the start if no edit was made yet, and the interval if there would be too few.
+        still ahead, and so does a change of K. Intervals are kept, so that no event happens twice
+        or is omitted. Density control does not restart after its end, and open levels and drawn
+        harmonics stay. If a minimum number of edits is set, the remaining edits are planned again:
+        the start if no edit was made yet, and the interval if there would be too few edits.
 
         Args:
             wanted: The schedule of a run that had this length from its start.
@@ -382,13 +384,14 @@ class Schedule:
         return edit <= self.counted(step) and edit < self.densify_until
 
     def collects(self, step: int) -> bool:
-        """Return True if densification statistics of this step are still needed."""
+        """Return True if the densification statistics of this step are still needed."""
         return self.counted(step - 1) + 1 < self.densify_until
 
     def prunes_large(self, step: int) -> bool:
         """Return True if an edit after this step removes primitives that are large in world space.
 
-        This is so after the first opacity reset, as published, and never in runs without resets.
+        This is the case after the first opacity reset, as published, and never in runs without
+        resets.
         """
         return self.reset_every is not None and self.counted(step - 1) >= self.reset_every
 
@@ -429,7 +432,7 @@ def _fitted(start: int, last: int, every: int, photos: int, edits: int) -> tuple
 
     Args:
         start: Wanted start.
-        last: Largest count of the last edit.
+        last: Largest allowed count of the last edit.
         every: Wanted interval.
         photos: The interval is at least this long if this leaves enough edits.
         edits: Wanted number of edits.
@@ -460,8 +463,8 @@ class Phase:
 def shortness(views: float) -> float:
     """Return 1 for runs of up to `SHORT` views, 0 from the published length on.
 
-    In between, the value falls with the logarithm of the length. Settings that suit short runs only
-    fade out with this value.
+    In between, the value falls with the logarithm of the length. Settings that suit only short runs
+    lose their effect gradually with this value.
     """
     short = log(REFERENCE / max(1.0, views)) / log(REFERENCE / SHORT)
     return min(1.0, max(0.0, short))

@@ -75,9 +75,10 @@ def visible(record: RenderedView, rows: Tensor | None = None) -> Tensor:
 
 
 def seen(record: RenderedView) -> Tensor | None:
-    """Return [S] int64 rows of the Gaussians that touched a pixel, for sums over these rows.
+    """Return [S] int64 rows of the Gaussians that touched a pixel; sums need only these rows.
 
-    On a GPU, return None, which means all rows, because the host would wait for their number.
+    On a GPU, return None, which means all rows, because the host would have to wait for their
+    number.
     """
     radii, rows = record.screen.radii, record.screen.rows
     if not radii.is_cpu:
@@ -119,7 +120,7 @@ def add(record: RenderedView, total: Tensor, values: Tensor, rows: Tensor | None
 
 
 def mean(statistics: Mapping[str, Tensor], total: str, count: str) -> Tensor:
-    """Return [P], the quotient of two sums; 0 where the count is 0."""
+    """Return [P], the quotient of two sums; 0 if the count is 0."""
     counts = statistics[count]
     means = statistics[total] / counts.clamp(min=torch.finfo(counts.dtype).tiny)
     return torch.where(counts > 0, means, torch.zeros_like(means))

@@ -73,7 +73,7 @@ class Selection:
 
     @property
     def components(self) -> dict[str, Component]:
-        """Slot (singular word) -> component, for the slots that are filled."""
+        """The mapping slot (singular word) -> component, for the slots that are filled."""
         filled: dict[str, Component | None] = {
             "backbone": self.backbone,
             "sampler": self.sampler,
@@ -97,7 +97,7 @@ class Selection:
 
 @runtime_checkable
 class HasUnusedOptions(Protocol):
-    """A component that knows which of its options would change nothing."""
+    """A component that reports which of its options would change nothing."""
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Return options that would change nothing in this selection: name -> reason and remedy.

@@ -45,8 +45,9 @@ def evaluate(
     """Render and measure the views, one at a time.
 
     Args:
-        views: The held-out views; without any, all metrics are null, with the reason.
-        render_one: Returns the [H, W, 3] float image of a view, on any device; need not be clamped.
+        views: The held-out views; without any view, all metrics are null, with the reason.
+        render_one: Returns the [H, W, 3] float image of a view, on any device; the values need not
+            be clamped.
         metrics: The metrics to measure.
         on_view: Called with each view and its render, for panels.
         points: [P, 3] SfM points of the scene, local frame, for metrics that need them.
@@ -79,15 +80,14 @@ def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
-    """Return the peak signal-to-noise ratio over all kept pixels and channels, in dB.
+    """Return the peak signal-to-noise ratio over all unmasked pixels and channels, in dB.
 
     Args:
         image: [H, W, 3] in [0, 1], or uint8.
-        target: [H, W, 3] likewise.
-        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        target: [H, W, 3] the other image, in the same form.
+        mask: [H, W] bool, True where the pixel counts; None counts all pixels.
 
-    Returns:
-        At most `PSNR_LIMIT`; None if no pixel is kept.
+    Returns: At most `PSNR_LIMIT`; None if no pixel counts.
 
     Source: 3DGS evaluation script: 20 log10(1 / sqrt(MSE)).
     """

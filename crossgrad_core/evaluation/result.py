@@ -16,9 +16,9 @@ class ViewMetrics:
 
     Attributes:
         name: Name of the view.
-        regime: Its regime.
-        values: Name of a metric -> value; None if there is no value.
-        masked: True if all its pixels are masked.
+        regime: The regime of the view.
+        values: Name of a metric -> value; None if the metric is undefined for the view.
+        masked: True if all pixels of the view are masked.
     """
 
     name: str
@@ -32,7 +32,7 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over `views` views, not counting fully masked ones; None if no view has the metric."""
+    """Means over `views` views without fully masked views; None if no view has the metric."""
 
     views: int
     values: Mapping[str, float | None]
@@ -54,7 +54,7 @@ class EvaluationResult:
         views: Metrics of each view, in the order of the scene.
         overall: Means over all views.
         regimes: Regime -> means over its views, sorted by name.
-        reasons: Name of a metric -> why it is null.
+        reasons: Name of a metric -> reason why it is null.
     """
 
     figures: tuple[Figure, ...]

@@ -1,4 +1,4 @@
-"""The running sum of the gradients of K views on a GPU; the host waits only when it is read.
+"""The running sum of the gradients of K views on a GPU; the host waits only when the sum is read.
 
 `SummedGradients` checks the gradients of each view when they are added. On a GPU, this would make
 the host wait K times for each tensor.
@@ -96,7 +96,7 @@ class DeferredSums(Gradients):
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two arrays [B, K]: views with finite gradients, and with non-zero ones among these."""
+        """Two arrays [B, K]: views with finite gradients, and views with non-zero finite ones."""
         found = [size for view in self._largest for size in view.values()]
         values = iter(torch.stack(found).tolist() if found else ())
         sizes = [{name: next(values) for name in view} for view in self._largest]

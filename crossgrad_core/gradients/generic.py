@@ -43,7 +43,7 @@ def combine(
     Args:
         column: K gradients; None is left out.
         weights: [K].
-        plain: Whether to add without weights, in the type of the gradients.
+        plain: True to add without weights, in the type of the gradients.
         out: The result; may be one of the gradients.
         divisor: Divisor of a plain sum.
     """
@@ -101,7 +101,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Set `shared` [N] where two views' rows have a common non-zero element."""
+    """Set `shared` [N] for rows in which two views have a common non-zero element."""
     a, b = column[first], column[second]
     if a is not None and b is not None and a.numel():
         both = ((a != 0) & (b != 0)).reshape(rows, -1).any(dim=1)

@@ -121,7 +121,7 @@ def row_combine(column: Column, weights: NDArray[np.float64], out: Tensor) -> No
 def row_overlap(
     column: Column, first: int, second: int, rows: int, shared: NDArray[np.bool_]
 ) -> None:
-    """Set `shared` [N] where two views' rows have a common non-zero element."""
+    """Set `shared` [N] for rows in which two views have a common non-zero element."""
     from crossgrad_core.gradients.numba_kernels import rows as kernels
 
     a, b = column[first], column[second]

@@ -41,8 +41,9 @@ def passes_of(*columns: Column) -> Passes:
 def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64]:
     """Return [T, K, K] float64 Gramians; NaN or infinite in rows of views that are not finite.
 
-    float32 products are exact in float64 and can neither overflow nor underflow there. If float64
-    gradients have magnitudes outside `SAFE`, all gradients are first multiplied by a power of two.
+    float32 products are exact in float64 and can neither overflow nor underflow in float64. If
+    float64 gradients have magnitudes outside `SAFE`, all gradients are first multiplied by a power
+    of two.
     """
     gramians = np.zeros((len(columns), views, views))
     touched = [t for t, column in enumerate(columns) if any(g is not None for g in column)]
@@ -62,7 +63,7 @@ def column_gramians(columns: Sequence[Column], views: int) -> NDArray[np.float64
 def column_remainders(
     columns: Sequence[Column], group: NDArray[np.int64], gramians: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return [B, K, K], the rounding residuals of `gramians`, sums of `column_gramians`.
+    """Return [B, K, K], the rounding residuals of `gramians`, which are sums of `column_gramians`.
 
     Args:
         columns: T columns.
@@ -97,7 +98,7 @@ def rounding_residuals(
 ) -> NDArray[np.float64]:
     """Return [B, K, K], the exact Gramians (to about 106 bits) minus the rounded `gramians`.
 
-    The result is NaN where a Gramian is not finite.
+    The result is NaN if a Gramian is not finite.
 
     Args:
         columns: T columns.

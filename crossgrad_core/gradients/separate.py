@@ -46,7 +46,7 @@ class DenseGradients(SeparateGradients):
         views: For each view: tensor name -> gradient; None or no entry means zero, because the view
             does not touch the tensor.
         blocks: The blocks, in the order of every Gramian's first dimension.
-        overwrite: Whether `combine` and `total` may overwrite the gradients of one view with their
+        overwrite: True if `combine` and `total` may overwrite the gradients of one view with their
             results. This saves memory, but the gradients can then be used only once.
     """
 

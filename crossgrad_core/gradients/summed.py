@@ -23,8 +23,8 @@ def plain_sums(columns: Sequence[Column], divisor: int, *, keep: bool) -> list[T
     Args:
         columns: T columns of contiguous gradients, dense or sparse by rows; None is left out.
         divisor: Divisor of the sums.
-        keep: Whether to leave the gradients unchanged; otherwise the first gradient of each column
-            is overwritten with the result.
+        keep: True to leave the gradients unchanged; otherwise the first gradient of each column is
+            overwritten with the result.
 
     Returns:
         T sums, None for columns without a gradient.
@@ -70,8 +70,8 @@ class SummedGradients(Gradients):
     """The sum of K views' gradients in the order of the views; single views are not kept.
 
     The sum is given as a whole (one backward pass of a joint loss), or built view by view from
-    `empty` with `add`. `add` leaves a view out of the blocks in which it is not finite. `total`
-    adds the last view and divides in a single pass.
+    `empty` with `add`. `add` ignores a view in those blocks in which its gradient is not finite.
+    `total` adds the last view and divides in a single pass.
 
     Args:
         total: Tensor name -> sum; None or no entry if no view touches the tensor.
@@ -131,7 +131,7 @@ class SummedGradients(Gradients):
 
     @override
     def total(self, divisor: int = 1) -> Mapping[str, Tensor | None]:
-        """See `Gradients.total`.
+        """Return the sum for each tensor; see `Gradients.total`.
 
         Raises:
             RuntimeError: The sum was already divided by another number.
@@ -173,7 +173,7 @@ class SummedGradients(Gradients):
     def _judged(
         self, view: Mapping[str, Tensor | None]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return [B], True for finite block gradients, and [B], True for finite non-zero ones."""
+        """Return two arrays [B]: True for finite block gradients, and for finite non-zero ones."""
         names = [name for block in self._blocks for name in block.tensors]
         known = all_finite_and_present([view.get(name) for name in names])
         each = dict(zip(names, known, strict=True))

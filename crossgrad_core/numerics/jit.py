@@ -44,8 +44,8 @@ def strict_device(function: Callable[P, R]) -> Callable[P, R]:
 def strict_section(function: Callable[P, R]) -> Callable[P, R]:
     """Mark a section of one strict kernel; its code is inserted before the caller is compiled.
 
-    Parts and devices are optimised alone and again in each caller. For large functions this takes
-    seconds at every level.
+    Parts and devices are optimised separately, and again in each caller. For large functions this
+    takes seconds at every level.
     """
     return cast("Callable[P, R]", _COMPILE(inline="always", **_OPTIONS)(function))
 

@@ -1,4 +1,4 @@
-"""Dynamic distribution of jobs over threads: each thread takes the next job when it is done.
+"""Dynamic distribution of jobs over threads: each thread takes the next job when it is idle.
 
 A kernel takes jobs until none is left,
 
@@ -8,13 +8,16 @@ A kernel takes jobs until none is left,
         job = next_job(jobs, count)
 
 and `parallel` calls the kernel on all threads at once. Numba's own `prange` divides the work into
-equal parts in advance and waits for every thread. If a core is busy or slow, this takes longer than
-one thread alone. Here, a helper thread that starts too late is skipped, and idle threads sleep.
+equal parts in advance and waits for every thread. If a core is busy or slow, waiting takes longer
+than computing with one thread. Here, a helper thread that starts too late is skipped, and idle
+threads sleep.
 
 A thread starts with its own range of jobs and continues with the remaining jobs of other threads.
-So it reads in one kernel the data that it wrote in the kernel before, which its core still caches.
+So in each kernel a thread reads the data that it wrote in the previous kernel, which its core still
+caches.
 
-The result of a job must not depend on the thread that runs it. Then no bit depends on the threads.
+The result of a job must not depend on the thread that runs it. Then the threads do not affect any
+bit.
 """
 # ruff: noqa: ANN401, ARG001 - Numba's objects have no types, and it fixes the arguments.
 
@@ -55,7 +58,7 @@ _next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
 
 @device
 def next_job(jobs: Jobs, count: int) -> int:
-    """Return the number of a free job, or `count` if none is left; only in kernels.
+    """Return the number of a free job, or `count` if no job is left; only for use in kernels.
 
     Args:
         jobs: From `parallel` or `serial`.
@@ -76,7 +79,7 @@ def next_job(jobs: Jobs, count: int) -> int:
 def _jobs(threads: int) -> list[Jobs]:
     """Return for each thread: the number of threads, and the jobs taken from each thread's range.
 
-    The arrays share one memory block. A thread derives its own number from its array's length.
+    The arrays share one memory block. A thread derives its own number from the length of its array.
     """
     room = np.zeros(2 * threads, np.int64)
     room[0] = threads
@@ -86,15 +89,15 @@ def _jobs(threads: int) -> list[Jobs]:
 def parallel(
     kernel: Callable[Concatenate[Jobs, P], None], *args: P.args, **kwargs: P.kwargs
 ) -> None:
-    """Run a kernel on Numba's number of threads; returns when all jobs are done."""
+    """Run a kernel on Numba's number of threads; return when all jobs are done."""
     Begun(kernel, *args, **kwargs).end()
 
 
 class Begun:
-    """A kernel that runs on the other threads while this thread does something else.
+    """A kernel that runs on the other threads while the calling thread does other work.
 
-    Nothing else may use the data of the kernel until `end`. With one thread, the kernel runs to its
-    end immediately.
+    No other code may use the data of the kernel until `end`. With one thread, the kernel runs to
+    its end immediately.
 
     Args:
         kernel: The kernel, as for `parallel`; its arguments follow.
@@ -112,9 +115,9 @@ class Begun:
             self.end()
 
     def end(self) -> None:
-        """Do the remaining jobs on this thread as well; returns when all jobs are done.
+        """Do the remaining jobs on this thread as well, and return when all jobs are done.
 
-        The object then holds no more references, and can be ended again.
+        The object then holds no more references; further calls have no effect.
         """
         if self._own is None:
             return
@@ -137,13 +140,14 @@ class Begun:
 class _Call:
     """A call for a helper, skipped if it is no longer needed when the helper starts.
 
-    It uses a bare lock, because a `Future` creates conditions for each call and for each wait.
+    The class uses a bare lock, because a `Future` creates conditions for each call and for each
+    wait.
 
     Args:
         call: The function to call.
 
     Attributes:
-        error: The exception of the call, if any.
+        error: The exception of the call; None if there was none.
     """
 
     def __init__(self, call: Callable[[], None]) -> None:
@@ -153,7 +157,7 @@ class _Call:
         self._under_way = threading.Lock()
 
     def make(self) -> None:
-        """Make the call; called by the helper."""
+        """Execute the call; this function is called by a helper thread."""
         with self._under_way:
             if not self._needed:
                 return
@@ -163,7 +167,7 @@ class _Call:
                 self.error = error
 
     def end(self) -> None:
-        """Return when the call has finished or is cancelled; may be repeated."""
+        """Return when the call has finished or is cancelled; this may be called repeatedly."""
         self._needed = False
         with self._under_way:
             pass
@@ -185,7 +189,7 @@ class _Helpers:
         atexit.register(self._dismiss)
 
     def ask(self, calls: Sequence[_Call]) -> None:
-        """Give one call each to as many helpers as there are calls."""
+        """Give one call to each of as many helper threads as there are calls."""
         core = current_core()
         if core != self._core:
             self._core = core
@@ -209,7 +213,7 @@ class _Helpers:
             del call  # This frees the call's arrays before the next call arrives.
 
     def _dismiss(self) -> None:
-        """Stop the helpers."""
+        """Stop the helper threads."""
         for queue, thread in self._helpers:
             queue.put(None)
             thread.join()

@@ -1,8 +1,8 @@
 """Disk cache of compiled kernels: files are named by all of their sources and checked before use.
 
-One file holds one kernel for one signature: the SHA-256 of the rest, then the key and Numba's
-result. There is no index that two processes could overwrite. A file is written completely or not at
-all, and a damaged file counts as missing.
+One file contains one kernel for one signature: the SHA-256 of the remaining content, then the key
+and Numba's result. There is no index that two processes could overwrite. A file is written
+completely or not at all, and a damaged file counts as missing.
 """
 
 import ast
@@ -94,7 +94,7 @@ class _NoCache(cast("Any", NullCache)):  # type: ignore[misc]
 
     @override
     def load_overload(self, sig: object, target_context: object) -> None:
-        """Return None: nothing is stored."""
+        """Return None, because nothing is stored."""
         _tell_compiling(self._name, kept=False)
 
     @override
@@ -148,8 +148,8 @@ class _Files:
     """The cache files of one kernel.
 
     Args:
-        folder: Their folder.
-        base: Prefix of their names.
+        folder: The folder of the files.
+        base: Prefix of the file names.
         source: The source file of the kernel.
     """
 
@@ -207,8 +207,9 @@ def fingerprint(source: Path) -> str:
     """Return the SHA-256 of all files whose constants and functions a kernel in `source` may use.
 
     Numba notices changes of the kernel's own file, but not of files that contain inlined functions.
-    The hash covers all files of the kernel's folder, and their imports from their own package or
-    from the core. If an imported file is in a folder of kernels, its imports are included as well.
+    The hash covers all files of the kernel's folder and the files that these import from their own
+    package or from the core. If an imported file is in a folder of kernels, its imports are
+    included as well.
     """
     digest = hashlib.sha256()
     for path in sorted(_sources(source)):

@@ -1,13 +1,13 @@
 """Vectors of eight or sixteen float32 lanes inside compiled kernels.
 
 Numba leaves vectorisation to LLVM's loop vectoriser, which fails on the compositing loops because
-they carry state. Here a vector is a type: `Lanes` holds eight float32 numbers and `Mask` eight
-truth values. A kernel written with them is SIMD code by construction. Each vector uses one AVX
-register; LLVM splits it on machines with narrower registers. Functions with names that end in
-`_wide` make vectors of sixteen lanes. These need half the instructions on machines with AVX-512,
-and two instructions each on other machines. All other functions accept both widths. Operations are
-never reordered, and `fma` fuses on every machine that supports it, so the same expression in two
-kernels gives the same bits.
+they carry state. This module makes the vector a type: `Lanes` holds eight float32 numbers and
+`Mask` eight truth values. A kernel that uses these types is SIMD code by construction. Each vector
+uses one AVX register; LLVM splits it on machines with narrower registers. Functions with names that
+end in `_wide` make vectors of sixteen lanes. Such vectors need half the instructions on machines
+with AVX-512, and two instructions each on other machines. All other functions accept vectors of
+both widths. Operations are never reordered, and `fma` fuses on every machine that supports it, so
+the same expression in two kernels gives the same bits.
 
 Functions exist only inside compiled kernels; `Lanes` and `Mask` are annotations. A kernel that
 needs other lane operations can define them with `emitted` and the helpers of this module.
@@ -109,10 +109,10 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
     """Make a function for kernels.
 
     Args:
-        emit: Emits its instructions from the `Site` and the operands' LLVM values.
+        emit: Emits the instructions from the `Site` and the operands' LLVM values.
         result: Numba type of the result, such as `SIXTEEN`. `_lanes` and `_mask` stand for a vector
             of the same width as the operands' vectors.
-        operands: Numba types of the operands, in the same form; None stands for any array.
+        operands: Numba types of the operands, in the same form; None means any array.
     """
 
     def define(*given: Any) -> Any:
@@ -165,7 +165,7 @@ _define(operator.and_, lambda at, a, b: at.builder.and_(a, b), _mask, _mask)
 
 
 def _llvm(name: str, result: ir.Type | None = None) -> Callable[..., Any]:
-    """Emit a call of an LLVM intrinsic; a vector intrinsic if no result type is given."""
+    """Emit a call of an LLVM intrinsic; without a result type, it is a vector intrinsic."""
 
     def emit(at: Site, *args: Any) -> Any:
         full = name if result else f"{name}.v{args[0].type.count}f32"

@@ -1,1 +1,1 @@
-"""The recipe of a run: the table of decided settings, and how it is applied and written down."""
+"""The recipe of a run: the table of decided settings, its application and its storage."""

@@ -1,4 +1,4 @@
-"""The table of decided settings: a recipe makes it, a run applies and shows it."""
+"""The table of decided settings: a recipe makes the table, and a run applies and shows it."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -55,7 +55,7 @@ def is_given(config: RunConfig, setting: str) -> bool:
 
 
 def given_settings(config: RunConfig) -> dict[str, Any]:
-    """Return the settings that have a value already; `max_gaussians` may be `auto`."""
+    """Return the settings that already have a value; `max_gaussians` may be `auto`."""
     names = (name for name in config.model_fields_set if is_given(config, name))
     given = {name: getattr(config, name) for name in names}
     return given | {"max_gaussians": config.max_gaussians}
@@ -121,7 +121,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
 
 
 def _settings_of(config: RunConfig, name: str) -> dict[str, Any]:
-    """Return the group of settings, or the component, to which a row adds an option."""
+    """Return the group of settings, or the component, that gets an option from a decision."""
     value = getattr(config, name, None)
     return value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else {"name": AUTO}
 

@@ -1,4 +1,4 @@
-"""Commands by name: described without an import, imported when they are called."""
+"""Commands by name: they are described without an import and imported when they are called."""
 
 import ast
 import inspect
@@ -22,10 +22,10 @@ Command: TypeAlias = "typer.Typer | Callable[..., Any]"
 
 
 def load_command(entry: Entry) -> Command:
-    """Return the typer app or function that an entry point names; import its module.
+    """Return the typer app or function that an entry point names; its module is imported first.
 
     Raises:
-        UserError: It cannot be imported, or is another kind of object.
+        UserError: The object cannot be imported, or it is another kind of object.
     """
     found = resolve_entry(entry)
     if isinstance(found, typer.Typer) or inspect.isfunction(found):

@@ -46,10 +46,10 @@ class Entry:
 
     Attributes:
         name: The name that users type.
-        slot: Slot that it fills, a key of `OFFERED`, or `planners`.
-        value: The place of its class: `module:Class`.
-        distribution: Name of the distribution that offers it.
-        version: Version of that distribution.
+        slot: Slot that the plugin fills, a key of `OFFERED`, or `planners`.
+        value: The location of the plugin's class: `module:Class`.
+        distribution: Name of the distribution that offers the plugin.
+        version: Version of this distribution.
     """
 
     name: str
@@ -65,17 +65,17 @@ class Entry:
 
     @property
     def file(self) -> str | None:
-        """The source file of its module; None before the module is imported."""
+        """The source file of the plugin's module; None before the module is imported."""
         return getattr(sys.modules.get(self.value.partition(":")[0].strip()), "__file__", None)
 
     @property
     def origin(self) -> str:
-        """The place of its class and its distribution, for messages."""
+        """The location of the plugin's class and its distribution, for messages."""
         return f"{self.value}, from {self.distribution} {self.version}"
 
 
 def offers(slot: str) -> tuple[Entry, ...]:
-    """Return all entries of installed distributions for a slot, by name; names may repeat.
+    """Return all entries of installed distributions for a slot, by name; names may occur twice.
 
     Raises:
         KeyError: There is no such slot.
@@ -84,7 +84,7 @@ def offers(slot: str) -> tuple[Entry, ...]:
 
 
 def entries(slot: str) -> dict[str, Entry]:
-    """Return name -> entry for a slot. Imports no plugin.
+    """Return name -> entry for a slot. No plugin is imported.
 
     Raises:
         KeyError: There is no such slot.
@@ -121,7 +121,7 @@ def load(slot: "type[C]", name: str) -> "type[C]": ...
 @overload
 def load(slot: str, name: str) -> "type[Component]": ...
 def load(slot: "str | type[Component]", name: str) -> "type[Component]":
-    """Return the class that fills a slot under a name; import its module.
+    """Return the class that fills a slot under a name; its module is imported first.
 
     Args:
         slot: Name of the slot, or its base class; the returned class is a subclass of it.
@@ -129,22 +129,22 @@ def load(slot: "str | type[Component]", name: str) -> "type[Component]":
 
     Raises:
         UserError: The name is unknown or ambiguous, the plugin fails to import, or its object is
-            not a complete subclass of the slot's base class or has methods that take other
-            arguments.
+            not a complete subclass of the slot's base class, or its methods take other arguments.
     """
     return load_entry(find(slot if isinstance(slot, str) else slot.slot, name))
 
 
 def load_entry(entry: Entry) -> "type[Component]":
-    """Return the class that an entry names; see `load`."""
+    """Return the class that an entry names (see `load`)."""
     return _checked(entry, resolve_entry(entry))
 
 
 def resolve_entry(entry: Entry) -> object:
-    """Return the object that an entry names; import its module.
+    """Return the object that an entry names; its module is imported first.
 
     Raises:
-        UserError: It cannot be imported, or its package requires another version of crossgrad.
+        UserError: The object cannot be imported, or its package requires another version of
+            crossgrad.
     """
     refuse_other_version(entry)
     try:
@@ -166,7 +166,8 @@ def refuse_other_version(entry: Entry) -> None:
     """Refuse a plugin whose package requires another version of crossgrad than this one.
 
     Raises:
-        UserError: It does; the message names the package and its requirement.
+        UserError: The package requires another version; the message names the package and the
+            requirement.
     """
     if required := unmet_requirement(entry.distribution):
         raise UserError(
@@ -186,13 +187,13 @@ def notes_on(error: BaseException) -> list[str]:
 
 
 def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
-    """Return a function that answers for a component without importing its class, or None.
+    """Return a function that answers for a component without an import of its class, or None.
 
     A package may announce such a function under the name of its component. The function answers
     like `accepts` of a reader with default options, or like `speed` of a rasterizer.
 
     Raises:
-        UserError: It cannot be imported.
+        UserError: The function cannot be imported.
     """
     for each in _offers(tuple(sys.path))[QUICK[entry.slot]]:
         if (each.name, each.distribution) == (entry.name, entry.distribution):
@@ -201,7 +202,7 @@ def quick_answer(entry: Entry) -> Callable[[Any], Any] | None:
 
 
 def failed_plugin(error: Exception) -> UserError | None:
-    """Return the error for an exception from another package's code; None for crossgrad's own."""
+    """Return the error for an exception from another package; None for crossgrad's own code."""
     others = (each for slot in OFFERED for each in offers(slot) if each.distribution != OURS)
     found = [(entry, place) for entry in others if (place := raised_at(error, entry.package))]
     if not found:
@@ -217,7 +218,7 @@ def failed_plugin(error: Exception) -> UserError | None:
 
 
 def from_elsewhere(names: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return a note on each distribution, except crossgrad, that components come from.
+    """Return a note about each distribution, except crossgrad, that provides one of the components.
 
     Args:
         names: Slot -> names of components.
@@ -244,7 +245,7 @@ def build(slot: "str | type[Component]", name: str, options: Mapping[str, Any]) 
         options: Name of an option -> value.
 
     Raises:
-        UserError: See `load`; or an option is unknown, missing or out of bounds.
+        UserError: For the reasons of `load`, or an option is unknown, missing or out of bounds.
     """
     from pydantic import ValidationError
 
@@ -285,7 +286,7 @@ def name_of(component: "Component") -> str:
 
 
 def plain(component: "Component") -> dict[str, Any]:
-    """Return a component as in a configuration: its name and its options that are not defaults."""
+    """Return a component as in a configuration: its name and the options that are not defaults."""
     return {"name": name_of(component), **component.model_dump(mode="json", exclude_defaults=True)}
 
 

@@ -1,7 +1,7 @@
-"""One plugin manager per run, and first-result hooks, which must return an answer.
+"""One plugin manager per run, and calls of first-result hooks, which must return a result.
 
-pluggy does not report an unknown hook, a hook method without its mark, or a second plugin that
-answers a first-result hook. All three are errors here, with the plugin's name.
+pluggy does not report an unknown hook, a hook method without its marker, or a second plugin that
+answers a first-result hook. In this module all three are errors that name the plugin.
 """
 
 import inspect
@@ -39,7 +39,7 @@ _MARK = f"{PROJECT}_impl"
 class _Manager(pluggy.PluginManager):
     """A manager that passes only attributes to pluggy that can be hooks.
 
-    A component has a hundred attributes, and pluggy is slow for each: 0.3 s of every start.
+    A component has a hundred attributes, and pluggy spends long on each: 0.3 s of every start.
     """
 
     def __init__(self, project: str) -> None:
@@ -162,7 +162,7 @@ def _note_failures(manager: pluggy.PluginManager, name: str, plugin: object) -> 
 
 
 def _noted(function: Callable[..., Any], note: str) -> Callable[..., Any]:
-    """Return the function (it may be a wrapper), which then adds the note to its own exceptions."""
+    """Return the function (it may be a wrapper) with the note added to the exceptions it raises."""
 
     def call(*arguments: object) -> object:
         try:
@@ -195,7 +195,7 @@ def _described(name: str, plugin: object) -> str:
 
 
 def _complete(answer: Answer) -> bool:
-    """Return True if the content of an answer has its type; a None inside is an error, too."""
+    """Return True if the content of an answer has its type; None inside an answer is also wrong."""
     match answer:
         case SampleResult():
             return bool(answer.draw)
@@ -210,9 +210,9 @@ def _complete(answer: Answer) -> bool:
 
 
 def _refuse_misspelt_hooks(manager: pluggy.PluginManager, name: str, plugin: object) -> None:
-    """Raise an error for hooks that do not exist; replaces pluggy's own `check_pending`.
+    """Raise an error for hooks that do not exist; this replaces pluggy's own `check_pending`.
 
-    `check_pending` sees only marked methods and suggests no name.
+    `check_pending` sees only marked methods and does not suggest a name.
     """
     for attribute in dir(plugin):
         options = manager.parse_hookimpl_opts(plugin, attribute)

@@ -1,4 +1,4 @@
-"""Checks of a component's methods against the calls, and places in its source for messages."""
+"""Checks of the signatures of component methods, and source locations for messages."""
 
 import inspect
 import traceback
@@ -18,14 +18,13 @@ _CONTRACT: Final = "crossgrad_core.contract."
 def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...]:
     """Return the methods that cannot be called like the base class's methods.
 
-    Hooks are left out: they may take fewer arguments.
+    Hooks are not checked, because they may take fewer arguments.
 
     Args:
         found: A subclass of `base`.
         base: The base class of a slot.
 
-    Returns:
-        Name, signature in the base class and signature found, for each such method.
+    Returns: Name, signature in the base class and actual signature, for each such method.
     """
     contract = [each for each in base.__mro__ if each.__module__.startswith(_CONTRACT)]
     names = dict.fromkeys(name for each in contract for name in vars(each))
@@ -43,7 +42,7 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
 
 
 def _takes(given: Signature, expected: Signature, *, whole: bool) -> bool:
-    """Return True if a call with all arguments, or only with the required ones, is possible."""
+    """Return True if a call with all arguments, or with the required ones only, is possible."""
     passed = [p for p in expected.parameters.values() if whole or p.default is Parameter.empty]
     positional = [each for each in passed if each.kind in _POSITIONAL]
     named = {each.name: None for each in passed if each.kind is Parameter.KEYWORD_ONLY}
@@ -58,7 +57,7 @@ def raised_at(error: BaseException, package: str) -> str:
     """Return the innermost line of a package that raised or passed an exception; else empty.
 
     Args:
-        error: The exception; exceptions that caused it are searched, too.
+        error: The exception; the exceptions that caused it are searched as well.
         package: Name of the import package or module.
     """
     roots = _roots(package)
@@ -89,7 +88,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def _roots(package: str) -> tuple[Path, ...]:
-    """Return the folders of a package, or the file of a module; import nothing."""
+    """Return the folders of a package, or the file of a module; nothing is imported."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):

@@ -1,6 +1,6 @@
 """The slots that plugins fill, their entry-point groups, and entry points in unknown groups.
 
-Imports nothing heavy.
+This module imports nothing heavy.
 """
 
 from collections.abc import Iterator
@@ -60,11 +60,11 @@ class Stray:
     """An entry point that crossgrad never reads.
 
     Attributes:
-        name: Its name.
-        group: The group that it is in.
+        name: Name of the entry point.
+        group: The group of the entry point.
         meant: The group that is probably meant; empty if no group is similar.
-        distribution: Name of its distribution.
-        version: Version of that distribution.
+        distribution: Name of the distribution.
+        version: Version of the distribution.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Stray:
 
     @property
     def reason(self) -> str:
-        """The reason why it is not read, and what to do."""
+        """The reason why the entry point is not read, and a remedy."""
         right = f"write {self.meant}" if self.meant else f"the groups are {', '.join(_KNOWN)}"
         return f"there is no entry-point group {self.group}: {right}"
 

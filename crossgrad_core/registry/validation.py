@@ -18,13 +18,13 @@ _PREFIXES = ("Input should be ", "Value error, ", "Assertion failed, ")
 def as_user_error(
     error: ValidationError, model: type[BaseModel], *, subject: str, prefix: str = "", todo: str
 ) -> UserError:
-    """Return a user error for the first validation error, with the names of the others.
+    """Return a user error for the first validation error; it also names all other wrong options.
 
     Args:
         error: The error of pydantic.
         model: The validated model; its fields are the options that are suggested.
         subject: The owner of the options, for example `operator cagrad`.
-        prefix: The place of the options in a configuration, for example `operator`.
+        prefix: The position of the options in a configuration, for example `operator`.
         todo: Advice for the user.
     """
     details = error.errors(include_url=False)
@@ -57,7 +57,7 @@ def _place(
 ) -> tuple[tuple[str, ...], type[BaseModel] | None]:
     """Return the place in the input that a pydantic location names, and the model that holds it.
 
-    A location also names the branch of a union that was tried; users never write such a branch.
+    A location also names the tried branch of a union, which users never write.
     """
     parts: list[str] = []
     holder: type[BaseModel] | None = None
@@ -94,7 +94,7 @@ def _name(annotation: object) -> str:
 
 
 def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, object]:
-    """Return the model that holds a part, if it is a model, and the annotation of that part."""
+    """Return the model inside a part, if the part is a model, and the annotation of the part."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(part)
         return annotation, field.annotation if field else None

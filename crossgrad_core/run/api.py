@@ -1,4 +1,4 @@
-"""Runs from Python: like `crossgrad run`, with exceptions instead of exit codes."""
+"""Runs from Python: the same as `crossgrad run`, but with exceptions instead of exit codes."""
 
 import signal
 from collections.abc import Iterator, Sequence
@@ -30,18 +30,19 @@ def run(
         verbose: Show every decision and event.
         options: Named like the options of `crossgrad run` or like the keys of config.yaml:
             `backbone="scaffold"`, `seconds=60`, `max_size=800`, `out="runs/mine"`. The options of a
-            component are given with its name, `operator={"name": "cagrad", "c": 0.4}`, or one by
-            one, `**{"operator.c": 0.4}`. An installed component may also be given as its class, or
-            as an instance whose options the run uses. An option with the value None is ignored.
+            component are given together with its name, `operator={"name": "cagrad", "c": 0.4}`, or
+            one by one, `**{"operator.c": 0.4}`. An installed component may also be given as its
+            class, or as an instance; the run then uses the options of the instance. An option with
+            the value None is ignored.
 
     Returns:
         The run, finished or stopped (`stop_after`).
 
     Raises:
-        UserError: The input is bad; nothing was written.
+        UserError: The input is invalid; nothing was written.
         RunFailedError: Training failed; existing results are kept.
-        KeyboardInterrupt: The user interrupted the run. In Python's main thread it is raised after
-            the current step, and the run can be resumed.
+        KeyboardInterrupt: The user interrupted the run. In Python's main thread, this exception is
+            raised after the current step, and the run can be resumed.
     """
     settings = merged(None if config is None else Path(config), {"scene": scene, **options}, ())
     with _speaking(quiet=quiet), as_in_a_command():
@@ -72,7 +73,7 @@ def resume(
         UserError: The folder is not a run, the run is finished or in use, an option would change
             the training, or the scene or a package has changed.
         RunFailedError: Training failed; existing results are kept.
-        KeyboardInterrupt: See `run`.
+        KeyboardInterrupt: As for `run`.
     """
     settings = merged(None, options, ())
     with _speaking(quiet=quiet), as_in_a_command():
@@ -84,7 +85,7 @@ def resume(
 
 @contextmanager
 def _speaking(*, quiet: bool) -> Iterator[None]:
-    """Report the stages of the start, as a command does."""
+    """Report the stages of the start in the same way as a command."""
     announce(quiet=quiet)
     try:
         yield
@@ -97,11 +98,11 @@ def _way(*, quiet: bool, verbose: bool) -> app.Way:
 
 
 def _say_nothing(table: str, folder: Path, words: Sequence[str]) -> None:
-    """Do nothing: the returned object holds the results."""
+    """Print nothing, because the returned object contains the results."""
 
 
 def _result(outcome: app.Outcome) -> Run:
-    """Return the run, or raise the exception that matches its ending."""
+    """Return the run, or raise the exception that corresponds to its ending."""
     folder, ending = outcome.folder.resolve(), outcome.ending
     if ending.status == "failed":
         raise RunFailedError(folder, ending.error or "") from ending.cause

@@ -113,7 +113,7 @@ def bundled_scene() -> Path:
     """Return the folder of the bundled scene, in an installed package or in a checkout.
 
     Raises:
-        UserError: It is in neither place.
+        UserError: The scene is in neither of these folders.
     """
     package = Path(__file__).resolve().parents[1]
     installed = package / "data" / "boruszyn"
@@ -138,8 +138,8 @@ class Outcome:
     """The outcome of a run.
 
     Attributes:
-        folder: The folder of its results.
-        ending: Its status and, after a failure, the reason.
+        folder: The folder of the results.
+        ending: The status and, after a failure, the reason.
         signal: Number of the signal that stopped the run; None if there was no signal.
     """
 
@@ -149,7 +149,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0; 1 if training failed; 128 plus the signal's number if a signal stopped the run."""
+        """The exit code: 0; 1 if training failed; 128 plus the signal's number after a signal."""
         if self.ending.status == "failed":
             return FAILED
         return 0 if self.signal is None else exit_code(self.signal)
@@ -186,7 +186,7 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         run (130 for an interrupt by the user).
 
     Raises:
-        UserError: The input is bad; nothing was written.
+        UserError: The input is invalid; nothing was written.
     """
     way = Way(verbosity, _print_results, check)
     if resume is not None:
@@ -215,11 +215,11 @@ def _end(outcome: "Outcome", way: "Way") -> int:
 
 @dataclass(frozen=True)
 class Way:
-    """The way in which a run reports to the user.
+    """The form in which a run reports to the user.
 
     Attributes:
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        tell: Receives the results.
+        tell: Function that receives the results.
         check: True to decode all photos before training, False for the held-out photos only.
     """
 
@@ -232,7 +232,7 @@ def new(settings: Mapping[str, Any], way: Way) -> Outcome:
     """Train a new run, evaluate and export it.
 
     Raises:
-        UserError: The input is bad; nothing was written.
+        UserError: The input is invalid; nothing was written.
     """
     setup, load_seconds = _checked(settings, way)
     config = setup.config
@@ -267,7 +267,7 @@ def _with_remarks(setup: Setup) -> tuple[Setup, float]:
 
 
 def _checked(settings: Mapping[str, Any], way: Way) -> tuple[Setup, float]:
-    """Return the setup of a new run after all checks, and the seconds of loading."""
+    """Return the setup of a new run after all checks, and the seconds that loading took."""
     config = with_defaults(parsed(with_recipe(settings)))
     check_out(config.out)
     check_folder(config.out or RUNS, SMALLEST_NEED)
@@ -378,7 +378,7 @@ def _held(folder: Path) -> Iterator[None]:
 def _train(
     setup: Setup, state: TrainState, session: Session, length: Length, tell: Tell
 ) -> Outcome:
-    """Train from `state` on, and finish the run's folder in every case."""
+    """Train from `state` on, and complete the run's folder even after a failure."""
     log = RunLog(session.folder)
     setup.manager.register(log, name="log")
     setup.manager.register(session.machine, name="machine")
@@ -481,10 +481,10 @@ def _print_dry_run(setup: Setup) -> None:
 
 @contextmanager
 def as_in_a_command() -> Iterator[None]:
-    """Reset the global state of torch and numpy to that of a new process inside the block.
+    """Reset, inside the block, the global state of torch and numpy to that of a new process.
 
     Default type and device, `no_grad`, `inference_mode`, `np.errstate` and the number of threads
-    would change the bits of a run, or end it. They are restored afterwards.
+    would change the bits of a run, or make it fail. The caller's state is restored afterwards.
     """
     threads = torch.get_num_threads(), numba.get_num_threads()
     kind, device = torch.get_default_dtype(), torch.get_default_device()
@@ -505,6 +505,6 @@ def as_in_a_command() -> Iterator[None]:
 
 
 def _set_device(old: torch.device, new: torch.device) -> None:
-    """Set the default device only if it changes: a default device slows every call down."""
+    """Set the default device only if it changes, because a default device slows down every call."""
     if old != new:
         torch.set_default_device(new)

@@ -44,8 +44,8 @@ from crossgrad_core.wording import in_one_line, listed, plural, singular
 def idle_note(setup: Setup) -> tuple[str, ...]:
     """Return a note if the operator leaves the gradient of a single view unchanged.
 
-    The note also proposes a way out. There is no note for the default operator, because a sum of
-    one gradient is expected to be this gradient.
+    The note also suggests a remedy. There is no note for the default operator: its sum of one
+    gradient is the gradient, as expected.
     """
     selection = setup.selection
     name, views = selection.names["operator"], selection.views_per_step
@@ -88,15 +88,16 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
 
 
 def read_and_check(config: RunConfig, path: Path, *, accept: bool = False) -> tuple[Scene, str]:
-    """Like `read_scene`, and check points, poses and photos against each other.
+    """Read a scene like `read_scene`, and check points, poses and photos against each other.
 
     Args:
         config: The configuration.
         path: The scene's folder.
-        accept: Continue although the scene contradicts itself; the configuration can also set this.
+        accept: True to continue although the scene contradicts itself; the configuration can also
+            set this.
 
     Raises:
-        UserError: As `read_scene`, or the scene contradicts itself.
+        UserError: For the reasons of `read_scene`, or because the scene contradicts itself.
     """
     scene, name = read_scene(config, path)
     data = config.data
@@ -110,7 +111,7 @@ def accepts(name: str, path: Path) -> bool:
 
 
 def nearly_accepts(name: str, path: Path) -> bool:
-    """Return True if a file in the folder nearly has the format of a reader; see `accepts`."""
+    """Return True if a file in the folder nearly has the format of a reader (see `accepts`)."""
     return _answer(name, lambda: build(Reader, name, {}).nearly_accepts(path))
 
 
@@ -128,7 +129,7 @@ def _answer(name: str, question: Callable[[], bool]) -> bool:
 
 
 def check_names(config: RunConfig) -> None:
-    """Look up every component and the device before a large scene is read in vain.
+    """Look up every component and the device before a large scene is read.
 
     Raises:
         UserError: A name does not exist (the message names the closest one), or its package
@@ -152,7 +153,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 
     Args:
         config: The configuration.
-        scene: Its scene.
+        scene: The scene of the run.
         reader: Name of the reader that read the scene.
 
     Raises:
@@ -217,7 +218,7 @@ def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
 def _with_first_degree(config: RunConfig) -> RunConfig:
     """Return the configuration with the SH degree at which the run starts.
 
-    The degree is stored, so that a resumed run does not need the file that it started from.
+    The degree is stored, so that a resumed run does not need the file from which it started.
     """
     path = config.data.init_file
     if config.sh_from is not None or path is None:
@@ -229,10 +230,11 @@ def _with_first_degree(config: RunConfig) -> RunConfig:
 def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     """Return the configuration with a length in steps, unless its length is in seconds.
 
-    Views within seconds stay: the first steps show whether the seconds suffice for them.
+    A limit in views together with seconds is kept: the first steps show whether the seconds suffice
+    for the views.
 
     Raises:
-        UserError: A single step draws more views than `max_views`.
+        UserError: A single step renders more views than `max_views`.
     """
     if config.max_views is None:
         known = config.seconds is not None or config.steps is not None

@@ -1,4 +1,4 @@
-"""Cameras without photos: a path from a file, or a zoom path from far photos to near ones."""
+"""Cameras without photos: a path from a file, or a zoom path from far photos to near photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class CameraPath:
 
     Attributes:
         name: Part of the names of files.
-        cameras: One camera per frame.
+        cameras: The cameras, one per frame.
         fps: Frames per second.
     """
 
@@ -58,7 +58,7 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
         frames: Number of frames of a zoom path.
 
     Raises:
-        UserError: There is no such file, it contains no path, or the photos give no zoom path.
+        UserError: The file does not exist or contains no path, or the photos give no zoom path.
     """
     if path == ZOOM:
         return CameraPath(ZOOM, zoom_path(scene.train_views, scene.points, frames))
@@ -66,11 +66,11 @@ def camera_path(scene: Scene, path: str, frames: int) -> CameraPath:
 
 
 def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Camera, ...]:
-    """Return cameras on a line from a far photo to a near photo that shows the same things.
+    """Return cameras on a line from a far photo to a near photo of the same points.
 
-    The distance shrinks by the same factor in each frame. One end is among the farthest fifth of
-    the views, the other among the nearest fifth. The pair with the most common SfM points is used;
-    of equal pairs, the pair whose viewing directions differ least.
+    The distance shrinks by the same factor in each frame. One end of the path is among the farthest
+    fifth of the views, the other end among the nearest fifth. The pair with the most common SfM
+    points is used; among equal pairs, the pair with the most similar viewing directions.
 
     Args:
         views: The training views.
@@ -224,7 +224,7 @@ def checked_camera(camera: object) -> Camera:
     """Return the camera if it is valid.
 
     Raises:
-        UserError: It is not a camera, or one of its numbers is not valid for a camera.
+        UserError: The input is not a camera, or one of its numbers is not valid for a camera.
     """
     if not isinstance(camera, Camera):
         raise _refused("a view's name or a camera", f"{type(camera).__name__}")

@@ -1,4 +1,4 @@
-"""Resumable checkpoints: safetensors and JSON in one folder, either complete or absent.
+"""Resumable checkpoints: safetensors and JSON in one folder, which is either complete or absent.
 
 <run>/checkpoints/step-000700/tensors.safetensors   parameters, moments, plugin tensors
 <run>/checkpoints/step-000700/state.json            everything else, and the tensors' SHA-256
@@ -38,12 +38,12 @@ class Checkpoint:
     """The complete state from which a run continues bit for bit.
 
     Attributes:
-        step: Steps done.
+        step: Number of completed steps.
         parameters: Tensor name -> parameter.
         exp_avg: Tensor name -> Adam's first moment.
         exp_avg_sq: Tensor name -> Adam's second moment.
         adam_steps: Tensor name -> number of Adam steps taken.
-        plugins: Plugin name -> its state.
+        plugins: Plugin name -> state of the plugin.
         generators: Stream name -> `bit_generator.state` of its NumPy generator.
         scalars: Counters, clocks and other values that JSON can hold (tuples come back as lists).
     """
@@ -67,11 +67,11 @@ _SCRATCH = ".scratch-"
 
 @dataclass(frozen=True)
 class Keep:
-    """The rule for the checkpoints that survive the writing of a new one.
+    """The rule that decides which older checkpoints are kept when a new one is written.
 
     Attributes:
-        last: Number of newest checkpoints that survive, including the new one.
-        every: Checkpoints at multiples of this step survive, too; None for none of them.
+        last: Number of newest checkpoints that are kept, including the new one.
+        every: Checkpoints at multiples of this step are kept, too; None keeps none of them.
     """
 
     last: int = 2
@@ -96,8 +96,9 @@ def is_complete(folder: Path) -> bool:
 def named_checkpoints(folder: Path) -> dict[int, Path]:
     """Return step -> folder of the checkpoints in `folder`, in the order of steps.
 
-    A checkpoint gets its name when all of its files are written. A checkpoint that lacks a file is
-    damaged. It is still returned, because otherwise an older one would silently replace it.
+    A checkpoint gets its final name when all of its files are written. A checkpoint with a missing
+    file is therefore damaged. Such a checkpoint is still returned, because otherwise an older
+    checkpoint would silently replace it.
     """
     if not folder.is_dir():
         return {}
@@ -107,7 +108,7 @@ def named_checkpoints(folder: Path) -> dict[int, Path]:
 
 
 def damaged(folder: Path, found: str) -> UserError:
-    """Return the error for a damaged checkpoint; it names another checkpoint if there is one."""
+    """Return the error for a damaged checkpoint; it names another checkpoint if one exists."""
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
@@ -175,16 +176,16 @@ def state_text(state: Mapping[str, Any]) -> str:
 
 
 def digest(state: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a state without its own digest; JSON does not change it."""
+    """Return the SHA-256 of a state without its own digest; a round trip through JSON keeps it."""
     rest = {key: value for key, value in state.items() if key != _DIGEST}
     return sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def check_json(value: object, where: str) -> None:
-    """Refuse values that JSON would change: keys that are not text, tuples, arrays.
+    """Refuse values that JSON would change: keys that are not text, tuples and arrays.
 
     Raises:
-        UserError: There is such a value; the message names its place.
+        UserError: Such a value exists; the message names its position.
     """
     if wrong := no_json(value):
         raise UserError(
@@ -328,8 +329,8 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
     """Write a safetensors file and wait until it is on the disk.
 
     Raises:
-        OSError: The system refused, for example because the disk is full. An error of the system
-            that the library wraps is raised as OSError, too.
+        OSError: The system refused, for example because the disk is full. A system error that the
+            library wraps in its own exception is also raised as OSError.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file
@@ -349,10 +350,10 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Read a safetensors file into memory of our own.
+    """Read a safetensors file into newly allocated memory.
 
     Raises:
-        ValueError: It is not a readable safetensors file.
+        ValueError: The file is not a readable safetensors file.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load, load_file
@@ -382,13 +383,13 @@ def _all(checkpoint: "Checkpoint") -> Iterator[tuple[tuple[str, ...], Tensor]]:
 def save(run: Path, checkpoint: Checkpoint, keep: Keep | None = None) -> Path:
     """Write a checkpoint below the run's folder, then delete the checkpoints that `keep` drops.
 
-    The new checkpoint gets its name when all of it is on the disk. Until then, and after any
-    failure, the earlier checkpoints stay as they are.
+    The new checkpoint gets its final name when all of it is on the disk. Until then, and after any
+    failure, the earlier checkpoints are not changed.
 
     Args:
         run: The run's folder.
         checkpoint: The checkpoint; tensors on any device.
-        keep: The rule for older checkpoints; by default the last two survive.
+        keep: The rule for older checkpoints; by default the two newest checkpoints are kept.
 
     Returns:
         The checkpoint's folder.
@@ -435,7 +436,7 @@ def load_latest(run: Path) -> Checkpoint:
     """Read the newest checkpoint of a run; a training run may delete old checkpoints meanwhile.
 
     Raises:
-        UserError: There is none, or it is damaged.
+        UserError: There is no checkpoint, or it is damaged.
     """
     while True:
         folder = latest(run)
@@ -447,13 +448,13 @@ def load_latest(run: Path) -> Checkpoint:
 
 
 def latest(run: Path) -> Path:
-    """Return the newest checkpoint of a run, whole or damaged.
+    """Return the newest checkpoint of a run, complete or damaged.
 
     Args:
         run: The run's folder, its folder `checkpoints`, or one checkpoint.
 
     Raises:
-        UserError: There is none.
+        UserError: There is no checkpoint.
     """
     if is_checkpoint(run):
         return run
@@ -471,7 +472,7 @@ def latest(run: Path) -> Path:
 
 
 def drop_later(run: Path, step: int) -> None:
-    """Delete checkpoints after `step`, because a resumed run would no longer lead to them."""
+    """Delete checkpoints after `step`, because a run resumed there would not reproduce them."""
     for later, folder in named_checkpoints(run / CHECKPOINTS).items():
         if later > step:
             discard(folder)
@@ -481,7 +482,7 @@ def load(folder: Path) -> Checkpoint:
     """Read a checkpoint folder: on the CPU, without gradients, bit for bit as it was saved.
 
     Raises:
-        UserError: It is missing, incomplete, damaged, or of another format version.
+        UserError: The checkpoint is missing, incomplete, damaged, or of another format version.
     """
     state = read_state(folder)
     if not (folder / TENSORS).is_file():
@@ -513,7 +514,7 @@ def renew_scalars(folder: Path, scalars: Mapping[str, Json]) -> None:
     """Replace some scalars of a checkpoint on the disk.
 
     Raises:
-        UserError: It is damaged, or the disk is full.
+        UserError: The checkpoint is damaged, or the disk is full.
     """
     state = read_state(folder)
     text = state_text({**state, "scalars": {**state["scalars"], **scalars}})

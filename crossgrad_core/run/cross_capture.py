@@ -35,11 +35,11 @@ class Elsewhere:
     """Another capture in the local frame of a run.
 
     Attributes:
-        name: Its name.
-        views: Its views without the views that the run was trained on.
-        points: [P, 3] its SfM points.
-        trained: Number of its views that the run was trained on.
-        alike: False if its points are not near the run's points; True also if this is unknown.
+        name: Name of the capture.
+        views: The views without the views that the run was trained on.
+        points: [P, 3] the SfM points of the capture.
+        trained: Number of views of the capture that the run was trained on.
+        alike: False if the points are not near the run's points; also True if this is unknown.
     """
 
     name: str
@@ -151,7 +151,7 @@ def _check_place(
 def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
     """Return True if `points` are near the run's points, and would not be after a rotation.
 
-    Return True also if there are too few points to tell.
+    Also return True if there are too few points for a decision.
     """
     from scipy.spatial import cKDTree
 

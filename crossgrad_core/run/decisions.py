@@ -1,4 +1,4 @@
-"""The facts that a recipe decides from, and the functions that make the table of decisions."""
+"""The facts from which a recipe decides, and the functions that make the table of decisions."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ def facts_of(config: RunConfig, scene: Scene) -> Facts:
 
     Args:
         config: The configuration with only the user's settings.
-        scene: Its scene.
+        scene: The scene of the run.
 
     Raises:
         UserError: A component is wrong, or no rasterizer runs on the device.
@@ -81,12 +81,12 @@ def with_decisions(
 ) -> tuple[RunConfig, tuple[Decision, ...], Decide]:
     """Return the decided configuration, the table, and a function that makes the table again.
 
-    With `--plan auto`, the planner's rows about the scene come first. The recipe treats them as
-    settings of the user.
+    With `--plan auto`, the planner's decisions about the scene come first. The recipe treats these
+    decisions like settings of the user.
 
     Raises:
-        UserError: See `facts_of`; there is no planner, a photo cannot be decoded, or the recipe
-            leaves a setting open.
+        UserError: For the reasons of `facts_of`; or there is no planner, a photo cannot be decoded,
+            or the recipe does not decide a setting.
     """
     if config.seconds is not None:
         # The seconds are planned anew, and so is everything that depends on the length.
@@ -113,18 +113,18 @@ def table_of(config: RunConfig, scene: Scene, start: int | None = None) -> dict[
 
     Args:
         config: The configuration with only the user's settings.
-        scene: Its scene.
-        start: Primitives at the start, if the number of primitives is to be decided.
+        scene: The scene of the run.
+        start: Number of primitives at the start, if it is already known.
 
     Raises:
-        UserError: See `with_decisions`.
+        UserError: For the reasons of `with_decisions`.
     """
     rows = decide(config, replace(facts_of(config, scene), start=start))
     return {row.setting: row for row in rows}
 
 
 def redecided(setup: Setup, planned: int, start: int | None = None) -> Setup:
-    """Return the run with the numbers and rules for the length that is planned now.
+    """Return the run with the numbers and rules for its newly planned length.
 
     Other components stay the same.
 

@@ -106,7 +106,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
-    """Return the backbone that the rasterizer draws, and the densifier that needs its outputs."""
+    """Return the backbone that the rasterizer renders, and the densifier that needs its outputs."""
     backbone = build(Backbone, config.backbone.name, config.backbone.options)
     choice = config.densifier or ComponentChoice(name=AUTO)
     name = backbone.default_densifier if choice.name == AUTO else choice.name
@@ -114,7 +114,7 @@ def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
 
 
 def _missing() -> list[str]:
-    """Return what each installed rasterizer lacks to run on the GPU, and how to install it."""
+    """Return what each installed rasterizer needs to run on the GPU, and how to install it."""
     told = []
     for name in entries("rasterizers"):
         try:

@@ -30,15 +30,15 @@ class Exported:
     Attributes:
         gaussians: Number of Gaussians.
         baked_for: The view that the file was baked for, or `N training views` for their average;
-            None if nothing had to be baked.
+            None if no baking was needed.
         views: Number of views on which the file was compared with the live model: the view that it
             was baked for, else the held-out views.
-        psnr: dB, mean over these views, for the file's Gaussians drawn on black as viewers draw
-            them. None if the live model has the same Gaussians on the same background, or if there
-            are no such views.
+        psnr: dB, mean over these views for the Gaussians of the file, rendered on black as in
+            viewers. None if the live model has the same Gaussians on the same background, or if
+            there are no such views.
         live_psnr: dB, the same mean for the live model on its own background.
         background: Name of the live model's background if it is not black; no file stores it.
-        notes: What the user should know about the file.
+        notes: Messages for the user about the file.
     """
 
     gaussians: int
@@ -70,15 +70,15 @@ def export_scene(
     exporter: Exporter | None = None,
     coordinates: str = INPUT,
 ) -> Exported:
-    """Write the trained scene, and with it a `.georef.json` if there is something to record.
+    """Write the trained scene and, if there is anything to record, a `.georef.json`.
 
     Args:
         setup: The run.
-        state: Its state.
+        state: The state of the run.
         path: The file.
         camera: Name of the view for which view-dependent parts are baked; None for the average
             over the training views.
-        exporter: The exporter; the run's own by default.
+        exporter: The exporter; by default the exporter of the run.
         coordinates: Coordinates of the file, as `check_coordinates` accepts them.
 
     Raises:
@@ -114,12 +114,12 @@ def export_scene(
 
 
 def georef_of(path: Path) -> Path:
-    """Return the path of the file that tells other programs where an exported file belongs."""
+    """Return the path of the file that tells other programs the location of an exported file."""
     return path.with_suffix(".georef.json")
 
 
 def _write_georef(path: Path, placed: Placed, exporter: Exporter) -> tuple[str, ...]:
-    """Write the `.georef.json` if there is something to record; return a note about rounding."""
+    """Write the `.georef.json` if there is anything to record; return a note about rounding."""
     rounding = exporter.rounding(placed.gaussians, placed.similarity)
     offset, largest = rounding.offset.tolist(), rounding.largest
     if not placed.facts and not any(offset):
@@ -136,7 +136,7 @@ def _own_background(setup: Setup) -> str | None:
 
 
 def _mean_psnr(views: Sequence[View], render_one: Callable[[View], Tensor]) -> float | None:
-    """Return the mean PSNR in dB over the views with pixels to compare; None without any."""
+    """Return the mean PSNR in dB over the views with pixels to compare; None without such views."""
     each = []
     with torch.no_grad():
         for view in views:

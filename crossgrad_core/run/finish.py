@@ -1,4 +1,4 @@
-"""A run from its first step to its last file: its results are kept, however it ends."""
+"""A run from its first step to its last file: its results are kept even if it fails."""
 
 import traceback
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the reason of an error; for an unexpected error with its type and place."""
+    """Return the reason of an error; for an unexpected error with its type and source location."""
     if not is_unexpected(error):
         return str(error)
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -95,12 +95,12 @@ class RunLoop:
     """A run in progress.
 
     Attributes:
-        setup: Its setup; a run that follows the clock replaces it.
-        state: Its state; after an exception the last good one.
-        session: The writer of its results.
-        log: Its log.txt.
-        stopper: The requests to stop it.
-        ending: Its ending, as far as it is known.
+        setup: The setup; a run that follows the clock replaces it.
+        state: The state; after an exception, the last good state.
+        session: The writer of the results.
+        log: The run's log.txt.
+        stopper: The requests to stop the run.
+        ending: The ending, as far as it is known.
     """
 
     setup: Setup
@@ -111,10 +111,10 @@ class RunLoop:
     ending: Ending = Ending("finished")
 
     def to_the_end(self, length: Length) -> Ending:
-        """Train, then save and describe the last state.
+        """Train, then save and describe the final state.
 
-        Each part is attempted separately: if one fails, the others still run, and the ending
-        reports the failure.
+        Each part is attempted separately: if one part fails, the other parts still run, and the
+        ending reports the failure.
         """
         self._attempt("", lambda: self._train(length))
         if self.ending.status == "finished":
@@ -210,11 +210,11 @@ class RunLoop:
         )
 
     def _attempt(self, missing: str, part: Callable[[], None]) -> None:
-        """Do a part of the run; if it fails, record the failure in the ending.
+        """Execute a part of the run; record a failure of the part in the ending.
 
         Args:
             missing: The result that is missing if the part fails.
-            part: The part.
+            part: The function that executes the part.
         """
         try:
             part()
@@ -249,7 +249,7 @@ class RunLoop:
 
 
 def exit_messages(course: RunLoop) -> list[str]:
-    """Return messages about a run that failed, is empty or is unfinished, and how to continue."""
+    """Return messages about a failed, empty or unfinished run, and how to continue it."""
     ending, folder = course.ending, course.session.folder
     lines = []
     if not course.state.primitives(course.setup):
@@ -292,7 +292,7 @@ def resume_line(folder: Path) -> str:
 
 
 def _kept(course: RunLoop) -> list[str]:
-    """Return a line about the state if the newest checkpoint does not hold it."""
+    """Return a line about the state if the newest checkpoint does not contain it."""
     step = course.state.step
     saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
@@ -308,7 +308,7 @@ WORTH_A_LINE = 60.0
 
 
 class Forecast:
-    """A wrapper of a length that logs once how long the rest of the run will take.
+    """A wrapper of a length that logs once how long the remaining steps will take.
 
     Args:
         length: The length that decides about the end of the run.
@@ -320,13 +320,13 @@ class Forecast:
         self._told = False
 
     def due(self, state: TrainState) -> bool:
-        """Return True if there is something to decide or to log."""
+        """Return True if there is anything to decide or to log."""
         if self._first is None:
             self._first = state.step, state.clock.train
         return self._length.due(state) or self._is_time(state)
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
-        """Return the setup with the current length; log the estimate if it is time."""
+        """Return the setup with the current length; log the estimate when it is due."""
         if self._length.due(state):
             setup = self._length.revised(setup, state)
         if self._is_time(state):

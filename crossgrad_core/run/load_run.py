@@ -114,7 +114,7 @@ def to_checkpoint(state: TrainState, config: RunConfig | None = None) -> Checkpo
 
     Args:
         state: The state.
-        config: The configuration that trained it, if a later load is to be compared with it.
+        config: The configuration that trained the state, if a later load must compare it.
     """
     scalars: dict[str, Any] = {
         "settings": {} if config is None else settings_of(config),
@@ -139,7 +139,8 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     """Return the state that continues bit for bit from the checkpoint.
 
     Raises:
-        UserError: It is not a state of this run: another backbone, other photos, or damaged.
+        UserError: The checkpoint is not a state of this run (another backbone or other photos), or
+            it is damaged.
     """
     _check_tensors(setup, checkpoint)
     try:
@@ -286,7 +287,7 @@ REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
 def without_missing(config: RunConfig) -> RunConfig:
-    """Return the configuration with default components for missing ones that only train.
+    """Return the configuration with defaults in place of missing components that only train.
 
     Metrics, observers and rules that are not installed are left out.
     """
@@ -311,7 +312,7 @@ def without_missing(config: RunConfig) -> RunConfig:
 
 
 def _is_gone(slot: str, choice: ComponentChoice) -> bool:
-    """Return True if a component, or one that its options name, is not installed."""
+    """Return True if a component, or a component that its options name, is not installed."""
     if choice.name not in entries(plural(slot)):
         return True
     if slot != "operator":
@@ -347,8 +348,8 @@ def set_up(
     Args:
         config: The configuration, with a scene.
         verbosity: -1 quiet, 0 normal, 1 verbose.
-        check: Refuses a scene that is not the run's scene; returns notes on an accepted one.
-        looks: True if nothing will be trained: the scene is then not checked against itself.
+        check: Refuses a scene that is not the run's scene; returns notes about an accepted scene.
+        looks: True if nothing will be trained; the consistency check of the scene is then omitted.
 
     Raises:
         UserError: The scene cannot be read, or the components cannot work together.
@@ -374,10 +375,10 @@ def set_up(
 
 
 def _refuse_lost_checkpoints(folder: Path) -> None:
-    """Refuse to begin a run again whose checkpoints were removed, to protect its results.
+    """Refuse to restart a run whose checkpoints were removed, to protect its results.
 
     Raises:
-        UserError: The run has results, so it had checkpoints.
+        UserError: The run has results, so it must have had checkpoints.
     """
     for status in _WITH_RESULTS:
         if step := summarised_step(folder, status):
@@ -392,7 +393,7 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
 
 
 def require_checkpoint(folder: Path) -> None:
-    """Refuse a folder that has no trained state yet; write nothing there.
+    """Refuse a folder that has no trained state yet; nothing is written to the folder.
 
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.
@@ -414,7 +415,7 @@ def require_checkpoint(folder: Path) -> None:
 def opened(
     folder: Path, settings: Mapping[str, Any], *, accept_scene: bool = False
 ) -> tuple[Setup, TrainState]:
-    """Load a finished, stopped or still training run and its newest state, to look at them.
+    """Load a finished, stopped or still training run and its newest state, without writing.
 
     Args:
         folder: The run's folder.
@@ -423,7 +424,7 @@ def opened(
 
     Raises:
         UserError: The folder is not a run, the run has no checkpoint, a setting would change the
-            training, or the scene is another one.
+            training, or the scene is not the run's scene.
     """
     require_checkpoint(folder)
     check = partial(check_scene, folder, tolerated=Weight.HELD_OUT, accept=accept_scene)
@@ -454,7 +455,7 @@ def continued(
 
     Raises:
         UserError: The folder is not a run, a setting would change the training, or the scene or a
-            package is another one.
+            package has changed.
     """
     check = partial(check_scene, folder, tolerated=Weight.CONTENT, accept=accept_scene)
     packages = read_plugins(folder)
@@ -536,7 +537,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
 
 
 def _check_device(name: str, folder: Path) -> None:
-    """Refuse a device that is not on this machine; the message tells what to do."""
+    """Refuse a device that does not exist on this machine; the message suggests a remedy."""
     import torch
 
     if name.startswith("cuda") and not torch.cuda.is_available():

@@ -21,10 +21,10 @@ class Option:
     """An option of the command line.
 
     Attributes:
-        path: The setting that it changes, such as `("data", "split")`.
-        flag: Its name and appearance on the command line.
-        kind: Its type.
-        help: Its help text.
+        path: The setting that the option changes, such as `("data", "split")`.
+        flag: Name and appearance of the option on the command line.
+        kind: Type of the option.
+        help: Help text of the option.
     """
 
     path: tuple[str, ...]
@@ -34,7 +34,7 @@ class Option:
 
     @property
     def name(self) -> str:
-        """Its name as a keyword: `max_size` for `--max-size`."""
+        """The option's name as a keyword: `max_size` for `--max-size`."""
         return self.flag.name or self.path[-1]
 
 

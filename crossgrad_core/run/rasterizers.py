@@ -19,7 +19,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Wanted:
-    """The demands of a run on its rasterizer.
+    """The requirements of a run on its rasterizer.
 
     Attributes:
         device: Torch device type.
@@ -56,19 +56,20 @@ def demands(config: RunConfig, device: str, backbone: Backbone, densifier: Densi
 
 
 def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
-    """Return the name of the rasterizer, and notes on why it was chosen.
+    """Return the name of the rasterizer, and notes about the reason for the choice.
 
-    Every installed rasterizer reports its speed on the device. The fastest one that meets the
-    demands is chosen; of equally fast ones, the first by name. If none meets them, the fastest is
-    chosen, and later checks report why it cannot work. A rasterizer that cannot be imported is left
-    out. Slower ones are not imported.
+    Every installed rasterizer reports its speed on the device. The fastest rasterizer that meets
+    the requirements is chosen; among equally fast rasterizers, the first by name. If no rasterizer
+    meets the requirements, the fastest is chosen, and later checks report why it cannot work. A
+    rasterizer that cannot be imported is left out. Rasterizers slower than the chosen one are not
+    imported.
 
     Args:
         name: The user's choice; `auto` leaves it open.
-        wanted: The demands of the run.
+        wanted: The requirements of the run.
 
     Raises:
-        UserError: The choice is open, and no installed rasterizer runs on the device.
+        UserError: The user named no rasterizer, and no installed rasterizer runs on the device.
     """
     if name != AUTO:
         return name, (f"rasterizer {name}: asked for",)
@@ -85,11 +86,11 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
 
 
 def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) -> str | None:
-    """Return the fastest rasterizer that meets the demands; None if none does.
+    """Return the fastest rasterizer that meets the requirements; None if none of them does.
 
     Args:
         speeds: Name -> speed.
-        wanted: The demands of the run.
+        wanted: The requirements of the run.
         notes: A line is added for each faster rasterizer that is left out.
     """
     for name in _ranked(speeds):
@@ -126,7 +127,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
 
 
 def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
-    """Return name -> speed of the rasterizers that run on a device type, and notes on broken ones.
+    """Return name -> speed of a device's rasterizers, and notes on broken rasterizers.
 
     A rasterizer that declares its speed without an import is not imported.
     """
@@ -146,5 +147,5 @@ def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
 
 
 def _ranked(speeds: Mapping[str, float]) -> list[str]:
-    """Return the names, the fastest first, equally fast ones by name."""
+    """Return the names in order of decreasing speed; ties are sorted by name."""
     return sorted(speeds, key=lambda name: (-speeds[name], name))

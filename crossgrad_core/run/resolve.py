@@ -1,4 +1,4 @@
-"""The configuration as it was carried out, with every decision filled in."""
+"""The configuration with which a run was carried out, with every decision filled in."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ ALWAYS = (
 def resolved(setup: Setup) -> RunConfig:
     """Return a configuration that repeats the run: components with all options, K and steps fixed.
 
-    The output folder is left out, so that the repetition gets its own.
+    The output folder is left out, so that the repetition gets a folder of its own.
     """
     config, selection = setup.config, setup.selection
     components, names = selection.components, selection.names
@@ -53,7 +53,7 @@ def resolved(setup: Setup) -> RunConfig:
 
 
 def _located(path: Path | None) -> Path | None:
-    """Return the absolute path if it exists; any other path is inside the scene."""
+    """Return the absolute path if it exists; any other path is taken relative to the scene."""
     return path.resolve() if path is not None and path.exists() else path
 
 

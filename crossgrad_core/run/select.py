@@ -246,7 +246,7 @@ def operator_of(config: RunConfig) -> tuple[Operator, str]:
 def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     """Return K over a run, and why it differs from the sampler's default; empty if it does not.
 
-    If no K is set, it is the sampler's default, or the smallest K at which the operator works.
+    If no K is set, K is the sampler's default, or the smallest K at which the operator works.
     """
     if config.view_plan is not None:
         return config.view_plan, ""

@@ -1,4 +1,4 @@
-"""The writer of a run's results, while it trains and when it ends."""
+"""The writer of a run's results, during training and at the end."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,7 +43,7 @@ class Session:
 
     Args:
         folder: The run's folder.
-        table: Its metrics.csv.
+        table: The metrics.csv of the run.
 
     Attributes:
         machine: Records the load of the machine while the run trains.
@@ -74,7 +74,7 @@ class Session:
         return session
 
     def has_row(self, step: int) -> bool:
-        """Return True if metrics.csv has a row of that step or a later one."""
+        """Return True if metrics.csv has a row of that step or of a later step."""
         return self._evaluated_step >= step
 
     def result(self, step: int) -> EvaluationResult | None:
@@ -213,7 +213,7 @@ def reporting(state: TrainState) -> Iterator[None]:
 
 
 def totals(setup: Setup, state: TrainState) -> Totals:
-    """Return what the run has cost so far."""
+    """Return the cost of the run so far."""
     losses = state.last.losses if state.last is not None else ()
     return Totals(
         step=state.step,
@@ -239,7 +239,7 @@ def columns_of(setup: Setup) -> tuple[str, ...]:
 
 
 def view_counts(setup: Setup, result: EvaluationResult | None) -> dict[str, int]:
-    """Return the number of held-out views overall and per regime; of measured views if known."""
+    """Return the number of held-out views overall and per regime; if known, of measured views."""
     if result is not None:
         regimes = {regime: means.views for regime, means in result.regimes.items()}
         return {"overall": result.overall.views, **regimes}

@@ -1,7 +1,7 @@
 """Settings of a run from a file, from options and from `--set`; later sources win.
 
 The result is a nested dictionary in the shape of `crossgrad_core.config.RunConfig`, which validates
-it and finds unknown keys and values out of bounds.
+it and reports unknown keys and values out of bounds.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -60,7 +60,7 @@ def merged(
         assignments: `KEY=VALUE` texts, values in YAML.
 
     Raises:
-        UserError: The file cannot be read, or an assignment makes no sense.
+        UserError: The file cannot be read, or an assignment is malformed.
     """
     chosen = _places(options)
     assigned = list(map(_parsed, assignments))
@@ -71,7 +71,7 @@ def merged(
 def name_file(
     error: UserError, config: Path, options: Mapping[str, object], assignments: Sequence[str]
 ) -> None:
-    """Add the configuration file to an error if the file made the setting of the error.
+    """Add the configuration file to an error if the wrong setting comes from the file.
 
     Args:
         error: An error about the settings of `merged`; changed in place.
@@ -87,16 +87,16 @@ def name_file(
 
 
 def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] = ()) -> Settings:
-    """Return the settings of several layers in their long form; later layers win.
+    """Return the settings of several layers in their long form; later layers override earlier ones.
 
     Args:
         layers: Name of an option of `crossgrad run`, or key of a configuration file -> value. A
             layer that chooses another component drops the options that earlier layers gave to the
-            previous component. A length replaces the length of earlier layers.
-        assignments: `KEY=VALUE` texts as after `--set`, values in YAML; they win over all layers.
+            previous component. A length replaces all lengths of earlier layers.
+        assignments: `KEY=VALUE` texts as after `--set`, values in YAML; they override all layers.
 
     Raises:
-        UserError: An assignment, or a key with a dot, makes no sense.
+        UserError: An assignment, or a key with a dot, is malformed.
     """
     settings: Settings = {}
     for layer in layers:
@@ -106,7 +106,7 @@ def layered(layers: Sequence[Mapping[str, object]], assignments: Sequence[str] =
 
 
 def with_recipe(settings: Mapping[str, Any]) -> Settings:
-    """Return the settings on top of the settings that their recipe fixes.
+    """Return the settings merged with the settings that their recipe fixes; the given settings win.
 
     A configuration that a run wrote already contains the fixed settings.
 
@@ -304,7 +304,7 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
     """Return the choice of a component given as a class, or as an instance with its options.
 
     Raises:
-        UserError: It belongs to another slot, or no installed package offers it.
+        UserError: The component belongs to another slot, or no installed package offers it.
     """
     slot = key if key in MANY else plural(key)
     where = f"{key}, {kind.__module__}:{kind.__qualname__}"
@@ -416,7 +416,7 @@ def _renamed(old: object, new: object) -> object:
 
 
 def _with_options(old: list[Settings], new: Settings) -> Settings:
-    """Return the new link with its old options; options without a name belong to any new link."""
+    """Return the new link with its old options; options without a name apply to any new link."""
     for link in old:
         if link.get("name", new["name"]) == new["name"]:
             return {**link, **new}
@@ -424,7 +424,7 @@ def _with_options(old: list[Settings], new: Settings) -> Settings:
 
 
 def _extended(old: list[object], new: object) -> list[object]:
-    """Return the old list with the new choices; options of a choice in both are merged.
+    """Return the old list with the new choices; the options of a choice in both lists are merged.
 
     Values that are not choices, and new names that occur twice, are left for the validation.
     """
@@ -457,7 +457,7 @@ def _holder(settings: Settings, path: tuple[str, ...]) -> Settings:
 
 
 def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
-    """Return the value that `path[depth]` names inside a place."""
+    """Return the value that `path[depth]` names inside a value."""
     part = path[depth]
     match place:
         case dict():

@@ -29,13 +29,13 @@ Columns: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 class Run:
     """A run and its folder.
 
-    Properties that read the folder (`metrics`, `summary`) read it anew each time, so that a run can
-    be watched while it trains. The scene and the newest checkpoint are loaded when they are first
-    needed, and kept.
+    Properties that read the folder (`metrics`, `summary`) read it again each time, so that a run
+    can be watched while it trains. The scene and the newest checkpoint are loaded when they are
+    first needed, and kept.
 
     Args:
         folder: The run's folder.
-        device: Device of the tensors; the run's own by default.
+        device: Device of the tensors; by default the device of the run.
         threads: CPU threads; all by default.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """
@@ -57,10 +57,10 @@ class Run:
 
     @property
     def metrics(self) -> "Columns":
-        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN if there is no value.
+        """Column -> its numbers, one per evaluation, as in metrics.csv; NaN for a missing value.
 
         Raises:
-            UserError: There is no metrics.csv, or it does not contain numbers.
+            UserError: metrics.csv does not exist, or it does not contain numbers.
         """
         rows = read_metrics(self.folder)
         names = list(rows[0]) if rows else []
@@ -71,7 +71,8 @@ class Run:
         """The content of summary.json.
 
         Raises:
-            UserError: There is no file: the run has not ended, or its process was killed.
+            UserError: The file does not exist, because the run has not ended or its process was
+                killed.
         """
         return read_summary(self.folder)
 
@@ -80,12 +81,12 @@ class Run:
         """The scene as the run sees it, in its local frame.
 
         Raises:
-            UserError: It cannot be read, or the run was trained on another scene.
+            UserError: The scene cannot be read, or the run was trained on another scene.
         """
         return self._open()[0].scene
 
     def render(self, view: "str | Camera") -> NDArray[np.float32]:
-        """Render the image of a camera, as an evaluation does but not rounded to 8 bits.
+        """Render the image of a camera like an evaluation, but without rounding to 8 bits.
 
         Args:
             view: Name of a view of the scene, or a camera in the scene's local frame, such as
@@ -116,7 +117,7 @@ class Run:
         """Evaluate the held-out views again and rewrite per_view.csv, as `crossgrad eval` does.
 
         Raises:
-            UserError: The run has no checkpoint, or its scene is another one.
+            UserError: The run has no checkpoint, or its scene has changed.
         """
         from crossgrad_core.run.app import as_in_a_command
         from crossgrad_core.run.postprocess.evaluate import evaluated
@@ -182,7 +183,7 @@ def open(  # noqa: A001 - users call it as `cg.open`
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
 
     Raises:
-        UserError: It is not the folder of a run.
+        UserError: The folder is not a run.
     """
     read_config(Path(folder))
     return Run(folder, device=device, threads=threads, accept_scene=accept_scene)

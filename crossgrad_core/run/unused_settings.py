@@ -1,4 +1,4 @@
-"""Refusal of settings of a new run that would change nothing, with the reason and the way out.
+"""Refusal of settings of a new run that would change nothing, with the reason and a remedy.
 
 A resumed run is not checked: its settings were accepted when it began.
 """
@@ -27,7 +27,7 @@ _TIMES = ("densify_from", "densify_until", "densify_every", "min_refinements")
 
 
 def refuse_labels_for_nothing(setup: Setup) -> None:
-    """Validate the selection again, now that the labels of the training views are known.
+    """Validate the selection again when the labels of the training views are known.
 
     Raises:
         IncompatibleSelectionError: A component needs labels that no view has.
@@ -44,7 +44,7 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     """Refuse settings of the user that have no effect in this run.
 
     Args:
-        config: The settings of the user, before anything was decided.
+        config: The settings of the user, before any decision.
         setup: The assembled run.
 
     Raises:
@@ -117,7 +117,7 @@ def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield options of the densifier that do nothing without opacity resets, with reasons."""
+    """Yield options of the densifier that have no effect without opacity resets, with reasons."""
     if config.densifier is None or setup.schedule.reset_every is not None:
         return
     densifier, given = setup.densifier, config.densifier.options
@@ -128,7 +128,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield settings about the views of a step that do nothing."""
+    """Yield settings about the views of a step that have no effect."""
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):
@@ -166,7 +166,7 @@ def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
-    """Yield the grouping if the user named one that nothing reads."""
+    """Yield the grouping if the user named a grouping that no component reads."""
     selection = setup.selection
     sampler, operator = selection.sampler, selection.operator
     watched = any(choice.name != PROGRESS for choice in config.observers)

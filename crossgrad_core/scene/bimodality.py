@@ -20,13 +20,14 @@ _SMALLEST_SAMPLE = 10
 class Bimodality:
     """Sarle's coefficient of one sample.
 
-    For orientation: 1/3 for a normal law, 5/9 for a uniform one, 1 for any law on two points. Skew
-    alone reaches 5/9 (exponential law), and the finite-sample form stays below 1: two equally
-    populated points give 0.566 at n = 10 and 0.951 at n = 100, so n belongs to the figure.
+    For orientation: the coefficient is 1/3 for a normal distribution, 5/9 for a uniform one, and 1
+    for any distribution on two points. Skewness alone reaches 5/9 (exponential distribution), and
+    the finite-sample form is always below 1: two equally populated points give 0.566 at n = 10 and
+    0.951 at n = 100, so n must be reported with the coefficient.
 
     Attributes:
-        sample: Finite-sample form with Fisher's G1 and G2; NaN where undefined.
-        population: Form with plain moments, (g1^2 + 1) / (g2 + 3); NaN where undefined.
+        sample: Finite-sample form with Fisher's G1 and G2; NaN if undefined.
+        population: Form with plain moments, (g1^2 + 1) / (g2 + 3); NaN if undefined.
         size: n.
         reason: Why a form is NaN; empty if both forms are defined.
     """

@@ -164,8 +164,9 @@ def label_by_footprint(
 ) -> tuple[str, ...]:
     """Label a view near if its footprint is at least the median of the training views, else far.
 
-    See `contract.scene.footprint`. A view without a footprint uses the footprint of the nearest
-    camera with one. If no view has a footprint, every view gets the label `all`.
+    The footprint is defined in `contract.scene.footprint`. A view without a footprint uses the
+    footprint of the nearest camera with one. If no view has a footprint, every view gets the label
+    `all`.
 
     Args:
         cameras: Cameras of all views, local frame.
@@ -193,7 +194,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> Scene:
 
     Leaves out views without a photo, views in neither split list, and completely masked training
     views. The local frame is computed from the training cameras. Nothing is written to disk. A
-    photo is decoded only if its mask or transparency leaves open whether any pixel counts.
+    photo is decoded only if its mask or transparency may exclude all of its pixels.
 
     Raises:
         UserError: The input cannot be used for training. The message gives cause, place and remedy.

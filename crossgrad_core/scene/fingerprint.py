@@ -40,7 +40,7 @@ class FileMark(_Mark):
 
     Attributes:
         bytes: Size of the file in bytes.
-        sha256: Digest of its first and last 64 KiB; stored by runs of all versions.
+        sha256: Digest of the first and last 64 KiB of the file; stored by runs of all versions.
         whole: Digest of the whole file; None if `sha256` already covers the whole file, and in
             fingerprints of earlier versions.
     """
@@ -95,7 +95,7 @@ class Fingerprint(_Mark):
         format: Version of the layout.
         frame: The local frame.
         points: The SfM points.
-        lists: Name -> digest of the split lists, if any.
+        lists: Name -> digest of each split list.
         files: Path relative to the scene's folder -> file, for the files that the reader used,
             except photos and masks; None in a fingerprint of an earlier version.
         views: Name -> view.
@@ -114,7 +114,7 @@ def fingerprint_of(scene: Scene, root: Path) -> Fingerprint:
 
     Args:
         scene: The scene.
-        root: Its folder.
+        root: The folder of the scene.
 
     Raises:
         UserError: A photo or mask cannot be read.
@@ -205,8 +205,8 @@ class Difference:
     """One difference between two fingerprints.
 
     Attributes:
-        weight: Its effect on a trained model.
-        text: Its description.
+        weight: The effect of the difference on a trained model.
+        text: The description of the difference.
     """
 
     weight: Weight
@@ -216,8 +216,8 @@ class Difference:
 def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     """Return the differences between the former and the current scene; empty if they are equal.
 
-    Other training views also change the local frame and everything measured in it. In this case
-    only the cause is reported.
+    A change of the training views also changes the local frame and all values measured in it. In
+    this case only the change of the views is reported.
     """
     found = _views(was, now)
     if not any(each.weight is Weight.PLACE for each in found):
@@ -290,7 +290,7 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
 
 
 def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
-    """Return differences of files except photos and masks; none if a run did not record them."""
+    """Return differences of files except photos and masks; empty if a run did not record them."""
     if was.files is None or now.files is None:
         return []
     names = was.files.keys() | now.files.keys()

@@ -28,9 +28,9 @@ class Frame:
     """A local frame and how it was chosen.
 
     Attributes:
-        similarity: Input frame -> local frame.
+        similarity: Maps the input frame to the local frame.
         note: One sentence for the run's log.
-        stray: [N] training cameras that were ignored, because they are far from all others.
+        stray: [N] training cameras that were ignored because they are far from all other cameras.
     """
 
     similarity: Similarity
@@ -59,8 +59,8 @@ def camera_centers(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Frame:
     """Choose the local frame of a scene (3DGS: centre and extent of the training cameras).
 
-    Stray cameras are ignored. If all training cameras are in one place, the unit is their median
-    distance to the points, or one input unit if there are no points.
+    Outlier cameras are ignored. If all training cameras are at one position, the unit is their
+    median distance to the points, or one input unit if there are no points.
 
     Args:
         centers: [N, 3] centres of the training cameras, input frame; N >= 1.

@@ -181,8 +181,8 @@ def _seen(
 ) -> float:
     """Compute the field of view of a photo along its longer side, degrees.
 
-    COLMAP's models are defined only below 90 degrees from the axis. A polynomial in the angle
-    extrapolates beyond; it fits the fisheye models up to rounding.
+    COLMAP's models are defined only below 90 degrees from the axis. For larger angles a polynomial
+    in the angle is used, which fits the fisheye models up to rounding.
     """
     axis = 0 if camera.width >= camera.height else 1
     size = (camera.width, camera.height)[axis]

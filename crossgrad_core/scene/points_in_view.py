@@ -51,7 +51,7 @@ _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
 def check_seen(
     points: PointCloud, views: Sequence[RawView], where: object, todo: str = "remove the file"
 ) -> None:
-    """Refuse points that almost no photo shows: they are in another frame than the cameras.
+    """Refuse points that almost no photo shows, because they are in another frame than the cameras.
 
     Args:
         points: Points of the input.

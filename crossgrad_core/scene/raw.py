@@ -1,4 +1,4 @@
-"""The raw scene: the output of a reader before split and local frame, and checks of it."""
+"""The raw scene: the output of a reader before split and local frame, and checks of this output."""
 
 import os
 import re
@@ -35,7 +35,7 @@ class RawView:
         calibration: Camera model, before undistortion and resizing.
         world_to_camera: [4, 4] float64, rigid, input frame to camera frame (OpenCV axes).
         seen: [S] int64 rows of the scene's points that the view observed; may be empty.
-        mask: Its mask if the input names one; an option for the mask folder has priority.
+        mask: The mask, if the input names one; an option for the mask folder has priority.
         place: Path whose folders give the regime; None uses the folders of `name`.
     """
 
@@ -52,8 +52,8 @@ class RawScene:
     """A scene as the input describes it; `crossgrad_core.scene.build` turns it into a `Scene`.
 
     Attributes:
-        root: The scene's folder. It may contain split lists and the default mask folder, and its
-            name is the scene's name.
+        root: The scene's folder. The folder may contain split lists and the default mask folder,
+            and its name is the scene's name.
         images: The folder of the photos; the siblings `<images>_2`, `_4` and `_8` may contain
             smaller copies.
         views: The posed photos, in any order.
@@ -61,8 +61,8 @@ class RawScene:
         point_colors: [P, 3] uint8 RGB.
         notes: Changes that the reader made to the input.
         split: Names of the training and of the test views, if the input prescribes a split.
-        background: RGB in [0, 1] to put behind photos with an alpha channel; None if pixels with
-            alpha below a half do not count.
+        background: RGB in [0, 1] behind photos with an alpha channel; None if pixels with alpha
+            below a half do not count.
         files: Files that the reader used, except photos and masks.
     """
 
@@ -149,7 +149,7 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
 def check_distances(
     raw: RawScene, points: CheckedPoints, frame: Frame
 ) -> tuple[CheckedPoints, list[str]]:
-    """Leave out points too far from the training cameras for single precision, and note this.
+    """Leave out points too far from the training cameras for single precision, and note it.
 
     Raises:
         UserError: A camera is too far away.

@@ -31,7 +31,7 @@ class Split:
     Attributes:
         train: Training views.
         test: Held-out views.
-        notes: How they were chosen.
+        notes: Notes on how the views were chosen.
         regimes: Regime of every view, if the views were chosen by regime.
     """
 
@@ -50,9 +50,9 @@ def split_views(
 ) -> Split:
     """Split views by the option `split`; there is always at least one training view.
 
-    `auto` uses lists or the given split first. Otherwise it holds out each n-th photo of each
-    folder. If only a split by regime holds out two or more photos of some regime, it holds out each
-    n-th photo of each regime.
+    `auto` uses lists or the given split first. If there are none, `auto` holds out each n-th photo
+    of each folder. If only a split by regime holds out two or more photos of some regime, it holds
+    out each n-th photo of each regime.
 
     Args:
         names: Names of all usable views.

@@ -10,7 +10,7 @@ _SHOWN = 3
 
 
 def name_some(names: Sequence[str]) -> str:
-    """Return the first few of many names, and the number of the others."""
+    """Return the first few of many names, and the number of the other names."""
     shown = showable(", ".join(names[:_SHOWN]).replace("\n", r"\n"))
     return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
 

@@ -26,8 +26,8 @@ _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 def keep_freed_memory() -> None:
     """Keep up to 512 MiB of freed memory in the process, for the arrays of the next step.
 
-    By default glibc returns it to the system after every step. The kernel then clears each page
-    again when the next step first writes to it. Other C libraries stay unchanged.
+    By default, glibc returns the memory to the system after every step. The kernel would then clear
+    each page again when the next step first writes to it. Other C libraries are not affected.
     """
     heap = _heap()
     if heap is not None:
@@ -36,9 +36,9 @@ def keep_freed_memory() -> None:
 
 
 def use_large_pages() -> None:
-    """Request large pages for the part of the heap that grew since the last call (Linux, glibc).
+    """Request large pages for the heap that is new since the previous call (Linux, glibc).
 
-    Steps read and write Gaussians at scattered places in arrays of many megabytes. With pages of
+    Steps read and write Gaussians at scattered positions in arrays of many megabytes. With pages of
     4 KiB, most accesses miss the processor's table of pages (TLB). This is only a request: the
     system may not support large pages, or may not provide them.
     """
@@ -59,7 +59,7 @@ class _Heap:
         self._asked = library.sbrk(0)
 
     def keep(self) -> None:
-        """Keep freed memory, and let the heap grow: memory that is not written to costs nothing."""
+        """Keep freed memory, and let the heap grow; memory that is never written costs nothing."""
         self._library.mallopt(TRIM_THRESHOLD, KEPT)
         self._library.mallopt(MMAP_THRESHOLD, LARGEST)
         self._library.mallopt(TOP_PAD, FIRST)
@@ -67,7 +67,7 @@ class _Heap:
         self._library.mallopt(TOP_PAD, LATER)
 
     def use_large_pages(self) -> None:
-        """Request large pages from the end of the heap at the last call."""
+        """Request large pages from the end of the heap at the previous call."""
         end = self._library.sbrk(0)
         begin = -(-self._asked // LARGE_PAGE) * LARGE_PAGE
         if begin < end:

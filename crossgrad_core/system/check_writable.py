@@ -27,7 +27,7 @@ def check_folder(folder: Path, needed: int = 0) -> None:
         needed: Bytes that will be written.
 
     Raises:
-        UserError: The folder cannot be used; the message tells why and what to do.
+        UserError: The folder cannot be used; the message states the reason and a remedy.
     """
     place = folder.absolute()
     while not os.path.lexists(place):
@@ -67,7 +67,7 @@ def check_own(path: Path) -> None:
     The target of a link would be overwritten, and a pipe would block forever.
 
     Raises:
-        UserError: There is a link, a pipe, a device or a folder.
+        UserError: A link, a pipe, a device or a folder has the name of the file.
     """
     if path.is_symlink() or (path.exists() and not path.is_file()):
         found = f"a link to {path.resolve()}" if path.is_symlink() else "a pipe, device or folder"
@@ -93,7 +93,7 @@ def check_new(*paths: Path) -> None:
 
 
 def check_name(path: Path) -> None:
-    """Refuse a file whose name is too long for the name of its unfinished form.
+    """Refuse a file if the longer name of its unfinished form is too long.
 
     Raises:
         UserError: The name or the path is too long.
@@ -106,7 +106,7 @@ def check_file(path: Path) -> None:
     """Refuse a file that is a folder, or whose folder is missing or not writable.
 
     Raises:
-        UserError: The file cannot be written; the message tells why and what to do.
+        UserError: The file cannot be written; the message states the reason and a remedy.
     """
     check_name(path)
     if path.is_dir():

@@ -30,7 +30,7 @@ def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     with open_file(path) as file:
         return file_digest(file, "sha256").hexdigest()
@@ -57,8 +57,8 @@ def drop_checksums(folder: Path) -> None:
 def relisted(folder: Path, *names: str) -> Iterator[None]:
     """Let the block replace files of the folder; afterwards SHA256SUMS lists the new digests.
 
-    If the process is killed inside the block, the files stay unlisted. A folder without SHA256SUMS
-    gets none.
+    If the process is killed inside the block, SHA256SUMS does not list the files. A folder without
+    SHA256SUMS does not get one.
 
     Args:
         folder: The folder.
@@ -107,7 +107,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]:
-    """Return the listed files that are gone or have another digest.
+    """Return the listed files that are missing or have another digest.
 
     Args:
         folder: The folder.
@@ -143,7 +143,7 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 
 
 def warn_if_changed(path: Path) -> None:
-    """Warn about a file that differs from SHA256SUMS in its folder; another program may edit it."""
+    """Warn about a file that differs from SHA256SUMS; another program may have edited it."""
     if changed_files(path.parent, [path.name]):
         _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
 

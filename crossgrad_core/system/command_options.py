@@ -1,4 +1,4 @@
-"""Options of a command: made from the fields of a dataclass, grouped under headings.
+"""Options of a command, generated from the fields of a dataclass and grouped under headings.
 
 The help uses no rich, which would double the start-up time.
 """
@@ -39,11 +39,11 @@ def option(
     """Return a dataclass field for an option of the command.
 
     Args:
-        default: Its value if the user does not give it.
-        help: Its help text.
-        metavar: The placeholder of its value in the help.
-        heading: The heading of the help under which it is listed.
-        flag: Its name, if it differs from the field's name.
+        default: Value of the option if the user does not give it.
+        help: Help text of the option.
+        metavar: Placeholder for the value in the help text.
+        heading: Heading under which the help text lists the option.
+        flag: Name of the option, if it differs from the name of the field.
         **bounds: `min` and `max` of a number.
     """
     known: dict[str, Any] = {"metavar": metavar, "rich_help_panel": heading, **bounds}
@@ -57,7 +57,8 @@ def command_of(
     """Return a decorator that turns a function into a command.
 
     Args:
-        options: A dataclass whose fields are `argument`s and `option`s. The function receives one.
+        options: A dataclass whose fields are `argument`s and `option`s. The function receives one
+            instance of this dataclass.
     """
     kinds = get_type_hints(options)
     parameters = [

@@ -47,7 +47,7 @@ def disk_full(path: Path, needed: int | None) -> UserError:
 
 
 def read_only(path: Path) -> UserError:
-    """Return the error for a place that is not writable."""
+    """Return the error for a path that is not writable."""
     return UserError(
         "cannot write here",
         where=path,
@@ -83,7 +83,7 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
 
     Args:
         path: The file that is being written.
-        needed: Its size in bytes, if known.
+        needed: Size of the file in bytes, if known.
     """
     try:
         yield
@@ -140,7 +140,8 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
     Args:
         folder: The folder.
-        shared: True if other processes may write into it; then files of live processes stay.
+        shared: True if other processes may write into the folder; then files of live processes are
+            kept.
     """
     for path in folder.glob(".*.tmp"):
         named = _TEMPORARY.fullmatch(path.name)
@@ -182,7 +183,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until new names in the folder are on the disk, if the system supports this."""
+    """Wait until new names in the folder are on the disk, if the system supports such a wait."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

@@ -1,6 +1,6 @@
-"""Input files: only regular files of bounded size, so that none blocks or fills the memory.
+"""Input files: only regular files of bounded size are read, so none blocks or fills the memory.
 
-Links are followed; docs/reliability.md lists where names may lead.
+Links are followed; docs/reliability.md lists the locations to which names may point.
 """
 
 import os
@@ -31,7 +31,8 @@ def open_file(path: Path) -> BufferedReader:
     """Open a file for reading.
 
     Raises:
-        OSError: It cannot be opened, or is a pipe or a device, which might never open or end.
+        OSError: The file cannot be opened, or it is a pipe or a device, which might never open or
+            end.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("a folder, pipe or device in place of a file")
@@ -43,11 +44,12 @@ def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int 
 
     Args:
         path: The file.
-        weights: Character -> bytes of memory of the value that one occurrence stands for.
-        most: Most bytes of the file; values may take `GROWS` times as many in memory.
+        weights: Character -> bytes of memory for the value that one occurrence represents.
+        most: Maximum size of the file in bytes; its values may take `GROWS` times as much memory.
 
     Raises:
-        OSError: See `open_file`; or it is too large, or would become too large.
+        OSError: For the reasons of `open_file`; or the file or its values in memory would be too
+            large.
     """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size

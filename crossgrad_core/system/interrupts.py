@@ -1,7 +1,7 @@
 """Handling of Ctrl-C, `kill` and a closed terminal: a command ends with one line at any time.
 
-The exit code is 128 and the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
-SIGTERM, 129 after SIGHUP. The command imports this module first, so it imports little.
+The exit code is 128 plus the signal's number, as a shell reports it: 130 after Ctrl-C, 143 after
+SIGTERM, 129 after SIGHUP. The command imports this module first, so this module imports little.
 """
 
 import os
@@ -38,7 +38,7 @@ def tell(text: str, *, alone: bool = True) -> None:
 
     Args:
         text: The line.
-        alone: True to begin on a new line of a terminal, after "^C" or a progress bar.
+        alone: True to start on a new line of a terminal, after "^C" or a progress bar.
     """
     line = f"\n{text}\n" if alone and sys.stderr.isatty() else f"{text}\n"
     try:
@@ -70,7 +70,7 @@ def end_at_once(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def resume_hint(text: str) -> Iterator[None]:
-    """Print this line after an immediate end inside the block."""
+    """Print this line if the process is ended immediately inside the block."""
     _WAYS_ON.append(text)
     try:
         yield

@@ -1,7 +1,7 @@
 """Progress of a command: a line for each stage, a clock while kernels compile, and counts.
 
 This module listens to the package's log. Slow stages write there (`reading scene ...`), and so does
-the kernel cache before it compiles a kernel. Nothing heavy is imported.
+the kernel cache before it compiles a kernel. This module imports nothing heavy.
 """
 
 import logging
@@ -77,9 +77,10 @@ class _Startup(logging.Handler):
 
 
 class _Compiling:
-    """A clock of compiling that runs in a thread, because one kernel may take ten seconds.
+    """A clock of compilation that runs in a thread, because one kernel may take ten seconds.
 
-    On a terminal, everything is one line. Compiling a kernel may compile other kernels inside.
+    On a terminal, the clock uses a single line. The compilation of a kernel may include the
+    compilation of other kernels.
     """
 
     def __init__(self) -> None:
@@ -88,7 +89,7 @@ class _Compiling:
         self._thread: Thread | None = None
 
     def begin(self) -> None:
-        """Note that a kernel is going to be compiled."""
+        """Record that the compilation of a kernel begins."""
         if self._thread is None:
             _say(_EXPLANATION, stays=not is_live(sys.stderr))
             self._over.clear()
@@ -99,13 +100,13 @@ class _Compiling:
         self._depth += 1
 
     def done(self) -> None:
-        """Note that the kernel that began last is compiled."""
+        """Record that the compilation that began last is complete."""
         self._depth -= 1
         if not self._depth:
             self._seconds += monotonic() - self._began
 
     def end(self) -> None:
-        """Show the total seconds of all kernels."""
+        """Show the total compilation time of all kernels."""
         if not self.stop():
             return
         _say(f"compiled in {self._seconds:.0f} s")
@@ -143,7 +144,7 @@ class Progress:
     """Lines on stderr that begin with three dots, at most one per pause.
 
     Args:
-        pause: Seconds between two lines; 0 shows all lines. The first pause begins at once.
+        pause: Seconds between two lines; 0 shows all lines. The first pause begins immediately.
     """
 
     def __init__(self, pause: float = 0.0) -> None:
@@ -152,7 +153,7 @@ class Progress:
 
     @property
     def due(self) -> bool:
-        """True if a line would be shown now; useful if the text is slow to make."""
+        """True if a line would be shown now; useful if the text is expensive to make."""
         return monotonic() - self._last >= self._pause
 
     def tell(self, text: str) -> None:

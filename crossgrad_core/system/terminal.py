@@ -12,8 +12,8 @@ from crossgrad_core.wording import showable
 class PlainText(io.TextIOWrapper):
     """A text stream that writes control characters as escapes, as Python does in a string.
 
-    Otherwise a name from a file could move the cursor or recolour the terminal. Code that moves the
-    cursor itself writes to `controls_of` the stream.
+    Otherwise a name from a file could move the cursor or change the colours of the terminal. Code
+    that needs to move the cursor writes to `controls_of` the stream.
     """
 
     def __init__(self, buffer: io.BufferedWriter, **options: Any) -> None:  # noqa: ANN401
@@ -33,7 +33,7 @@ class _Controls:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text as it is."""
+        """Write the text unchanged."""
         return io.TextIOWrapper.write(self._stream, text)
 
     def __getattr__(self, name: str) -> object:

@@ -29,11 +29,11 @@ def read_rows(
         path: The file.
         what: Name of the content for an error message, such as `the list of labels`.
         todo: Advice for an error message.
-        whole: Leave out a last line without a line end.
+        whole: True to leave out a last line without a line end.
         delimiter: The character between two cells.
 
     Raises:
-        UserError: The file is missing or is not CSV, or too large.
+        UserError: The file is missing, is not CSV, or is too large.
     """
     try:
         content = read_file(path, {**_CSV, delimiter.encode(): _CSV[b","]})
@@ -50,11 +50,11 @@ def read_json(path: Path, most: int = LARGEST) -> object:
 
     Args:
         path: The file.
-        most: Most bytes of the file.
+        most: Maximum size of the file in bytes.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, is too large or too deep, or is not JSON.
+        ValueError: The file cannot be read, is too large or too deeply nested, or is not JSON.
     """
     try:
         value: object = json.loads(read_file(path, _JSON, most).decode("utf-8-sig"))
@@ -108,7 +108,7 @@ def csv_bytes(lines: Iterable[Iterable[str]]) -> bytes:
 
 
 class _Rows(list[str]):
-    """The rows that a `csv.writer` writes, one by one."""
+    """The rows that a `csv.writer` writes, collected one by one."""
 
     def write(self, row: str) -> None:
         self.append(row)

@@ -1,9 +1,9 @@
-"""YAML as users mean it: `1e-3` is a number, `no` is a word, a key that occurs twice is an error.
+"""YAML as users expect it: `1e-3` is a number, `no` is a word, and a repeated key is an error.
 
-PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. It also builds
-values without limits: endless numbers, nested lists until the stack is full, and, through aliases,
-a billion copies of one list from a few hundred bytes. This module builds the values from PyYAML's
-parse tree, with bounds on their number and depth.
+PyYAML follows YAML 1.1, where `1e-3` is a string, `no` is false and `12:30` is 750. PyYAML also
+builds values without limits: very long numbers, lists nested until the stack is full, and, through
+aliases, a billion copies of one list from a few hundred bytes. This module builds the values from
+PyYAML's parse tree, with bounds on their number and depth.
 """
 
 import re
@@ -52,7 +52,7 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def compose_node(self, parent: Node | None, index: int) -> Node | None:
-        """Return the next node; raise an error if there are too many nodes or levels."""
+        """Return the next node; raise an error if there are too many nodes or nesting levels."""
         mark: Mark | None = self.peek_event().start_mark  # type: ignore[no-untyped-call]
         self._depth += 1
         self._values += 1
@@ -144,7 +144,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
 
 
 def described(error: yaml.YAMLError) -> str:
-    """Describe the fault in a YAML text in one line, with its place."""
+    """Describe the fault in a YAML text in one line, with its position."""
     if not isinstance(error, yaml.MarkedYAMLError):
         return " ".join(str(error).split())
     text = ", ".join(part for part in (error.context, error.problem) if part)

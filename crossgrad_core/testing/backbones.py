@@ -66,7 +66,7 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
 
 
 def the_default_densifier_is_there(make: Make[Backbone]) -> None:
-    """`default_densifier` names an installed densifier that finds its tensors in the blocks."""
+    """`default_densifier` names an installed densifier whose tensors are in the blocks."""
     backbone = make()
     usual = registry.load(Densifier, backbone.default_densifier)
     lacks = usual.tensors - {name for block in backbone.blocks() for name in block.tensors}
@@ -125,7 +125,7 @@ def _require_valid(gaussians: Gaussians, primitives: int) -> None:
 
 
 def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
-    """`positions` is empty or names a tensor [N, 3] with a row for each primitive."""
+    """`positions` is empty or names a tensor [N, 3] with one row for each primitive."""
     backbone = make()
     parameters = created(backbone)
     held = [name for block in backbone.blocks() if block.per_primitive for name in block.tensors]
@@ -266,9 +266,9 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
 
 
 def _grown(parameters: Parameters) -> Parameters:
-    """Move the parameters away from their initial values, so that none is a round number.
+    """Move the parameters away from their initial values, so that no value is a round number.
 
-    All parameters increase. So colours stay above 0, because harmonics are clamped there and
+    All parameters increase. Colours therefore stay above 0, because harmonics are clamped there and
     colours are not.
     """
     rng = np.random.default_rng(5)

@@ -24,9 +24,10 @@ class Result:
 
     Attributes:
         check: Name of the check.
-        failure: Why it failed; None if it passed.
-        skipped: Why it does not apply; None if it applies.
-        where: `file:line` in the plugin of the failure, or how its package registers it.
+        failure: Reason why the check failed; None if it passed.
+        skipped: Reason why the check does not apply; None if it applies.
+        where: `file:line` of the failure in the plugin, or the registration of the plugin by its
+            package.
     """
 
     check: str
@@ -67,7 +68,7 @@ def check_entry(entry: registry.Entry) -> list[Result]:
 
 
 def _taken(entry: registry.Entry) -> str:
-    """Return why users cannot choose the plugin by its name; empty if they can."""
+    """Return the reason why users cannot choose the plugin by its name; empty if they can."""
     if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
         return f"the core has a command {entry.name}, which is called instead"
     try:
@@ -78,7 +79,7 @@ def _taken(entry: registry.Entry) -> str:
 
 
 def _announced_at(entry: registry.Entry) -> str:
-    """Return the location of the object that an entry point names, as far as it can be found."""
+    """Return the location of the object that an entry point names, as far as it is known."""
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)

@@ -1,7 +1,7 @@
 """Contract checks of commands, for the object that an entry point in `crossgrad.commands` names.
 
 These checks take the command itself, `check(my_command)`, because a function cannot be created
-anew.
+again.
 """
 
 import subprocess

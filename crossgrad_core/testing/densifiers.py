@@ -249,7 +249,7 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
-    """No edit removes nearly all primitives of a sound model: training could not restore them."""
+    """No edit removes nearly all primitives of a sound model; training could not restore them."""
     run = DensifierRun.of(make())
     for step in range(_EDIT - 4, _EDIT + 1):
         before = run.primitives
@@ -263,7 +263,7 @@ def most_primitives_survive(make: Make[Densifier]) -> None:
 
 
 def same_seed_same_edits(make: Make[Densifier]) -> None:
-    """The edits depend only on the arguments, and randomness comes from `context.rng`."""
+    """The edits depend only on the arguments; random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one, other = DensifierRun.of(make()), DensifierRun.of(make())
         for step in _AROUND_EDITS:

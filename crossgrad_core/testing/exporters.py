@@ -19,7 +19,7 @@ _ROUNDING = 1e-5
 
 
 def has_a_suffix(make: Make[Exporter]) -> None:
-    """`suffix` is the suffix of its file names, without the dot."""
+    """`suffix` is the suffix of the exporter's file names, without the dot."""
     suffix = getattr(make(), "suffix", None)
     good = isinstance(suffix, str) and suffix.isalnum() and suffix == suffix.lower()
     require(good, f"suffix is {suffix!r}; it must be lower-case letters and digits, without a dot")
@@ -43,7 +43,7 @@ def writes_one_file(make: Make[Exporter]) -> None:
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
-    """An existing file is replaced as a whole and never overwritten in place."""
+    """An existing file is replaced as a whole and is never overwritten in place."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a"
         make().write(_gaussians(), _FRAME, path, ())

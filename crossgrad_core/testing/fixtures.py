@@ -41,7 +41,7 @@ class NoisePhoto:
         return torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
 
     def mask(self) -> Tensor | None:
-        """Return None: every pixel counts."""
+        """Return None, because every pixel counts."""
         return None
 
 
@@ -50,7 +50,7 @@ def sample_scene() -> Scene:
     """Make six near and six far cameras around a small cloud; every fourth view is held out.
 
     The cameras of each regime are in a separate folder and at different distances, so that every
-    grouping finds its groups. The frame is a local one: extent 1.
+    grouping finds its groups. The frame is a local frame: the extent of its cameras is 1.
     """
     rng = np.random.default_rng(7)
     cloud = rng.uniform(-_CLOUD, _CLOUD, (_POINTS, 3))
@@ -109,7 +109,7 @@ def sample_phase(step: int = STEPS, *, training: bool = True) -> Phase:
 
 
 def step_fields(step: int = 1) -> dict[str, Any]:
-    """Return the fields that the contexts of all hooks share."""
+    """Return the fields that the contexts of all hooks have in common."""
     return {
         "step": step,
         "schedule": Schedule.for_run(STEPS),
@@ -150,7 +150,7 @@ def posed_view(
 
 
 def posed_scene(views: Sequence[View], points: ArrayLike = (), test: Sequence[int] = ()) -> Scene:
-    """Make a scene of these views; all but the positions in `test` are training views."""
+    """Make a scene of the given views; all views except those in `test` are training views."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     train = tuple(i for i in range(len(views)) if i not in set(test))
     colors = np.zeros((len(cloud), 3), dtype=np.uint8)

@@ -98,7 +98,7 @@ def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
 
 
 def same_seed_same_labels(make: Make[Grouping]) -> None:
-    """The labels depend only on the arguments, and randomness comes from `rng`."""
+    """The labels depend only on the arguments; random numbers come from `rng`."""
     scene = sample_scene()
     with global_randomness_untouched():
         one = fitted(make(), scene).labels(scene.views)

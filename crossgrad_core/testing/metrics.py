@@ -28,7 +28,7 @@ def names_its_figure(make: Make[Metric]) -> None:
 
 
 def its_columns_are_its_own(make: Make[Metric]) -> None:
-    """Its name differs from every column that crossgrad writes in each run."""
+    """The metric's name differs from every column that crossgrad writes in each run."""
     metric = make()
     first = load(Metric, METRICS.split("+")[0])
     figures = () if type(metric) is first else (first.figure,)
@@ -37,7 +37,7 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
-    """Every view gets a finite number or None, also if the render equals the photo."""
+    """Every view gets a finite number or None, even if the render equals the photo."""
     photo = sample_scene().test_views[0].photo.image()
     for render in (_render(), photo, torch.zeros_like(photo)):
         _require_number(make().measure(_compared(render)))
@@ -50,7 +50,7 @@ def an_empty_mask_is_no_error(make: Make[Metric]) -> None:
 
 
 def masked_pixels_do_not_count(make: Make[Metric]) -> None:
-    """The render's pixels under a False mask do not change the figure."""
+    """The render's pixels under a False mask do not change the metric."""
     mask = torch.ones(_render().shape[:2], dtype=torch.bool)
     mask[2:6, 3:12] = False
     other = _render()
@@ -60,7 +60,7 @@ def masked_pixels_do_not_count(make: Make[Metric]) -> None:
 
 
 def same_input_same_figure(make: Make[Metric]) -> None:
-    """The figure depends only on the compared images, and does not change them."""
+    """The metric depends only on the compared images and does not change them."""
     compared = _compared(_render())
     one, two = make().measure(compared), make().measure(compared)
     require(one == two, f"two looks at one render give {one} and {two}")

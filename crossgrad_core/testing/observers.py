@@ -99,7 +99,7 @@ _KEPT, _BLOCK = 100_000, 4
 
 
 class _Components:
-    """Replacement of the selected components: a fixed sample, full size, plain sum, no edit."""
+    """A replacement for the selected components: a fixed sample, full size, plain sum, no edit."""
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
@@ -176,7 +176,7 @@ def survives_every_event(make: Make[Observer]) -> None:
 
 
 def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
-    """Require that the hooks of a step raise nothing; other checks test their answers."""
+    """Require that the hooks of a step raise no error; other checks test their results."""
     try:
         _step_end(hooks, step, _step_hooks(hooks, observer, step))
         hooks.crossgrad_model_ready(model=_model(step))
@@ -343,7 +343,7 @@ def _step_hooks(
     """Return the answers of the hooks of a step, called as in the training loop.
 
     Gradients of single views are available only if the observer needs them. The first step has no
-    record of a former step, and its views have no labels.
+    record of a previous step, and its views have no labels.
     """
     centers, last = sample_scene().centers, _record(step - 1) if step > 1 else None
     sample = SampleContext(
@@ -414,7 +414,7 @@ def nothing_piles_up(make: Make[Observer]) -> None:
 
 
 def steps_are_not_held_up(make: Make[Observer]) -> None:
-    """No hook that is called in every step is slow, measured by the fastest of several calls."""
+    """No hook that is called in every step is slow; the fastest of several calls is measured."""
     run, observer = DensifierRun.of(build(Densifier, NO_DENSIFIER, {})), make()
     seconds: dict[str, float] = {}
     with _hooks(observer, seconds) as hooks:

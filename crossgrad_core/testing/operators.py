@@ -103,7 +103,7 @@ def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
     """Return the operator if it computes a matrix.
 
     Raises:
-        SkipTest: It needs the gradients themselves.
+        SkipTest: The operator needs the gradients themselves.
     """
     operator = make()
     if not isinstance(operator, MatrixOperator):
@@ -139,7 +139,7 @@ def matrices_are_finite(make: Make[Operator]) -> None:
 
 
 def one_block_is_enough(make: Make[Operator]) -> None:
-    """Each block is processed separately: other blocks do not change its matrix."""
+    """Each block is processed separately, so that other blocks do not change its matrix."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         case = operator_case(views)
@@ -183,7 +183,7 @@ def inputs_stay_untouched(make: Make[Operator]) -> None:
 
 
 def same_seed_same_answer(make: Make[Operator]) -> None:
-    """The answer depends only on the arguments, and randomness comes from `rng`."""
+    """The result depends only on the arguments; random numbers come from `rng`."""
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
         with global_randomness_untouched():
@@ -246,8 +246,8 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
 def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
     """The order of views in a step has no effect: equal views get equal weights.
 
-    Such views have gradients of equal length with equal angles. With more than two views only a
-    right angle is tested, because methods may process conflicting pairs one after another.
+    The tested views have gradients of equal length with equal angles. With more than two views only
+    a right angle is tested, because methods may process conflicting pairs one after another.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):
@@ -283,9 +283,10 @@ def _alike(case: OperatorCase, gramians: Array) -> OperatorCase:
 
 
 def what_it_reads_is_declared(make: Make[Operator]) -> None:
-    """`reads_labels` and `reads_gramians` are right: inputs that are not read have no effect.
+    """`reads_labels` and `reads_gramians` are correct: inputs that are not read have no effect.
 
-    A run refuses a grouping that is not read, and a granularity of Gramians that are not read.
+    A run refuses a grouping that no component reads, and a granularity for Gramians that no
+    component reads.
     """
     operator = _matrix_operator(make)
     for views in admitted(operator.views):

@@ -63,7 +63,7 @@ def every_view_has_a_scale(make: Make[Resolution]) -> None:
 
 
 def same_seed_same_scales(make: Make[Resolution]) -> None:
-    """The scales depend only on the arguments, and randomness comes from `context.rng`."""
+    """The scales depend only on the arguments; random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one, other = (
             [run.take_step(step) for step in _STEPS] for run in (_Run(make()), _Run(make()))

@@ -60,7 +60,7 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
 
 
 def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
-    """`unused` returns a text: why the rule would have no effect, or nothing if it has one."""
+    """`unused` returns a text: the reason why the rule would have no effect, or an empty text."""
     setup = _setup(make)
     reason = make().unused(setup.backbone, setup.scene)
     require(isinstance(reason, str), f"unused() answers {reason!r}, not a text")

@@ -113,7 +113,7 @@ def every_view_comes(make: Make[Sampler]) -> None:
 
 
 def same_seed_same_draws(make: Make[Sampler]) -> None:
-    """The samples depend only on the arguments, and randomness comes from `context.rng`."""
+    """The samples depend only on the arguments; random numbers come from `context.rng`."""
     with global_randomness_untouched():
         one = list(sampler_run(make()).draws(_AFTER))
         other = list(sampler_run(make()).draws(_AFTER))

@@ -228,7 +228,7 @@ class Timed:
     Args:
         seconds: The budget.
         kind: The clock of the budget.
-        most: Largest number of steps of the run, however fast they are.
+        most: Largest number of steps of the run, for arbitrarily fast steps.
     """
 
     def __init__(self, seconds: float, kind: ClockKind = "wall", *, most: int = _NEVER) -> None:
@@ -309,7 +309,7 @@ def replay_length(setup: Setup, step: int) -> Setup:
 
 
 def _with_notes(setup: Setup, instead_of: Setup) -> Setup:
-    """Return the setup with new notes on its length in place of the outdated notes."""
+    """Return the setup with new notes about its length in place of outdated notes."""
     gone = {*notes_on_length(instead_of), *_length_note(instead_of)}
     kept = (note for note in setup.notes if note not in gone)
     return replace(setup, notes=(*kept, *notes_on_length(setup), *_length_note(setup)))

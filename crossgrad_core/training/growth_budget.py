@@ -63,7 +63,7 @@ def most_after(setup: Setup, schedule: Schedule, step: int, start: int) -> int:
 
 
 def curve(event: int, events: int, start: int, budget: int) -> int:
-    """Return the allowed number of primitives after an edit; `budget` after the last edit.
+    """Return the allowed number of primitives after an edit; after the last edit it is `budget`.
 
     Source: Taming 3DGS (arXiv 2406.15643), A(x) = (B - S - 2 N) (x / N)^2 + 2 x + S.
     """

@@ -43,7 +43,7 @@ class Stopper:
 
     Attributes:
         signal: Number of the first signal; None if there was no signal.
-        at_once: Whether there was a second signal; optional work is then skipped.
+        at_once: True after a second signal; optional work is then skipped.
         error: Error from outside the training step that ends the run; None without an error.
     """
 
@@ -56,7 +56,7 @@ class Stopper:
 
     @property
     def requested(self) -> bool:
-        """Whether training must stop after the present step."""
+        """True if training must stop after the present step."""
         return self.signal is not None or self.error is not None
 
     def fail(self, error: Exception) -> None:
@@ -65,9 +65,9 @@ class Stopper:
 
     @contextmanager
     def installed(self) -> Iterator["Stopper"]:
-        """Handle signals inside the block; does nothing outside the main thread.
+        """Handle signals inside the block; this does nothing outside the main thread.
 
-        Signals that the process ignores already (`nohup`, background jobs) stay ignored.
+        Signals that the process already ignores (`nohup`, background jobs) are still ignored.
         """
         before = self._before
         try:
@@ -118,8 +118,8 @@ _VIEWS, _STEPS = 8, 2
 class Prefetcher:
     """A prefetcher of photos: draws future views with copies of the sampler's stream and state.
 
-    The prediction only decides which photos are decoded first. It may be wrong for a sampler that
-    uses the losses of the last step. The state of the run is not changed.
+    The prediction only decides which photos are decoded first. The prediction may be wrong for a
+    sampler that uses the losses of the previous step. The state of the run is not changed.
 
     Args:
         setup: The run.
@@ -218,8 +218,8 @@ def train(
     each call creates a new guard.
 
     Raises:
-        TrainingFailedError: A value was not finite for the second time, or at the start; names
-            step, views and block.
+        TrainingFailedError: A value was not finite for the second time, or at the start; the
+            message names step, views and block.
         BaseException: An error of a plugin, a photo, the memory or the disk, with the step as a
             note. After any exception, `state` is the last good state.
     """
@@ -297,7 +297,10 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
 
 
 def _is_good(setup: Setup, state: TrainState, sink: RunWriter, guard: RollbackGuard) -> bool:
-    """Check a state before it is kept; if it is bad, rewind training. Return True if it is good."""
+    """Check a state before it is kept; if it is bad, rewind training.
+
+    Return True if the state is good.
+    """
     try:
         guard.check(state)
     except NonFiniteError as error:
@@ -339,12 +342,12 @@ def copies_after(setup: Setup, step: int) -> bool:
 
 
 def saves_after(setup: Setup, step: int) -> bool:
-    """Return True if a checkpoint is written after this step, which is not the last one."""
+    """Return True if a checkpoint is written after this step; False for the last step."""
     return step % setup.numbers.save_every == 0 and step < setup.schedule.total
 
 
 def evaluates_after(setup: Setup, step: int) -> bool:
-    """Return True if held-out views are evaluated after this step, which is not the last one."""
+    """Return True if held-out views are evaluated after this step; False for the last step."""
     every = setup.numbers.eval_every
     first = max(1, setup.config.eval_from)
     # Opacities are also reset every tenth of the steps, and renders are poor right after a reset.

@@ -71,12 +71,12 @@ class Demand:
     """Peak memory of a step for each primitive.
 
     Attributes:
-        parameters: Bytes of its parameters.
+        parameters: Bytes of the parameters.
         kept: Further bytes in the records of all views: decoded tensors and statistics.
         views: K.
-        separate: Whether the gradients of the views are stored separately.
-        watched: Whether the combined gradient must not overwrite the gradient of a view.
-        joint: Whether the graphs of all views exist at once.
+        separate: True if the gradients of the views are stored separately.
+        watched: True if the combined gradient must not overwrite the gradient of a view.
+        joint: True if the graphs of all views exist at the same time.
         copies: Copies of the parameters in the states of rules.
     """
 

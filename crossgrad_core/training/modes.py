@@ -12,7 +12,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
     """Return a note if the quantity that the grouping splits has a single mode, else no note.
 
     The finite-sample form of the bimodality coefficient decides; for small samples, the form with
-    plain moments decides.
+    plain moments is used.
 
     Args:
         name: Name of the grouping.

@@ -43,7 +43,7 @@ def write_values(
         values: Name of a parameter -> [P, ...].
 
     Raises:
-        UserError: The disk is full, or the folder may not be written to.
+        UserError: The disk is full, or the folder is not writable.
     """
     plain = {name: each.detach().cpu().tolist() for name, each in values.items()}
     rows = {
@@ -184,7 +184,7 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
     """Check that the state contains the values of exactly the training photos.
 
     Raises:
-        UserError: It contains values of other photos.
+        UserError: The state contains values of other photos.
     """
     held = state.states.get(STATE, EMPTY_STATE).values.get("photos", [])
     names = [view.name for view in setup.train_views] if setup.per_photo else []
@@ -231,7 +231,7 @@ def take_photo_step(
 
     Args:
         setup: The run.
-        state: The state of the run; gets new tensors.
+        state: The state of the run, which gets new tensors.
         taken: Position of each drawn view and its leaves after the backward passes.
         progress: Completed share of the schedule, for the learning rates.
 
@@ -293,7 +293,7 @@ def _check_gradients(
 
 
 def _is_finite(tensor: Tensor) -> bool:
-    """Return True if finite or on a GPU, where the loss of the photo's next draw shows an error."""
+    """Return True if finite or on a GPU, where the next loss of the photo shows an error."""
     return not tensor.is_cpu or bool(torch.isfinite(tensor).all())
 
 

@@ -18,9 +18,8 @@ def view_gradients(model: Model, view: View, tensors: Sequence[str]) -> dict[str
         view: Any view of the scene.
         tensors: Names of tensors of `model.parameters`.
 
-    Returns:
-        Name -> gradient in the shape of its tensor; absent for a tensor that is frozen or that the
-        view does not touch.
+    Returns: Name -> gradient in the shape of its tensor; tensors that are frozen or that the view
+    does not touch are absent.
     """
     wanted = {n: model.parameters[n] for n in tensors if model.parameters[n].requires_grad}
     gaussians = model.backbone.decode(model.parameters, view.camera, model.phase)

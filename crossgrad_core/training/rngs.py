@@ -1,4 +1,4 @@
-"""Named random streams: one generator per purpose, so that one draw never shifts another."""
+"""Named random streams: one generator per purpose, so that one draw never shifts other draws."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, cast

@@ -1,4 +1,4 @@
-"""Calls of rules: Gaussians of a view, learning rates, and parameters for evaluation."""
+"""Calls of rules: for Gaussians of a view, learning rates, and parameters in evaluations."""
 
 from dataclasses import replace
 from math import inf, prod
@@ -15,7 +15,7 @@ from crossgrad_core.training.state import TrainState
 
 
 def view_gaussians(setup: Setup, state: TrainState, context: GaussiansContext) -> Gaussians:
-    """Return the Gaussians that a training view is rendered from.
+    """Return the Gaussians from which a training view is rendered.
 
     Raises:
         UserError: A rule gives another number of Gaussians.

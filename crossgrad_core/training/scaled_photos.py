@@ -19,8 +19,8 @@ _Size = tuple[int, int]
 class ScaledPhotos:
     """A cache of reduced photos: for each view, the last requested size and its source.
 
-    The source is the photo, halved as often as it stays larger than the requested size. If the size
-    changes from step to step, most of the work is done once.
+    The source is the photo after as many halvings as leave it at least as large as the requested
+    size. If the size changes from step to step, most of the work is done once.
 
     Args:
         mib: Memory in MiB; photos that do not fit are computed again.
@@ -71,13 +71,13 @@ class DevicePhotos:
         self._kept: dict[str, tuple[_Size, Pair]] = {}
 
     def holds(self, view: View, camera: Camera) -> bool:
-        """See `ScaledPhotos.holds`."""
+        """Return True if the photo is cached; see `ScaledPhotos.holds`."""
         held = self._kept.get(view.name)
         here = held is not None and held[0] == (camera.width, camera.height)
         return here or self._scaled.holds(view, camera)
 
     def get(self, view: View, camera: Camera, full: Callable[[View], Pair]) -> Pair:
-        """See `ScaledPhotos.get`; `full` returns the photo in host memory."""
+        """Return the photo and mask on the GPU; `full` returns them in host memory."""
         size = camera.width, camera.height
         held = self._kept.get(view.name)
         if held is not None and held[0] == size:

@@ -36,9 +36,9 @@ from crossgrad_core.training.scaled_photos import DevicePhotos, ScaledPhotos
 
 
 def learns_in(step: int, every: int) -> bool:
-    """Return True if a tensor that learns in one of `every` steps learns in this one.
+    """Return True if a tensor with one update in `every` steps is updated in this step.
 
-    One step of each `every` steps is chosen by a hash. So no photo or regime is left out if a
+    A hash chooses one step of each `every` steps. No photo or regime is therefore left out if a
     sampler cycles through photos or regimes.
     """
     turn, place = divmod(step - 1, every)
@@ -71,10 +71,10 @@ class Scale:
 
 
 class OperatorScale:
-    """The factors c(K), the sums of an operator's weights for K equal gradients.
+    """The factors c(K), which are the sums of an operator's weights for K equal gradients.
 
     The operator is called once for each combination of K and labels, with K equal gradients of one
-    element per tensor, without state. The views differ in their labels only. This defines a scale
+    element per tensor, without state. The views differ only in their labels. This defines a scale
     for every operator: chains, one operator per block, element-wise operators and plugins.
 
     Args:
@@ -183,7 +183,7 @@ class Setup:
         return Numbers.of(self.in_force)
 
     def following(self, steps: int, start: int | None) -> dict[str, Any]:
-        """Return the values that length-dependent settings have for a total of `steps` steps.
+        """Return the length-dependent settings for a total of `steps` steps.
 
         Args:
             steps: Steps of the run.
@@ -277,7 +277,7 @@ class Setup:
 
     @cached_property
     def weighs(self) -> bool:
-        """Whether any plugin weighs pixels."""
+        """True if any plugin weighs pixels."""
         return bool(self.hook.crossgrad_pixel_weights.get_hookimpls())
 
     @cached_property
@@ -288,7 +288,7 @@ class Setup:
 
     @cached_property
     def separate(self) -> bool:
-        """Whether the gradients of the views are stored separately."""
+        """True if the gradients of the views are stored separately."""
         return self.operator.separate or bool(self.watchers)
 
     @cached_property
@@ -298,7 +298,7 @@ class Setup:
 
     @cached_property
     def joint(self) -> bool:
-        """Whether one backward pass runs through the sum of the views' losses."""
+        """True if one backward pass runs through the sum of the views' losses."""
         return self.config.backward == "joint"
 
     @cached_property
@@ -336,27 +336,27 @@ class Setup:
 
     @cached_property
     def regularizes(self) -> bool:
-        """Whether any plugin adds loss terms."""
+        """True if any plugin adds loss terms."""
         return bool(self.hook.crossgrad_regularize.get_hookimpls())
 
     @cached_property
     def shows_model(self) -> bool:
-        """Whether any plugin reads the model after a step."""
+        """True if any plugin reads the model after a step."""
         return bool(self.hook.crossgrad_model_ready.get_hookimpls())
 
     @cached_property
     def acts_after_step(self) -> bool:
-        """Whether any plugin acts after the step."""
+        """True if any plugin acts after the step."""
         return bool(self.hook.crossgrad_after_step.get_hookimpls())
 
     @cached_property
     def follows_steps(self) -> bool:
-        """Whether any plugin updates a state after each complete step."""
+        """True if any plugin updates a state after each complete step."""
         return bool(self.hook.crossgrad_step_done.get_hookimpls())
 
     @cached_property
     def changes_rates(self) -> bool:
-        """Whether any plugin changes learning rates."""
+        """True if any plugin changes learning rates."""
         return bool(self.hook.crossgrad_rate_factor.get_hookimpls())
 
     @cached_property

@@ -57,8 +57,8 @@ def compiling_beside(setup: Setup) -> Iterator[None]:
     """Compile kernels in a second process, which starts at the first missing kernel.
 
     The second process is not used with a single core or thread, or for a GPU. At the end of the
-    block, this process waits for it. Then all kernels for sparse rows are loaded here, because few
-    and many rows use different kernels, and a view of either kind may first occur during training.
+    block, this process waits for it. Then all kernels for sparse rows are loaded, because few and
+    many rows use different kernels, and a view of either kind may first occur during training.
     """
     alone = setup.config.threads == 1 or available_cores() == 1
     processes: list[subprocess.Popen[bytes]] = []
@@ -150,10 +150,10 @@ def first_state(setup: Setup) -> TrainState:
 def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Parameters, int | None]:
     """Return parameters made from SfM points, from random points, or from a PLY of Gaussians.
 
-    If the points would make more primitives than the user's bound, points are drawn at random so
-    that the run starts with the share `BEGINNING` of the bound. The rest is left for density
-    control, which places primitives where the photos need them. Without density control, the run
-    starts with the full bound. A PLY is used unchanged.
+    If the points would make more primitives than the user's bound, points are drawn at random, so
+    that the run starts with the share `BEGINNING` of the bound. The remaining share is left for
+    density control, which places primitives where the photos need them. Without density control,
+    the run starts with the full bound. A PLY is used unchanged.
 
     Returns:
         The parameters, and the number of primitives that all points would have made; None if all
@@ -206,7 +206,7 @@ def _begun(setup: Setup) -> Scene:
 
 
 def _misfit(begun: Scene, known: int) -> str:
-    """Return what is wrong with the points after the first `known` ones; empty if all are valid."""
+    """Return the problem of the points after the first `known` ones; empty if all are valid."""
     points, sizes, opacities = begun.points[known:], begun.point_sizes, begun.point_opacities
     if sizes is None or opacities is None:
         return ""
@@ -228,7 +228,7 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
     """Return the checked parameters from a method of the backbone.
 
     Raises:
-        UserError: The result is not a dictionary, or lacks tensors that the blocks name (after
+        UserError: The result is not a dictionary, or it lacks tensors that the blocks name (after
             `prepare`: any of them; before: the first per-primitive tensor).
     """
     parameters = answered(answer, dict, setup.backbone, method)
@@ -300,7 +300,7 @@ def warm_up(setup: Setup, reached: TrainState | None = None) -> float:
     """Compile every kernel that the run needs, with temporary states.
 
     Photos are decoded at the same time, because compilers run one at a time and release the
-    interpreter.
+    interpreter lock.
 
     Args:
         setup: The run.

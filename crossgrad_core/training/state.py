@@ -88,15 +88,15 @@ class Clock:
 
 @dataclass
 class PhaseTimer:
-    """The phases of the present step; an interrupted step is not counted.
+    """The phases of the current step; an interrupted step is not counted.
 
     Attributes:
         phase_began: Time at which the present phase began.
-        total: Seconds from the start of the step to the end of the last phase, without excluded
+        total: Seconds from the start of the step to the end of the previous phase, without excluded
             seconds.
         spent: Phase -> seconds.
         cpu: CPU seconds of the process in the same time, without excluded seconds.
-        cpu_border: CPU time of the process at the end of the last phase.
+        cpu_border: CPU time of the process at the end of the previous phase.
     """
 
     phase_began: float = field(default_factory=perf_counter)
@@ -106,7 +106,7 @@ class PhaseTimer:
     cpu_border: float = field(default_factory=process_time)
 
     def lap(self, phase: Phase) -> None:
-        """End a phase: add the time since the end of the last phase to it."""
+        """End a phase: add the time since the end of the previous phase to its total."""
         now = perf_counter()
         seconds = now - self.phase_began
         self.spent[phase] = self.spent.get(phase, 0.0) + seconds
@@ -146,13 +146,13 @@ class Counters:
 
 @dataclass
 class TrainState:
-    """Everything that a step reads and writes.
+    """All values that a step reads and writes.
 
     Attributes:
         tensors: The parameters as stored in memory. Some rows may have deferred Adam steps, and a
             step may still run on other threads.
         moments: The optimizer's moments, under the same conditions.
-        rngs: Stream name -> its generator.
+        rngs: Stream name -> generator of the stream.
         states: Plugin name -> its state.
         step: Number of steps, including the present one.
         last: Record of the last complete step.
@@ -160,7 +160,7 @@ class TrainState:
         clock: Seconds so far.
         laps: Phases of the present step.
         rewinds: How often training was rewound to the last good state.
-        touched: Whether an incomplete step has begun to change parameters or moments.
+        touched: True if an incomplete step has begun to change parameters or moments.
         late: The deferred steps of rows, and the steps that still run on other threads.
     """
 
@@ -254,9 +254,9 @@ class TrainState:
 
 
 def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -> str:
-    """Return what in a state a checkpoint cannot store; empty if it can store everything.
+    """Return what a checkpoint cannot store of a state; empty if it can store everything.
 
-    To be fast in each step, it checks only names that are not in the state `known`.
+    For speed in each step, only names that are not in the state `known` are checked.
     """
     for kind in ("values", "tensors", "per_primitive"):
         have = getattr(known, kind)
@@ -281,7 +281,7 @@ def no_json(value: object) -> str:
 
 
 def _odd(value: object, device: str) -> str:
-    """Return how a value differs from a tensor that a file can store; empty if it is storable."""
+    """Return how a value differs from a tensor that a file can store; empty if it can be stored."""
     if not isinstance(value, Tensor):
         return f"of type {type(value).__name__}, not a tensor"
     plain = value.layout == torch.strided and not value.dtype.is_complex and not value.is_quantized
@@ -330,7 +330,7 @@ class _Current(Mapping[str, Tensor]):
 
 @dataclass(frozen=True, eq=False)
 class StepSnapshot:
-    """Everything that a step changes except parameters and moments, at one moment.
+    """All values that a step changes except parameters and moments, at one time.
 
     Plugin states and records are immutable values and need no copy.
     """
@@ -426,7 +426,7 @@ class NonFiniteError(Exception):
     """A loss, gradient or parameter is NaN or infinite.
 
     Args:
-        step: Step in which it was found.
+        step: Step in which the value was found.
         views: Names of the views of that step, or of the single view if it is known.
         block: Description of the value that is not finite.
     """
@@ -464,7 +464,7 @@ def check_start(state: TrainState) -> None:
     """Check the state at the start of training, before which there is no state to restore.
 
     Raises:
-        TrainingFailedError: A parameter or moment is NaN or infinite; names it.
+        TrainingFailedError: A parameter or moment is NaN or infinite; the message names it.
     """
     parts = {
         "block": state.parameters,
@@ -551,7 +551,7 @@ class RollbackGuard:
     def restore(self, state: TrainState) -> None:
         """Restore `state` to the last complete step or, if this is impossible, to the copy.
 
-        This is for the end of training, because the copy may be used up.
+        This method is for the end of training, because the copy cannot be used again.
         """
         for tensor in state.tensors.values():
             tensor.grad = None

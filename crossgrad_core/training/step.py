@@ -436,7 +436,7 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
 
 
 def _misfit(answer: AggregateResult, wanted: Mapping[str, Tensor]) -> str:
-    """Return what in a result does not fit the trained tensors; empty if all fits."""
+    """Return the reason why a result does not fit the trained tensors; empty if it fits."""
     for part in (answer.gradients, answer.counts):
         if not isinstance(part, Mapping):
             return f"{type(part).__name__}, not a mapping of names"

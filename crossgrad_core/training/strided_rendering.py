@@ -1,4 +1,4 @@
-"""Strided rendering: one pixel of each n x n is rendered, at a position that varies by step."""
+"""Strided rendering: one pixel of each n x n block is rendered, at a varying position."""
 
 from dataclasses import replace
 from math import isclose
@@ -25,15 +25,16 @@ def stride_of(scale: float, camera: Camera) -> int:
 
 
 def corner_of(step: int, slot: int, stride: int) -> Corner:
-    """Return the pseudo-random pixel of each n x n that a step renders of its view at `slot`."""
+    """Return the pseudo-random pixel of each n x n block that a step renders for `slot`."""
     place = hash32(hash32(step) + slot) * stride * stride >> 32
     return place % stride, place // stride
 
 
 def camera_of(camera: Camera, stride: int, corner: Corner) -> Camera:
-    """Return the camera whose pixels are every n-th pixel of `camera`, from `corner` on.
+    """Return the camera whose pixels are every n-th pixel of `camera`, starting at `corner`.
 
-    The centre of its pixel (i, j) is the centre of pixel (corner + n (i, j)) of `camera`.
+    The centre of pixel (i, j) of the new camera is the centre of pixel (corner + n (i, j)) of
+    `camera`.
     """
     column, row = corner
     return replace(
@@ -70,8 +71,8 @@ def _copied(pixels: Tensor) -> Tensor:
 def as_in_full(gaussians: Gaussians, rasterizer: Rasterizer, stride: int) -> Gaussians:
     """Return the Gaussians with the dilation of the full photo, in units of n times wider pixels.
 
-    With it, a render with `camera_of` has the same values as the full render at these pixels,
-    except for Gaussians so far outside the image that their positions are clamped.
+    A render with this dilation and `camera_of` has the same values as the full render at these
+    pixels, except for Gaussians so far outside the image that their positions are clamped.
     """
     if stride == 1:
         return gaussians

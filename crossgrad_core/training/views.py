@@ -60,7 +60,7 @@ class Target:
         scale: Side length of the render divided by the side length of the photo as trained.
         photo: [H, W, 3] uint8.
         mask: [H, W] bool; None if every pixel counts.
-        stride: n if the render contains one pixel of each n x n pixels of the photo.
+        stride: n if the render contains one pixel of each n x n block of the photo.
     """
 
     camera: Camera
@@ -78,8 +78,8 @@ def target_at(setup: Setup, state: TrainState, index: int, scale: float, slot: i
         state: The state of the run.
         index: The training view.
         scale: The scale.
-        slot: Position of the view in the step; with the step number, it determines the pixels of a
-            strided view.
+        slot: Position of the view in the step; together with the step number, it determines the
+            pixels of a strided view.
     """
     view = setup.train_views[index]
     stride, camera = _stride_at(setup, view, scale), photo_camera(setup, view, scale)
@@ -148,7 +148,7 @@ def camera_at(camera: Camera, scale: float) -> Camera:
 
 
 def context_fields(setup: Setup, state: TrainState, stream: str) -> dict[str, Any]:
-    """Return the fields that the contexts of all hooks of a step share."""
+    """Return the fields that the contexts of all hooks of a step have in common."""
     return {
         "step": state.step,
         "schedule": setup.schedule,
@@ -292,7 +292,7 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """A rendered view with its graph. Its record does not contain the loss yet."""
+    """A rendered view with its graph. The record does not contain the loss yet."""
 
     record: ViewRecord
     gaussians: Gaussians
@@ -385,7 +385,7 @@ def _together(
     """Yield each view with its gradients; all views share one render call and one backward pass.
 
     This backward pass ends at copies of the decoded Gaussians of each view. A second backward pass
-    per view leads from there to the parameters.
+    per view continues from these copies to the parameters.
     """
     _clear(state.tensors)
     slots = range(len(draw.views))
@@ -423,7 +423,7 @@ def _pass_back(decoded: Gaussians, copy: Gaussians) -> None:
 def _with_losses(
     state: TrainState, records: Sequence[ViewRecord], losses: Sequence[Tensor]
 ) -> tuple[ViewRecord, ...]:
-    """Return the records with their losses, which are read together to wait for a GPU only once.
+    """Return the records with their losses, which are read together so that the host waits once.
 
     Raises:
         NonFiniteError: A loss is not finite.
@@ -521,7 +521,7 @@ def _compare(
 
 
 def _seen(setup: Setup, state: TrainState, camera: Camera) -> Gaussians:
-    """Return the decoded Gaussians of a view; some tensors are updated when they are drawn."""
+    """Return the decoded Gaussians of a view; some tensors are updated when they are rendered."""
     phase = setup.phase(state.step, training=True)
     tensors = _learning(setup, state)
     answer = setup.backbone.decode(tensors, camera, phase)
@@ -594,7 +594,7 @@ class RenderCallback:
     Attributes:
         setup: The run.
         state: The state of the run.
-        counted: Whether the renders count as rendered views.
+        counted: True if the renders count as rendered views.
     """
 
     setup: Setup
@@ -608,7 +608,7 @@ class RenderCallback:
         outputs: frozenset[str] = frozenset(),
         background: Tensor | None = None,
     ) -> RequestedRender:
-        """See `RenderOnRequest`.
+        """Return the rendered view; see `RenderOnRequest`.
 
         Raises:
             UserError: There is no such view, or the scale is out of bounds.

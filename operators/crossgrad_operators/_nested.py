@@ -54,7 +54,7 @@ OperatorField: TypeAlias = Annotated[
 
 
 def reads_gramians(operators: Iterable[MatrixOperator]) -> bool:
-    """Return whether any of these operators depends on the Gramians."""
+    """Return True if any of these operators depends on the Gramians."""
     return any(isinstance(each, GramianOperator) and each.reads_gramians() for each in operators)
 
 

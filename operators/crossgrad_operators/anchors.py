@@ -22,8 +22,8 @@ from crossgrad_operators.projection import project, slot_order
 class Anchors(GramianOperator):
     """`symmetric` between a nearest and a farthest view, and `sum` between other views.
 
-    Use it with the sampler `anchors-30`: the nearest and the farthest 30 % of the cameras are
-    anchors. The cameras in between contribute plain photometric gradients.
+    Use this operator with the sampler `anchors-30`: the nearest and the farthest 30 % of the
+    cameras are anchors. The cameras in between contribute plain photometric gradients.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)

@@ -14,8 +14,8 @@ class Aligned(Weighting):
     """Reduction of all singular values of the gradient matrix to its smallest singular value.
 
     G = V L V^T; w = sqrt(l_min) V L^-1/2 V^T p with p = 1/K and l_min the smallest eigenvalue above
-    K eps l_max. If an eigenvalue falls below this limit, u jumps: the eigenvalue's direction is
-    omitted, and l_min becomes the next larger eigenvalue.
+    K eps l_max. If an eigenvalue falls below this limit, the result u is discontinuous: the
+    eigenvalue's direction is omitted, and l_min becomes the next larger eigenvalue.
 
     Source: Senushkin et al. 2023, "Independent component alignment".
     """
@@ -32,11 +32,11 @@ class Aligned(Weighting):
 
 
 class IMTLG(Weighting):
-    """The combination with equal projections on all unit gradients, weights adding up to 1.
+    """The combination with equal projections on all unit gradients and weights that add up to 1.
 
     G v = (|g_k|), w = v / sum v. For two views, w = (|g_2|, |g_1|) / (|g_1| + |g_2|): the bisector.
-    If G is singular, v is the shortest least-squares solution. If the sum of the v is zero, or if
-    the result is only rounding noise, the result is zero.
+    If G is singular, v is the shortest least-squares solution. If the sum of v is zero, or if the
+    result is only rounding noise, the result is zero.
 
     Source: Liu et al. 2021, "Towards impartial multi-task learning".
     """
@@ -56,9 +56,9 @@ class Nash(Weighting):
     """The bargaining solution: alpha > 0 with G alpha = 1 / alpha, u = sum alpha_k g_k.
 
     Two views use a closed form. More views use damped Newton steps (decrement 1e-13). |u| would
-    always be sqrt(K). It is multiplied by the geometric mean of the norms, so that u scales with
-    the gradients and a single view is unchanged. The result is zero if the gradients are exactly
-    opposite.
+    always be sqrt(K). The solution is multiplied by the geometric mean of the norms, so that u
+    scales with the gradients and a single view is unchanged. The result is zero if the gradients
+    are exactly opposite.
 
     Source: Navon et al. 2022, "Multi-task learning as a bargaining game".
     """

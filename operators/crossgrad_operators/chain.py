@@ -65,7 +65,7 @@ class Chain(GramianOperator):
         return any(link.reads_labels() for link in self.links)
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         return inner_idle(selection, "links", self.links)
 
     @override
@@ -104,7 +104,7 @@ class Chain(GramianOperator):
 def _noise(
     seen: NDArray[np.float64], product: NDArray[np.float64], gramians: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return the rows [B, R] of M G that are zero, or rounding noise of terms that cancel."""
+    """Return the rows [B, R] of M G that are zero, or only rounding noise of cancelling terms."""
     norms = np.sqrt(np.diagonal(gramians, axis1=1, axis2=2))
     terms = np.abs(product) @ norms[:, :, None]
     empty: NDArray[np.bool_] = np.diagonal(seen, axis1=1, axis2=2) <= _NOISE * terms[:, :, 0] ** 2

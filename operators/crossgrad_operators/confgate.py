@@ -17,7 +17,7 @@ _THRESHOLDS: Final = {"v2": 0.9, "low": 0.6}
 
 
 class ConfGate(GramianOperator):
-    """Projection of a pair only if it conflicts now and has probably conflicted for some time.
+    """A projection of a pair only if it conflicts now and has probably conflicted for some time.
 
     The mean mu and the variance v of the block's cosine are exponential averages (bias-corrected)
     with n_eff = (1 + beta) / (1 - beta) effective samples.
@@ -36,7 +36,7 @@ class ConfGate(GramianOperator):
     warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         return {} if self.tau is None else {"variant": "tau wins over it; leave one of the two out"}
 
     @override

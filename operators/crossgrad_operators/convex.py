@@ -38,8 +38,9 @@ class CAGrad(Weighting):
 
     max over |d - g_0| <= c |g_0| of min_k g_k.d, g_0 the mean: d = g_0 + (c |g_0| / |g_w|) g_w,
     where w on the simplex minimises g_w.g_0 + c |g_0| |g_w|. Two views use a closed form. For more
-    views, d is the point nearest to g_0 in the polyhedron in which all views reach a level. It is
-    found by active sets, with 32 digits for gradients in float64. A single view is not changed.
+    views, d is the point nearest to g_0 in the polyhedron in which all views reach a level. The
+    point is found by active sets, with 32 digits for gradients in float64. A single view is not
+    changed.
 
     Source: Liu et al. 2021, "Conflict-averse gradient descent for multi-task learning".
     """
@@ -55,7 +56,7 @@ class CAGrad(Weighting):
         return self.c > 0
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.c > 0:
             return {}
         return {"rescale": "it divides by 1 where c = 0; leave it out"}

@@ -57,7 +57,7 @@ def _as_mapping(rules: tuple[Rule, ...]) -> dict[str, object]:
 
 
 class Dispatch(GramianOperator):
-    """A different operator for each block: from its rule, its kind's rule, or the variant.
+    """A different operator for each block: from the block's rule, its kind's rule, or the variant.
 
     Variants of the paper: `geometry-confgate` gates the geometry and adds the appearance.
     `geometry-projection` projects the geometry and gates the appearance.
@@ -98,7 +98,7 @@ class Dispatch(GramianOperator):
         return any(operator.reads_labels() for operator in self._operators().values())
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         given = self._given(selection)
         ruled = {rule.block for rule in self.rules}
         keys = {self._key(name, kind, ruled) for name, kind in given}

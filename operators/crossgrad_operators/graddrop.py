@@ -11,7 +11,7 @@ from crossgrad_core.plugin import AggregateContext, AggregateResult, Operator, P
 
 
 class GradDrop(Operator):
-    """A random choice, in every element, between its positive and its negative gradients.
+    """A random choice, in every element, between the positive and the negative gradients.
 
     p is the sum of the positive magnitudes and n the sum of the negative magnitudes. The positive
     gradients are kept with probability p / (p + n), else the negative gradients. All views share
@@ -46,7 +46,7 @@ class GradDrop(Operator):
 
 
 def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
-    """Return the sum of either the positive or the negative elements, chosen in each place."""
+    """Return the sum of either the positive or the negative values, chosen for each element."""
     first = views[0]
     dtype = torch.promote_types(first.dtype, torch.float32)
     positive = torch.zeros_like(first, dtype=dtype)

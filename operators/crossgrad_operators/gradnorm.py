@@ -48,7 +48,7 @@ class GradNorm(GramianOperator):
         return True
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.alpha > 0:
             return {}
         return dict.fromkeys(("baseline", "decay"), "alpha = 0 looks at no losses; leave it out")

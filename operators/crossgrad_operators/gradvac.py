@@ -14,7 +14,7 @@ from crossgrad_operators.projection import random_order
 
 
 class GradVac(GramianOperator):
-    """A sum of gradients, each rotated towards its partners up to their usual cosine.
+    """A sum of gradients, each rotated towards its partners up to their average cosine.
 
     For each i, for j != i in random order: phi = cos(v, g_j); if phi < t_ij, v gets the multiple of
     g_j that raises the cosine to t_ij; then t_ij <- (1 - beta) t_ij + beta phi, clipped to +-0.999.

@@ -21,7 +21,7 @@ class Symmetric(GramianOperator):
     equations proj_near, proj_far and final_update): two-task PCGrad. With more than two views,
     every ordered pair is projected in the order of the slots, always with the original partner.
 
-    The primary operator of CrossGrad-GS (arXiv 2605.00052).
+    This is the primary operator of CrossGrad-GS (arXiv 2605.00052).
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -41,8 +41,8 @@ class PCGrad(GramianOperator):
     """A sum of gradients that lose their components against conflicting partners in random order.
 
     For each i: v = g_i; for j != i in random order: if v.g_j < 0, v -= (v.g_j / |g_j|^2) g_j, with
-    the original g_j; u is the sum of all v. All blocks share one order per step. With two views,
-    nothing is drawn.
+    the original g_j; u is the sum of all v. All blocks share one order per step. With two views, no
+    random number is drawn.
 
     Source: Yu et al. 2020, "Gradient surgery for multi-task learning", algorithm 1.
     """
@@ -65,7 +65,8 @@ class Soft(GramianOperator):
     """Removal of `strength` times the component along g_j if cos(g_i, g_j) < -threshold.
 
     v -= strength (v.g_j / |g_j|^2) g_j. Threshold 0 and strength 1 equal `symmetric`, and strength
-    0 equals `sum`. With a threshold above 0 the rule has a jump. Pairs are in the order of slots.
+    0 equals `sum`. With a threshold above 0 the rule is discontinuous. Pairs are processed in the
+    order of slots.
     """
 
     identity_at_one: ClassVar[bool] = True
@@ -77,7 +78,7 @@ class Soft(GramianOperator):
         return self.strength > 0
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.strength > 0:
             return {}
         return {"threshold": "nothing is taken away where strength = 0; leave it out"}
@@ -106,7 +107,10 @@ def slot_order(views: int) -> NDArray[np.int64]:
 
 
 def random_order(views: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the partners [K, K] of each view in random order. With one partner, draw nothing."""
+    """Return the partners [K, K] of each view in random order.
+
+    With a single partner, no random number is drawn.
+    """
     order = slot_order(views)
     return order if views <= 2 else rng.permuted(order, axis=1)  # noqa: PLR2004
 
@@ -126,7 +130,8 @@ def project(
         gramians: [B, K, K].
         context: Gives the views that are present.
         order: [K, K] order of the partners of each view.
-        gates: [B, K, K] True for pairs that may be projected. By default all.
+        gates: [B, K, K] True for pairs that may be projected. By default, all pairs may be
+            projected.
         threshold: Only cosines below minus this value are conflicts.
         strength: Share of the conflicting component that is removed.
     """

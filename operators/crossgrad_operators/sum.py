@@ -18,7 +18,8 @@ from crossgrad_core.plugin import (
 class Sum(MatrixOperator):
     """u = sum of g_k, equal to one backward pass through the sum of the losses.
 
-    No Gramian and no separate gradients are needed. Separate gradients give the same bits.
+    No Gramian and no separate gradients are needed. Separate gradients give the same bits as
+    accumulated gradients.
     """
 
     separate: ClassVar[bool] = False

@@ -363,7 +363,9 @@ def test_bad_input_is_refused_with_one_message(make, scene, tmp_path, capfd, mon
         ("seed: 3", ["--device", "gpu"], "--device"),
     ],
 )
-def test_a_message_names_the_file_that_made_a_setting(text, more, where, scene, tmp_path, capfd):
+def test_an_error_names_the_file_that_contains_the_wrong_setting(
+    text, more, where, scene, tmp_path, capfd
+):
     path = tmp_path / "run.yaml"
     path.write_text(text)
     out = ["--out", str(tmp_path / "out")]
@@ -377,7 +379,7 @@ def full_disk(*args: object, **kwargs: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_full_disk_is_one_message_and_earlier_results_stay(scene, tmp_path, capfd, monkeypatch):
+def test_a_full_disk_gives_one_error_and_keeps_earlier_results(scene, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
@@ -387,7 +389,7 @@ def test_a_full_disk_is_one_message_and_earlier_results_stay(scene, tmp_path, ca
     assert not (tmp_path / "out").exists()
 
 
-def test_a_disk_that_fills_during_the_run_is_one_message(scene, tmp_path, capfd, monkeypatch):
+def test_a_disk_that_fills_during_the_run_gives_one_error(scene, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", full_disk)
     assert failing(["run", str(scene), "--out", str(tmp_path / "out"), *BASE]) == 1
@@ -397,6 +399,6 @@ def test_a_disk_that_fills_during_the_run_is_one_message(scene, tmp_path, capfd,
     assert (tmp_path / "out" / "config.yaml").is_file()
 
 
-def test_there_are_at_least_25_kinds():
+def test_the_tests_cover_at_least_25_kinds_of_bad_input():
     assert len(MAKERS) >= 25
     assert np.unique([make.__name__ for make in MAKERS]).size == len(MAKERS)

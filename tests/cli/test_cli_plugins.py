@@ -68,7 +68,7 @@ def third_party(tmp_path, monkeypatch):
     sys.modules.pop("made_up_cli", None)
 
 
-def test_version(ran):
+def test_version_option_prints_the_version(ran):
     assert ran("--version") == (0, f"crossgrad {__version__}\n", "")
 
 
@@ -90,7 +90,7 @@ def test_version(ran):
     ],
     ids=" ".join,
 )
-def test_help_fits_the_terminal(ran, arguments):
+def test_help_fits_a_terminal_of_80_columns(ran, arguments):
     code, out, err = ran(*arguments)
     assert (code, err) == (0, "")
     assert out.startswith("Usage: crossgrad")
@@ -117,20 +117,20 @@ def test_the_list_names_every_plugin_with_its_package(ran, arguments):
 
 
 @pytest.mark.parametrize("slot", ["operators", "operator"])
-def test_the_list_of_one_slot(ran, slot):
+def test_plugins_list_can_be_limited_to_one_slot(ran, slot):
     out = ran("plugins", "list", "--slot", slot)[1]
     assert "symmetric" in out
     assert "samplers" not in out
 
 
-def test_a_name_offered_twice_is_marked_in_the_list(ran, third_party, monkeypatch):
+def test_a_plugin_name_of_two_packages_is_marked_in_the_list(ran, third_party, monkeypatch):
     monkeypatch.syspath_prepend(third_party)
     rows = [row for row in ran("plugins")[1].splitlines() if row.startswith("  halving ")]
     assert len(rows) == 2
     assert all("offered twice" in row for row in rows)
 
 
-def test_the_list_and_the_check_report_an_entry_point_in_an_unknown_group(
+def test_list_and_check_report_an_entry_point_in_an_unknown_group(
     ran, tmp_path, monkeypatch, capsys
 ):
     lost = {"operator": {"lost": "made_up_cli:Halving"}}
@@ -146,9 +146,7 @@ def test_the_list_and_the_check_report_an_entry_point_in_an_unknown_group(
     assert code == 2 and "there is no entry-point group crossgrad.operator" in err
 
 
-def test_the_check_of_a_package_fails_for_an_entry_point_in_an_unknown_group(
-    ran, third_party, monkeypatch
-):
+def test_check_fails_for_an_entry_point_in_an_unknown_group(ran, third_party, monkeypatch):
     both = {"operators": {"halving": "made_up_cli:Halving"}, "operator": {"lost": "made_up_cli:A"}}
     write_distribution(third_party, "both-package", both)
     monkeypatch.syspath_prepend(third_party)
@@ -189,7 +187,7 @@ def test_show_prints_options_bounds_docstring_and_package(ran, third_party):
 
 
 @pytest.mark.parametrize("slot", list(GROUPS))
-def test_every_plugin_of_ours_can_be_shown_in_80_columns(ran, slot):
+def test_show_fits_every_bundled_plugin_into_80_columns(ran, slot):
     for entry in registry.offers(slot):
         if entry.distribution == "crossgrad":
             code, out, err = ran("plugins", "show", entry.name, "--slot", slot)
@@ -212,7 +210,7 @@ def test_check_passes_a_good_package(ran, third_party, package):
     assert "1 of 1 plugins keep the contract" in out
 
 
-def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatch):
+def test_check_fails_a_bad_package_and_prints_the_reasons(ran, third_party, monkeypatch):
     monkeypatch.syspath_prepend(third_party)
     code, out, err = ran("plugins", "check", "bad-package")
     flat = " ".join(out.split())
@@ -270,7 +268,7 @@ def test_check_reports_the_file_and_the_line_of_a_defect(ran, tmp_path, monkeypa
     assert f"      at {tmp_path / 'made_up_broken.py'}:{line}\n" in out
 
 
-def test_a_plugin_that_fails_to_import_is_refused_with_the_line(ran, tmp_path, monkeypatch):
+def test_an_import_error_of_a_plugin_is_reported_with_its_line(ran, tmp_path, monkeypatch):
     source, line = BROKEN["raises at import"]
     plugins = {"operators": {"halving": "made_up_broken:Halving"}}
     write_distribution(tmp_path, "broken-package", plugins, {"made_up_broken": source})
@@ -316,7 +314,7 @@ def test_bad_usage_ends_with_one_message_and_code_2(ran, arguments):
     assert "─" not in err
 
 
-def test_an_interrupt_ends_with_130(ran, monkeypatch):
+def test_an_interrupt_ends_a_command_with_exit_code_130(ran, monkeypatch):
     def interrupted(slot):
         raise KeyboardInterrupt
 
@@ -325,7 +323,7 @@ def test_an_interrupt_ends_with_130(ran, monkeypatch):
     assert (code, err) == (130, "interrupted\n")
 
 
-def test_our_own_mistakes_keep_their_traceback(monkeypatch):
+def test_an_internal_error_keeps_its_traceback(monkeypatch):
     def broken(slot):
         raise RuntimeError("a bug")
 
@@ -336,14 +334,14 @@ def test_our_own_mistakes_keep_their_traceback(monkeypatch):
     assert sys.excepthook is before
 
 
-def test_show_names_the_slot_in_which_the_plugin_exists(ran):
+def test_show_names_the_slot_that_contains_the_plugin(ran):
     code, _, err = ran("plugins", "show", "near-far", "--slot", "operators")
     assert code == 2
     assert "no plugin named 'near-far' among the operators" in err
     assert "one among the samplers" in err
 
 
-def test_a_bad_value_is_reported_without_the_words_of_a_library(ran):
+def test_a_bad_value_is_reported_without_messages_of_pydantic(ran):
     for given in (("run", "--steps", "1e3"), ("render", "x", "--split", "foo")):
         code, _, err = ran(*given)
         assert code == 2

@@ -41,7 +41,7 @@ def _ran(capsys):
         (("--name", "b", "a"), Options(Path("a"), name="b")),
     ],
 )
-def test_the_function_gets_what_was_given(ran, arguments, given):
+def test_the_command_function_receives_the_given_options(ran, arguments, given):
     assert ran(*arguments) == (0, f"{given}\n")
 
 

@@ -78,7 +78,7 @@ def test_a_signal_before_a_run_begins_ends_with_one_message(number, moment, last
     assert not list(tmp_path.iterdir())
 
 
-def test_an_ignored_signal_stays_ignored():
+def test_an_ignored_signal_is_still_ignored():
     ignoring = "signal.signal(number, signal.SIG_IGN)\nfor each in ():\n   "
     program = PROGRAM.replace("for each in ALL:", ignoring)
     command = [sys.executable, "-c", program, str(int(signal.SIGHUP)), "typer", "--version"]

@@ -47,7 +47,7 @@ def installed(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("slot", OFFERED)
-def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
+def test_a_generated_plugin_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
     name = f"made-new-{slot}"
     code, out, err = ran("plugins", "new", name, "--slot", slot)
     assert (code, err) == (0, "")
@@ -59,7 +59,7 @@ def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
 
 
 @pytest.mark.parametrize("slot", OFFERED)
-def test_a_new_plugin_imports_public_modules_only(ran, tmp_path, slot):
+def test_a_generated_plugin_imports_public_modules_only(ran, tmp_path, slot):
     ran("plugins", "new", "made-new", "--slot", slot)
     own = {"readers": "crossgrad_core.scene", COMMANDS: "crossgrad_core.commands"}
     public = (*PUBLIC, own.get(slot, PUBLIC[0]))
@@ -71,7 +71,7 @@ def test_a_new_plugin_imports_public_modules_only(ran, tmp_path, slot):
                 assert node.module.startswith(public)
 
 
-def test_its_own_test_runs(ran, tmp_path, monkeypatch):
+def test_the_test_of_a_generated_plugin_runs(ran, tmp_path, monkeypatch):
     ran("plugins", "new", "made-new", "--slot", "operators")
     monkeypatch.syspath_prepend(tmp_path / "made-new")
     names = {"__name__": "made_new_test"}
@@ -82,7 +82,7 @@ def test_its_own_test_runs(ran, tmp_path, monkeypatch):
         names["test_contract"](check)
 
 
-def test_a_new_reader_plugin_reads_a_scene(ran, tmp_path, monkeypatch):
+def test_a_generated_reader_plugin_reads_a_scene(ran, tmp_path, monkeypatch):
     ran("plugins", "new", "made-new", "--slot", "readers")
     monkeypatch.syspath_prepend(tmp_path / "made-new")
     (tmp_path / "images").mkdir()
@@ -101,7 +101,7 @@ def test_a_new_reader_plugin_reads_a_scene(ran, tmp_path, monkeypatch):
     assert (scene.views[0].camera.width, scene.views[0].camera.height) == (20, 16)
 
 
-def test_every_slot_has_a_template_for_a_new_plugin():
+def test_every_slot_has_a_template_for_a_generated_plugin():
     assert set(examples()) == set(OFFERED)
 
 
@@ -110,7 +110,7 @@ def test_the_slot_may_be_given_in_the_singular(ran, tmp_path):
     assert (tmp_path / "elsewhere" / "made_new.py").is_file()
 
 
-def test_nothing_is_overwritten(ran, tmp_path):
+def test_plugins_new_does_not_write_into_an_existing_folder(ran, tmp_path):
     (tmp_path / "made-new").mkdir()
     (tmp_path / "made-new" / "notes.txt").write_text("mine")
     code, _, err = ran("plugins", "new", "made-new", "--slot", "operators")

@@ -99,7 +99,7 @@ def rows(out):
 
 
 @pytest.mark.usefixtures("installed")
-def test_help_lists_all_plugin_commands_without_importing_them(ran):
+def test_help_lists_all_plugin_commands_without_an_import(ran):
     code, out, err = ran("--help")
     found = rows(out)
     assert (code, err) == (0, "")
@@ -111,13 +111,13 @@ def test_help_lists_all_plugin_commands_without_importing_them(ran):
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_command_of_the_core_stays(ran):
+def test_a_plugin_command_does_not_replace_a_core_command(ran):
     assert rows(ran("--help")[1])["run"].startswith("Train on a scene")
     assert ran("run", "nobody", "--steps", "0")[0] == 2
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_function_is_called_with_its_options(ran):
+def test_a_function_command_is_called_with_its_options(ran):
     assert ran("hello", "you", "--loud") == (0, "HELLO YOU\n", "")
     code, out, _ = ran("hello", "-h")
     assert code == 0
@@ -126,7 +126,7 @@ def test_a_function_is_called_with_its_options(ran):
 
 
 @pytest.mark.usefixtures("installed")
-def test_an_app_brings_its_own_commands(ran):
+def test_a_typer_app_adds_its_own_subcommands(ran):
     assert ran("compares", "two", "a", "b") == (0, "a b\n", "")
     code, out, _ = ran("compares", "--help")
     assert code == 0
@@ -134,13 +134,13 @@ def test_an_app_brings_its_own_commands(ran):
 
 
 @pytest.mark.usefixtures("installed")
-def test_bad_input_of_a_plugin_command_is_reported_like_that_of_the_core(ran):
+def test_bad_input_is_reported_alike_by_plugin_and_core_commands(ran):
     assert ran("hello", "nobody") == (2, "", "error: there is nobody\n  to do:    name somebody\n")
 
 
 @pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("arguments", [("hello", "ctrl-c"), ("compares", "stopped")])
-def test_an_interrupt_ends_a_plugin_command_with_130(ran, arguments):
+def test_an_interrupt_ends_a_plugin_command_with_exit_code_130(ran, arguments):
     assert ran(*arguments) == (130, "", "interrupted\n")
 
 
@@ -154,7 +154,7 @@ def test_an_interrupt_ends_a_plugin_command_with_130(ran, arguments):
         ("seven", "a typer.Typer, or a function"),
     ],
 )
-def test_a_broken_command_is_one_error_when_it_is_called(ran, name, words):
+def test_a_broken_command_gives_one_error_when_it_is_called(ran, name, words):
     code, out, err = ran(name)
     assert (code, out) == (2, "")
     assert err.startswith(f"error: command {name} cannot be ")
@@ -163,7 +163,7 @@ def test_a_broken_command_is_one_error_when_it_is_called(ran, name, words):
     assert "Traceback" not in err
 
 
-def test_a_name_of_two_packages_is_refused(ran, installed, monkeypatch):
+def test_a_command_name_of_two_packages_is_refused(ran, installed, monkeypatch):
     write_distribution(installed / "two", "other", {COMMANDS: {"hello": "made_up_hello:hello"}})
     monkeypatch.syspath_prepend(installed / "two")
     code, _, err = ran("hello")
@@ -206,7 +206,7 @@ def test_check_reports_on_commands(ran):
         assert f"command {name:<8}  FAIL  1 of 1 checks" in out
 
 
-def test_check_finds_what_is_slow_or_without_help(ran, tmp_path, monkeypatch):
+def test_check_reports_a_command_that_imports_slowly_or_has_no_help(ran, tmp_path, monkeypatch):
     source = "import numpy\n\ndef slow() -> None:\n    pass\n"
     commands = {COMMANDS: {"slow": "made_up_slow:slow"}}
     write_distribution(tmp_path, "made-up-slow", commands, {"made_up_slow": source})
@@ -225,5 +225,5 @@ def test_the_bundled_commands_are_entry_points_of_crossgrad():
     assert {"diagnose", "plugins", "stress"} <= ours
 
 
-def test_the_core_s_own_names_are_all_of_its_commands():
+def test_the_list_of_core_commands_is_complete():
     assert tuple(get_command(app).commands) == OWN_COMMANDS

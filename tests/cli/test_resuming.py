@@ -25,7 +25,9 @@ from crossgrad_core.run.load_run import _config
     ],
     ids=lambda words: words[0] if isinstance(words, list) else "",
 )
-def test_options_that_a_resumed_run_ignores_are_named_as_they_were_typed(arguments, named, capsys):
+def test_options_that_a_resumed_run_ignores_are_named_as_the_user_typed_them(
+    arguments, named, capsys
+):
     with pytest.raises(SystemExit, match="2"):
         main(["run", *arguments, "--resume", "runs/one", "-q"])
     rows = dict(line.split(":", 1) for line in capsys.readouterr().err.splitlines())
@@ -41,7 +43,7 @@ def test_settings_that_may_change_on_resume_are_accepted():
     assert CHANGEABLE == OF_A_RUN
 
 
-def test_settings_from_python_are_named_as_settings(tmp_path):
+def test_ignored_settings_of_the_python_api_are_named_as_settings(tmp_path):
     with pytest.raises(UserError) as raised:
         _config(tmp_path, {"scene": "x", "views": 2, "device": "cpu"})
     assert raised.value.where == "settings scene, views"

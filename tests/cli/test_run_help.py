@@ -38,14 +38,14 @@ def test_the_help_has_20_options_on_60_lines_of_100_columns(capsys):
     assert any("--help-all" in line for line in lines)
 
 
-def test_the_whole_help_has_every_option(capsys):
+def test_help_all_lists_every_option(capsys):
     few, every = (options_in(shown(capsys, "run", flag)) for flag in ("--help", "--help-all"))
     options = {each.opts[0] for each in RUN.params if each.param_type_name == "option"}
     assert every == options | {"--help"}
     assert few < every
 
 
-def test_the_help_is_short_again_after_the_whole_one(capsys):
+def test_help_is_short_again_after_help_all(capsys):
     before = shown(capsys, "run", "--help")
     shown(capsys, "run", "--help-all")
     assert shown(capsys, "run", "--help") == before
@@ -58,7 +58,7 @@ def commands():
 
 
 @pytest.mark.parametrize("name", sorted(commands()))
-def test_no_default_is_explained_at_length(name):
+def test_the_help_explains_no_default_at_length(name):
     for parameter in commands()[name].params:
         for default in re.findall(r"Default: (.*)\.", getattr(parameter, "help", None) or ""):
             assert len(default) <= 60, (parameter.name, default)

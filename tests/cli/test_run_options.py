@@ -21,13 +21,13 @@ OWN = {
 PARAMETERS = {each.name: each for each in get_command(app).commands["run"].params}
 
 
-def test_options_are_settings_and_a_few_of_the_command():
+def test_every_setting_and_a_few_command_options_are_options_of_run():
     assert PARAMETERS.keys() - OWN == {option.name for option in OPTIONS}
     assert PARAMETERS.keys() >= OWN
 
 
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
-def test_type_help_and_heading_are_the_field_s(option):
+def test_type_help_and_heading_of_an_option_come_from_its_field(option):
     parameter = PARAMETERS[option.name]
     assert option.help == parameter.help
     assert option.help.endswith(".")
@@ -57,7 +57,7 @@ def test_each_flag_has_the_name_of_its_setting_with_four_exceptions():
         ("init", "str"),
     ],
 )
-def test_types_follow_the_schema(name, kind):
+def test_option_types_follow_the_schema(name, kind):
     (option,) = (each for each in OPTIONS if each.name == name)
     assert option.kind.__name__.lower() == kind
 
@@ -67,14 +67,14 @@ def test_every_setting_of_the_core_has_a_description():
     assert silent == ["data"]
 
 
-def test_typer_reads_the_made_signature():
+def test_typer_accepts_the_generated_signature():
     from crossgrad_core.cli.run import run
 
     assert list(inspect.signature(run).parameters) == list(run.__annotations__)
 
 
 @pytest.mark.parametrize("text", ["views: 3", "views_per_step: 3"])
-def test_the_old_key_of_the_views_is_accepted_in_a_file(text, tmp_path):
+def test_a_configuration_file_may_use_the_old_key_views(text, tmp_path):
     (tmp_path / "run.yaml").write_text(text)
     settings = merged(tmp_path / "run.yaml", {}, [])
     assert parsed(settings).views_per_step == 3
@@ -84,12 +84,12 @@ def test_the_old_key_of_the_views_is_accepted_in_a_file(text, tmp_path):
 @pytest.mark.parametrize(
     "given", [({"views": 4}, []), ({}, ["views=4"]), ({}, ["views_per_step=4"])]
 )
-def test_what_is_typed_wins_over_the_old_key(given, tmp_path):
+def test_an_option_on_the_command_line_overrides_the_old_key_views(given, tmp_path):
     (tmp_path / "run.yaml").write_text("views: 3")
     assert parsed(merged(tmp_path / "run.yaml", *given)).views_per_step == 4
 
 
-def test_both_keys_at_once_are_refused(tmp_path):
+def test_a_file_with_the_keys_views_and_views_per_step_is_refused(tmp_path):
     (tmp_path / "run.yaml").write_text("views: 3\nviews_per_step: 4")
     with pytest.raises(UserError, match="no option 'views'"):
         parsed(merged(tmp_path / "run.yaml", {}, []))

@@ -37,11 +37,11 @@ def refusal(*arguments):
     return caught.value
 
 
-def test_nothing_given_sets_nothing():
+def test_no_options_give_an_empty_configuration():
     assert merged(None, {"steps": None, "observe": None, "scene": None}, []) == {}
 
 
-def test_a_file_is_read_with_choices_in_their_long_form(config):
+def test_a_file_is_read_and_its_component_choices_are_expanded(config):
     assert merged(config, {}, []) == {
         "steps": 100,
         "operator": {"name": "cagrad", "c": 0.4},
@@ -50,7 +50,7 @@ def test_a_file_is_read_with_choices_in_their_long_form(config):
     }
 
 
-def test_options_win_over_the_file_and_assignments_over_both(config):
+def test_options_override_the_file_and_assignments_override_both(config):
     assert merged(config, {"steps": 200}, [])["steps"] == 200
     assert merged(config, {"steps": 200}, ["steps=300"])["steps"] == 300
 
@@ -73,7 +73,7 @@ def test_replacing_the_seconds_of_a_file_also_replaces_its_clock(
     assert merged(path, options, assignments).get("clock") == clock
 
 
-def test_stop_after_of_a_file_is_dropped_with_its_length(tmp_path):
+def test_a_new_length_also_drops_stop_after_of_the_file(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("steps: 40\nstop_after: 20\n")
     assert merged(path, {"seed": 5}, [])["stop_after"] == 20
@@ -93,7 +93,7 @@ def test_a_new_length_replaces_the_length_of_the_file(tmp_path, options, assignm
     assert (kept["revisions"], kept["planned_seconds"]) == ([[10, 60]], 3.0)
 
 
-def test_unset_options_leave_the_file_alone(config):
+def test_options_that_are_not_given_keep_the_values_of_the_file(config):
     assert merged(config, {"steps": None, "observe": []}, []) == merged(config, {}, [])
 
 
@@ -106,11 +106,11 @@ def test_unset_options_leave_the_file_alone(config):
         ("init", "random", ("data", "init")),
     ],
 )
-def test_options_about_the_scene_have_a_group_of_their_own(name, value, place):
+def test_options_about_the_scene_are_stored_in_their_own_group(name, value, place):
     assert merged(None, {name: value}, []) == {place[0]: {place[1]: value}}
 
 
-def test_paths_become_text(tmp_path):
+def test_paths_are_stored_as_text(tmp_path):
     assert merged(None, {"scene": tmp_path, "out": tmp_path}, []) == {
         "scene": str(tmp_path),
         "out": str(tmp_path),
@@ -136,22 +136,22 @@ def test_paths_become_text(tmp_path):
         ("a=b", "a=b"),
     ],
 )
-def test_values_are_typed_as_users_mean_them(text, value):
+def test_assigned_values_get_the_type_that_a_user_expects(text, value):
     found = merged(None, {}, [f"operator.c={text}"])["operator"]["c"]
     assert found == value
     assert type(found) is type(value)
 
 
-def test_infinity_is_a_number():
+def test_infinity_is_read_as_a_number():
     assert merged(None, {}, ["operator.c=.inf"])["operator"]["c"] == float("inf")
 
 
 @pytest.mark.parametrize("how", [({"operator": "pcgrad"}, []), ({}, ["operator=pcgrad"])])
-def test_another_component_drops_the_options_of_the_old_one(config, how):
+def test_another_component_drops_the_options_of_the_previous_component(config, how):
     assert merged(config, *how)["operator"] == {"name": "pcgrad"}
 
 
-def test_the_same_component_keeps_its_options(config):
+def test_choosing_the_same_component_again_keeps_its_options(config):
     assert merged(config, {"operator": "cagrad"}, [])["operator"] == {"name": "cagrad", "c": 0.4}
 
 
@@ -163,7 +163,7 @@ def test_the_order_of_assignments_does_not_matter(config, assignments):
     assert merged(config, {}, assignments)["operator"] == {"name": "pcgrad", "x": 1}
 
 
-def test_options_alone_belong_to_the_component_that_is_taken_by_default():
+def test_options_without_a_component_name_belong_to_the_default_component():
     assignments = ["rasterizer.max_alpha=0.999", "sampler.order=epoch", "densifier.x=1"]
     assert merged(None, {}, assignments) == {
         "rasterizer": {"name": "auto", "max_alpha": 0.999},
@@ -172,32 +172,32 @@ def test_options_alone_belong_to_the_component_that_is_taken_by_default():
     }
 
 
-def test_options_in_a_file_without_a_name_belong_to_the_component_chosen_later(tmp_path):
+def test_options_without_a_name_in_a_file_belong_to_the_component_chosen_later(tmp_path):
     path = written(tmp_path, "operator: {c: 0.3}")
     assert merged(path, {"operator": "cagrad"}, [])["operator"] == {"name": "cagrad", "c": 0.3}
 
 
-def test_a_chain_is_a_list_of_choices():
+def test_a_chain_is_stored_as_a_list_of_choices():
     links = [{"name": "preconditioner"}, {"name": "symmetric"}]
     assert merged(None, {"operator": "preconditioner+symmetric"}, [])["operator"] == links
 
 
-def test_options_of_a_link_are_found_by_its_name():
+def test_options_of_a_chain_link_are_found_by_its_name():
     settings = merged(None, {"operator": "a+b"}, ["operator.b.c=1"])
     assert settings["operator"] == [{"name": "a"}, {"name": "b", "c": 1}]
 
 
-def test_a_link_keeps_its_options_in_another_chain(config):
+def test_a_chain_link_keeps_its_options_in_another_chain(config):
     links = [{"name": "preconditioner"}, {"name": "cagrad", "c": 0.4}]
     assert merged(config, {"operator": "preconditioner+cagrad"}, [])["operator"] == links
 
 
-def test_an_option_of_a_chain_must_say_whose_it_is():
+def test_an_option_of_a_chain_must_name_its_link():
     error = refusal(None, {"operator": "a+b"}, ["operator.c=1"])
     assert error.expected == "operator.a.c, operator.b.c"
 
 
-def test_observers_are_added_and_their_options_found_by_name(config):
+def test_observers_are_added_and_their_options_are_found_by_name(config):
     settings = merged(config, {"observe": ["clip", "progress"]}, ["observers.clip.max_norm=0.1"])
     assert settings["observers"] == [
         {"name": "progress"},
@@ -242,7 +242,7 @@ def test_a_value_that_is_not_a_component_is_refused_after_set(assignment):
 
 
 @pytest.mark.parametrize("slot", sorted(GROUPS))
-def test_every_slot_takes_a_name_a_mapping_a_class_or_an_instance(slot):
+def test_every_slot_accepts_a_name_a_mapping_a_class_or_an_instance(slot):
     name = "cagrad" if slot == "operators" else max(entries(slot))
     kind = load(slot, name)
     for given in (name, {"name": name}, kind, kind()):
@@ -254,7 +254,7 @@ def test_every_slot_takes_a_name_a_mapping_a_class_or_an_instance(slot):
         assert ComponentChoice(name=name) in (chosen if slot in LISTS else [chosen])
 
 
-def test_the_options_of_an_instance_are_those_that_were_given():
+def test_an_instance_contributes_only_the_options_that_were_given():
     given = load("operators", "cagrad")(c=0.4)
     assert settled(operator=given).operator == ComponentChoice(name="cagrad", c=0.4)
     chain = settled(operator=[load("operators", "preconditioner"), given, "soft"]).operator
@@ -263,12 +263,12 @@ def test_the_options_of_an_instance_are_those_that_were_given():
     assert settled(backbone=usual).backbone == ComponentChoice(name="vanilla", sh_degree=3)
 
 
-def test_a_class_of_another_slot_is_refused_though_its_name_is_known():
+def test_a_class_of_another_slot_is_refused_even_if_its_name_is_known():
     with pytest.raises(UserError, match="Anchors cannot be chosen as a grouping"):
         settled(grouping=load("operators", "anchors"))
 
 
-def test_options_of_a_component_that_is_there_already_are_not_lost(tmp_path):
+def test_options_of_a_default_component_are_kept(tmp_path):
     (metric,) = [each for each in settled(metrics=[{"name": "lpips", "trunk": "x"}]).metrics
                  if each.name == "lpips"]  # fmt: skip
     assert metric == ComponentChoice(name="lpips", trunk="x")
@@ -278,7 +278,7 @@ def test_options_of_a_component_that_is_there_already_are_not_lost(tmp_path):
     assert merged(path, {"observe": ["diagnostics"]}, [])["observers"][0]["every"] == 5
 
 
-def test_a_component_that_comes_twice_with_other_options_is_refused(tmp_path):
+def test_a_component_given_twice_with_different_options_is_refused(tmp_path):
     twice = [{"name": "diagnostics", "every": 5}, {"name": "diagnostics", "every": 6}]
     path = written(tmp_path, "observers: [{name: diagnostics, every: 5}, diagnostics]")
     for given in ((None, {"observe": twice}, []), (path, {}, [])):
@@ -287,7 +287,7 @@ def test_a_component_that_comes_twice_with_other_options_is_refused(tmp_path):
     assert len(settled(observe=["diagnostics", "diagnostics"]).observers) == 1
 
 
-def test_options_of_an_observer_that_is_not_there_are_refused():
+def test_options_of_an_observer_that_is_not_selected_are_refused():
     assert "--observe NAME" in refusal(None, {}, ["observers.clip.max_norm=1"]).todo
 
 
@@ -302,11 +302,11 @@ def test_options_of_an_observer_that_is_not_there_are_refused():
         ("steps.c.d=1", "plain setting"),
     ],
 )
-def test_assignments_that_make_no_sense_are_refused(config, assignment, words):
+def test_malformed_assignments_are_refused(config, assignment, words):
     assert words in str(refusal(config, {}, [assignment]))
 
 
-def test_unknown_keys_are_left_to_the_validation():
+def test_unknown_keys_are_passed_on_to_the_validation():
     assert merged(None, {}, ["stepps=3", "a.b=1"]) == {"stepps": 3, "a": {"b": 1}}
 
 
@@ -318,7 +318,7 @@ def test_unknown_keys_are_left_to_the_validation():
         ("steps: 1\nsteps: 2\n", "'steps' occurs twice"),
     ],
 )
-def test_broken_files_are_refused_with_the_place(tmp_path, text, words):
+def test_broken_files_are_refused_with_the_position_of_the_error(tmp_path, text, words):
     path = written(tmp_path, text)
     error = refusal(path, {}, [])
     assert error.where == str(path)
@@ -329,5 +329,5 @@ def test_a_missing_file_is_refused(tmp_path):
     assert "cannot be read" in refusal(tmp_path / "gone.yaml", {}, []).what
 
 
-def test_an_empty_file_sets_nothing(tmp_path):
+def test_an_empty_file_gives_an_empty_configuration(tmp_path):
     assert merged(written(tmp_path, "# nothing yet\n"), {}, []) == {}

@@ -38,7 +38,7 @@ STAGES = logging.getLogger("crossgrad_core.training.start")
      ("stress", "sum")],
     ids=lambda arguments: arguments[0],
 )  # fmt: skip
-def test_the_first_line_comes_before_anything_large_is_imported(arguments):
+def test_the_first_line_is_printed_before_any_large_library_is_imported(arguments):
     command = [sys.executable, "-c", FIRST_LINE, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     words = done.stdout.split()
@@ -51,7 +51,7 @@ def announced(monkeypatch):
     startup.finish()
 
 
-def test_stages_are_lines_and_kernels_are_reported_only_when_they_are_compiled(announced, capsys):
+def test_each_stage_prints_a_line_and_kernels_are_reported_only_if_they_compile(announced, capsys):
     announced()
     STAGES.info("loading kernels")
     STAGES.debug("loaded")
@@ -60,7 +60,7 @@ def test_stages_are_lines_and_kernels_are_reported_only_when_they_are_compiled(a
     assert lines[1:] == ["loading kernels", "training"]
 
 
-def test_compiling_is_shown_with_a_clock_that_runs_inside_a_kernel(announced, capsys, monkeypatch):
+def test_the_clock_of_compilation_also_runs_inside_a_kernel(announced, capsys, monkeypatch):
     monkeypatch.setattr(startup, "PLAIN_INTERVAL", 0.02)
     announced()
     STAGES.info("loading kernels")
@@ -79,7 +79,7 @@ def test_compiling_is_shown_with_a_clock_that_runs_inside_a_kernel(announced, ca
     assert capsys.readouterr().err == "compiled in 0 s\n"
 
 
-def test_a_log_gets_two_lines_of_a_minute_of_compiling_and_no_kernel(announced, capsys):
+def test_a_log_shows_two_lines_for_a_minute_of_compiling_and_names_no_kernel(announced, capsys):
     announced()
     for name in ("one", "two", "three"):
         LOG.info("compiling %s", name)
@@ -91,7 +91,7 @@ def test_a_log_gets_two_lines_of_a_minute_of_compiling_and_no_kernel(announced, 
     assert lines[1:] == [startup._EXPLANATION, "compiled in 0 s"]
 
 
-def test_on_a_terminal_compiling_is_one_line(announced, capsys, monkeypatch):
+def test_compiling_takes_one_line_on_a_terminal(announced, capsys, monkeypatch):
     monkeypatch.setattr(startup, "TERMINAL_INTERVAL", 0.02)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     announced()
@@ -111,7 +111,7 @@ def test_on_a_terminal_compiling_is_one_line(announced, capsys, monkeypatch):
     assert len(f"{startup._EXPLANATION}: 999 s") <= 80
 
 
-def test_quiet_shows_warnings_only(announced, capsys):
+def test_quiet_prints_warnings_only(announced, capsys):
     announced(quiet=True)
     STAGES.info("loading kernels")
     LOG.info("compiling %s", "one")

@@ -44,7 +44,7 @@ def test_writing_to_a_closed_pipe_raises_nothing(pipe):
         stream.flush()
 
 
-def test_a_reader_that_is_slow_gets_everything_even_if_writes_do_not_wait(pipe):
+def test_a_slow_reader_of_a_nonblocking_pipe_gets_all_output(pipe):
     reader, stdout = pipe
     os.set_blocking(stdout.fileno(), False)
     stream = streams._lasting(stdout)
@@ -98,7 +98,7 @@ def in_ascii(*arguments):
     )
 
 
-def test_a_run_says_where_its_results_are_on_every_terminal(foreign):
+def test_a_run_prints_its_results_folder_on_every_terminal(foreign):
     folder, done = foreign
     assert done.returncode == 0, done.stderr
     assert rb"results in" in done.stdout and rb"\u017c\xf3\u0142w\x1b[31m" in done.stdout
@@ -107,7 +107,7 @@ def test_a_run_says_where_its_results_are_on_every_terminal(foreign):
 
 
 @pytest.mark.parametrize("command", ["export", "render", "compare"])
-def test_a_command_says_where_its_results_are_on_every_terminal(
+def test_a_command_prints_its_output_path_on_every_terminal(
     foreign, command, tmp_path, monkeypatch
 ):
     out = tmp_path / "ó\x1b[31m"
@@ -127,7 +127,7 @@ def test_a_command_says_where_its_results_are_on_every_terminal(
 
 @pytest.mark.parametrize("name", ["a" * 300, "/".join(["folder"] * 700), "a" * 250])
 @pytest.mark.parametrize("command", ["run", "export", "render", "compare"])
-def test_a_path_that_is_too_long_is_one_error(command, name, tmp_path, monkeypatch, capsys):
+def test_a_path_that_is_too_long_gives_one_error(command, name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     if len(name) < 255 and command != "export":
         pytest.skip("a folder may have that name")
@@ -141,13 +141,13 @@ def test_a_path_that_is_too_long_is_one_error(command, name, tmp_path, monkeypat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoints", "config.yaml"]
 
 
-def test_streams_of_another_kind_stay_as_they_are():
+def test_streams_of_another_kind_are_not_wrapped():
     other = io.StringIO()
     assert streams._lasting(other) is other
 
 
 @pytest.mark.parametrize("redirections", ["| head -1", ">&-", "2>&-", ">&- 2>&-", ">&- 2>&- <&-"])
-def test_listing_for_nobody_ends_quietly(redirections):
+def test_a_list_printed_to_a_closed_pipe_ends_quietly(redirections):
     command = f"{shlex.quote(sys.executable)} -m crossgrad_core plugins list"
     script = f"set -o pipefail; {command} {redirections}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
@@ -161,7 +161,7 @@ def scene(tmp_path_factory):
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=5)
 
 
-def test_a_training_outlasts_the_readers_of_its_output(scene, tmp_path):
+def test_a_training_continues_after_the_readers_of_its_output_end(scene, tmp_path):
     out = tmp_path / "run"
     command = [*CROSSGRAD, "run", str(scene), "--steps", "20", "--threads", "1", "--out", str(out)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}

@@ -83,7 +83,7 @@ COMMANDS = ["run", "render", "export", "diagnose", "stress"]
     ("obstacle", "command"),
     [*product((forbidden, below_a_file), COMMANDS), (below_a_file, "signature")],
 )
-def test_an_unwritable_place_is_found_before_anything_is_written(
+def test_an_unwritable_output_path_is_reported_before_anything_is_written(
     obstacle, command, request, tmp_path, monkeypatch, capsys
 ):
     place = obstacle(monkeypatch, tmp_path)
@@ -96,7 +96,7 @@ def test_an_unwritable_place_is_found_before_anything_is_written(
     assert sorted(path for path in tmp_path.rglob("*")) == before
 
 
-def test_an_unwritable_default_folder_of_runs_is_found_at_once(
+def test_an_unwritable_default_folder_of_runs_is_reported_at_once(
     scene, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
@@ -106,7 +106,7 @@ def test_an_unwritable_default_folder_of_runs_is_found_at_once(
     assert "runs is no folder" in capsys.readouterr().err
 
 
-def test_a_full_disk_is_found_at_once(scene, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_is_reported_at_once(scene, tmp_path, monkeypatch, capsys):
     place = full(monkeypatch, tmp_path)
     with pytest.raises(SystemExit, match="2"):
         main(["run", str(scene), "--out", str(place), "-q"])

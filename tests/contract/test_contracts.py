@@ -19,5 +19,5 @@ CASES = [
 
 
 @pytest.mark.parametrize(("entry", "check"), CASES)
-def test_contract(entry, check):
+def test_every_component_keeps_the_contract_of_its_slot(entry, check):
     check(registry.load(entry.slot, entry.name))

@@ -5,7 +5,7 @@ from crossgrad_faults import laws
 
 
 @pytest.mark.parametrize("at", [pytest.param(2, marks=pytest.mark.slow), 9])
-def test_a_run_survives_jumps_of_the_clock(reference, tmp_path, at):
+def test_a_run_survives_jumps_of_the_system_clock(reference, tmp_path, at):
     folder = tmp_path / "run"
     fault = {"below": str(folder), "at": at, "what": "jump"}
     end = reference.nursery.run(*reference.command(folder), fault=fault)

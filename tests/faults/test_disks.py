@@ -12,7 +12,9 @@ WORDS = {"full": "not enough disk space", "readonly": "cannot write here"}
 
 
 @pytest.mark.parametrize("what", WORDS)
-def test_a_run_survives_writes_that_fail_from_some_write_on(reference, thorough, tmp_path, what):
+def test_a_run_survives_if_every_write_fails_after_a_random_one(
+    reference, thorough, tmp_path, what
+):
     writes = range(1, reference.writes + 1)
     for at in random.Random(3).sample(writes, min(thorough, len(writes))):
         folder = tmp_path / str(at)
@@ -25,7 +27,7 @@ def test_a_run_survives_writes_that_fail_from_some_write_on(reference, thorough,
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
-def test_a_small_file_system_that_fills_up(reference, tmp_path):
+def test_a_run_survives_a_small_file_system_that_fills_up(reference, tmp_path):
     place = tmp_path / "small"
     place.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=96m", "tmpfs", str(place)]

@@ -4,7 +4,7 @@ import random
 import signal
 
 
-def test_killed_at_random_instants(reference, thorough, tmp_path):
+def test_a_run_killed_at_random_instants_resumes_to_the_same_bits(reference, thorough, tmp_path):
     # Also during checkpoints, evaluations and the export, which take most of the time here.
     draw = random.Random(0)
     for number in range(thorough):
@@ -14,7 +14,7 @@ def test_killed_at_random_instants(reference, thorough, tmp_path):
         reference.recovers(folder)
 
 
-def test_killed_again_while_it_is_resumed(reference, thorough, tmp_path):
+def test_a_run_killed_again_while_resuming_resumes_to_the_same_bits(reference, thorough, tmp_path):
     draw = random.Random(1)
     for number in range(max(1, thorough // 10)):
         folder = tmp_path / str(number)
@@ -29,7 +29,7 @@ def test_killed_again_while_it_is_resumed(reference, thorough, tmp_path):
         reference.recovers(folder)
 
 
-def test_killed_right_before_a_write(reference, thorough, tmp_path):
+def test_a_run_killed_right_before_a_write_resumes_to_the_same_bits(reference, thorough, tmp_path):
     # Each opening, renaming and deleting of the run in turn, which no random instant would hit.
     writes = range(1, reference.writes + 1)
     for at in random.Random(2).sample(writes, min(thorough, len(writes))):

@@ -9,7 +9,9 @@ from crossgrad_faults import laws
 
 
 @pytest.mark.parametrize("what", ["rot", "vanish"])
-def test_a_photo_is_lost(reference, thorough, tmp_path, what):
+def test_a_run_whose_photo_is_lost_names_the_photo_and_can_be_resumed(
+    reference, thorough, tmp_path, what
+):
     scene = tmp_path / "scene"
     shutil.copytree(reference.scene, scene)
     here = replace(reference, scene=scene)

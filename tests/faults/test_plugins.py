@@ -20,7 +20,7 @@ def fails(reference, folder, hook, call, error="RuntimeError"):
 
 
 @pytest.mark.parametrize("hook", [name for name in HOOKS if name not in UNUSED])
-def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_is_kept(
+def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_can_be_resumed(
     reference, thorough, tmp_path, hook
 ):
     if thorough < 10 and hook not in {"crossgrad_densify", "crossgrad_evaluation"}:
@@ -37,7 +37,9 @@ def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_is_kept(
 
 
 @pytest.mark.parametrize("error", ["MemoryError", "OSError"])
-def test_errors_of_other_types_in_a_plugin_keep_the_run(reference, tmp_path, error):
+def test_errors_of_other_types_in_a_plugin_leave_a_run_that_can_be_resumed(
+    reference, tmp_path, error
+):
     folder = tmp_path / "run"
     end = fails(reference, folder, "crossgrad_aggregate_gradients", 25, error)
     assert end.code == 1, end.said

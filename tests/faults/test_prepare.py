@@ -46,7 +46,7 @@ def result(photos, scene):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600 if "FAULTS" in os.environ else 600)
-def test_killed_at_random_instants(photos, tmp_path):
+def test_a_preparation_killed_at_random_instants_ends_with_the_same_result(photos, tmp_path):
     draw = random.Random(0)
     begun = time.monotonic()
     registered, error = result(photos, tmp_path / "undisturbed")

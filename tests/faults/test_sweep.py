@@ -109,7 +109,7 @@ def finished(out):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600 if "FAULTS" in os.environ else 600)
-def test_killed_at_random_it_repeats_and_loses_nothing(grid, tmp_path):
+def test_a_sweep_killed_at_random_instants_repeats_and_loses_no_run(grid, tmp_path):
     out = tmp_path / "sweep"
     draw = random.Random(0)
     long = "FAULTS" in os.environ
@@ -159,7 +159,7 @@ def undisturbed(grid, folder):
 
 @pytest.mark.skipif("FAULTS" not in os.environ, reason="minutes: `make faults`")
 @pytest.mark.timeout(3600)
-def test_on_a_ray_cluster_that_loses_a_node_the_bits_are_the_same(grid, tmp_path):
+def test_a_sweep_on_a_ray_cluster_that_loses_a_node_gives_the_same_bits(grid, tmp_path):
     pytest.importorskip("ray")
     content = yaml.safe_load(grid.read_text())
     few = grid.with_name("few.yaml")
@@ -206,7 +206,7 @@ class Slow(Observer):
 
 
 @pytest.mark.slow
-def test_interrupted_it_stops_its_runs_and_goes_on(grid, slow, tmp_path, capsys):
+def test_an_interrupted_sweep_stops_its_runs_and_can_be_continued(grid, slow, tmp_path, capsys):
     out = tmp_path / "sweep"
     observer = json.dumps({"name": "slow", "go": str(slow)})
     more = ("--seed", "7", "--set", "steps=12", "--set", f"observers={observer}")

@@ -18,7 +18,7 @@ def at_once(reference, second, *command):
     return sorted((reference.nursery.wait(), second.wait()), key=lambda end: end.code)
 
 
-def test_two_runs_into_one_folder(reference, second, tmp_path):
+def test_a_second_run_into_the_same_folder_is_refused(reference, second, tmp_path):
     folder = tmp_path / "run"
     works, refused = at_once(reference, second, *reference.command(folder))
     assert (works.code, refused.code) == (0, 2), refused.said
@@ -28,7 +28,7 @@ def test_two_runs_into_one_folder(reference, second, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_resume_one_run(reference, second, tmp_path):
+def test_a_second_resume_of_the_same_run_is_refused(reference, second, tmp_path):
     folder = tmp_path / "run"
     end = reference.nursery.run(*reference.command(folder, "--stop-after", "20"))
     assert end.code == 0, end.said

@@ -30,7 +30,7 @@ def told(found) -> str:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_a_short_search_finds_nothing(name, tmp_path):
+def test_a_short_fuzz_search_finds_no_defect(name, tmp_path):
     target = TARGETS[name]
     found = search(target, Bench(target, tmp_path / "bench"), Budget(executions=SHORT), seed=0)
     assert not found.findings, told(found.findings)
@@ -40,7 +40,7 @@ def test_a_short_search_finds_nothing(name, tmp_path):
 @pytest.mark.parametrize(
     ("target", "name"), [(target, name) for target, cases in REGRESSIONS.items() for name in cases]
 )
-def test_inputs_that_once_failed_pass(target, name, tmp_path):
+def test_inputs_that_once_failed_now_pass(target, name, tmp_path):
     seeds = TARGETS[target].seeds()
     bench = Bench(TARGETS[target], tmp_path / "bench")
     bench.warm_up(seeds)
@@ -49,7 +49,7 @@ def test_inputs_that_once_failed_pass(target, name, tmp_path):
 
 
 @pytest.mark.parametrize("name", DEFECTS)
-def test_a_defect_that_is_put_back_is_found(name, tmp_path):
+def test_the_search_finds_a_reintroduced_defect(name, tmp_path):
     # What takes too long is known after a quarter of a second here.
     target = replace(TARGETS[DEFECTS[name].target], seconds=0.25)
     bench = Bench(target, tmp_path / "bench")
@@ -60,7 +60,7 @@ def test_a_defect_that_is_put_back_is_found(name, tmp_path):
     assert found.findings
 
 
-def test_functions_that_are_left_out_of_a_search_exist():
+def test_functions_excluded_from_a_search_exist():
     unknown = [
         f"{target}: {module.__name__}.{name}"
         for target, parser in ((name, found.parser) for name, found in TARGETS.items())
@@ -79,7 +79,7 @@ def _has(module, name):
     return True
 
 
-def test_the_makefile_finds_the_search():
+def test_the_makefile_runs_the_fuzz_search():
     (path,) = set(re.findall(r"PYTHONPATH=(\S+) .*-m crossgrad_fuzz", MAKEFILE.read_text()))
     arguments = [sys.executable, "-m", "crossgrad_fuzz", "--help"]
     environment = os.environ | {"PYTHONPATH": path}

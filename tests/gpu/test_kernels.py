@@ -106,7 +106,7 @@ def test_images_and_gradients_agree_with_the_float64_reference(name, seed, sh_de
 
 
 @pytest.mark.parametrize("sh_degree", [None, 3])
-def test_antialiased_gaussians_are_those_of_the_rules(gsplat, sh_degree):
+def test_antialiased_gaussians_agree_with_the_reference_rasterizer(gsplat, sh_degree):
     camera = CAMERAS["middle"]
     scene = random_gaussians(400, camera, sh_degree=sh_degree, response="antialiased")
     image, gradients, _ = drawn(gsplat, leaves(scene, "cuda", torch.float32), camera)
@@ -153,7 +153,7 @@ def extremes():
 
 
 @pytest.mark.parametrize("case", extremes())
-def test_extreme_gaussians_give_nearly_what_they_give_in_float64(name, case):
+def test_extreme_gaussians_agree_with_the_float64_reference(name, case):
     """Their images; gradients that are finite and not longer, which rounding may turn."""
     camera, scene = CAMERAS["middle"], extremes()[case]
     image, gradients, _ = drawn(RASTERIZERS[name](), leaves(scene, "cuda", torch.float32), camera)
@@ -190,7 +190,7 @@ def test_views_rendered_together_equal_views_rendered_one_by_one(gsplat, seed):
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-def test_counts_of_pixels_are_those_of_the_reference(gsplat, camera):
+def test_pixel_counts_agree_with_the_reference(gsplat, camera):
     scene = random_gaussians(300, camera, seed=3, opacities=(0.3, 0.95))
     _, _, ours = drawn(gsplat, leaves(scene, "cuda", torch.float32), camera)
     _, _, theirs = drawn(REFERENCES["gsplat"], leaves(scene, "cpu", torch.float32), camera)
@@ -203,7 +203,7 @@ def test_counts_of_pixels_are_those_of_the_reference(gsplat, camera):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_loss_is_that_of_the_cpu(masked):
+def test_the_loss_agrees_between_gpu_and_cpu(masked):
     random = torch.Generator().manual_seed(7)
     image = torch.rand(61, 83, 3, generator=random)
     photo = torch.randint(0, 256, (61, 83, 3), generator=random, dtype=torch.uint8)
@@ -218,7 +218,7 @@ def test_the_loss_is_that_of_the_cpu(masked):
     assert (ours.grad.cpu().double() - exact.grad).norm() <= 1e-4 * exact.grad.norm()
 
 
-def test_adam_is_that_of_the_cpu():
+def test_adam_agrees_between_gpu_and_cpu():
     random = torch.Generator().manual_seed(8)
     shapes = {"a": (1000, 3), "b": (1000,), "c": (1000, 15, 3)}
     start = {name: torch.randn(shape, generator=random) for name, shape in shapes.items()}
@@ -279,7 +279,7 @@ def started(rasterizer, device="cuda", **options):
     ids=str,
 )
 @pytest.mark.usefixtures("gsplat")
-def test_a_steady_step_waits_as_often_as_the_documents_say(options):
+def test_a_regular_step_synchronizes_the_gpu_at_most_three_times(options):
     """For the losses, for the Gramians or what tells whether all is finite, and in gsplat."""
     setup, state = started({"name": "gsplat"}, **options)
     for _ in range(5):
@@ -296,7 +296,7 @@ def test_a_steady_step_waits_as_often_as_the_documents_say(options):
     assert len(waits) <= 3, waits
 
 
-def test_steps_along_axes_are_those_of_the_cpu():
+def test_steps_along_axes_agree_between_gpu_and_cpu():
     draws = torch.Generator().manual_seed(0)
     arrays = [torch.randn(5000, columns, generator=draws) for columns in (3, 3, 3, 4)]
     on_gpu = [each.to("cuda") for each in arrays]
@@ -307,7 +307,7 @@ def test_steps_along_axes_are_those_of_the_cpu():
 
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 @pytest.mark.usefixtures("gsplat")
-def test_floaters_are_those_of_the_cpu(backbone):
+def test_floaters_agree_between_gpu_and_cpu(backbone):
     """Primitives beside and behind the cameras; what is left is what the state goes on with."""
     options = {"backbone": {"name": backbone}}
     if backbone == "scaffold":
@@ -336,7 +336,7 @@ def test_floaters_are_those_of_the_cpu(backbone):
 
 @pytest.mark.parametrize("backbone", ["vanilla", "pixel", "mip", "distance", "scaffold", "octree"])
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
-def test_every_backbone_learns_as_on_the_cpu(name, backbone, operator):
+def test_every_backbone_trains_alike_on_gpu_and_cpu(name, backbone, operator):
     """Without growth, whose draws and order would take them apart."""
     if name == "gswarp" and backbone in {"mip", "pixel"}:
         pytest.skip("refused: docs/rasterizers.md")

@@ -17,13 +17,13 @@ def packages():
     return folders | {path.stem for path in CORE.glob("*.py")}
 
 
-def test_every_package_is_named_and_every_named_package_exists():
+def test_the_architecture_page_names_exactly_the_existing_packages():
     rows = re.findall(r"^\| \d+ \| (.+?) \|", PAGE, re.MULTILINE)
     named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
     assert sorted(named) == sorted(packages())
 
 
-def test_every_plugin_package_is_named():
+def test_the_architecture_page_names_every_plugin_package():
     rows = re.findall(r"^\| `(\w+)/` \| `(\w+)` \|", PAGE, re.MULTILINE)
     assert tuple(folder for folder, _ in rows) == PLUGIN_PACKAGES
     assert all((ROOT / folder / package).is_dir() for folder, package in rows)
@@ -37,11 +37,11 @@ FILES = sorted(set(re.findall(r"`((?:\w+/)+\w+\.\w+)`", PAGE)))
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_every_file_that_is_named_exists(name):
+def test_every_file_named_on_the_architecture_page_exists(name):
     assert (ROOT / name).is_file()
 
 
-def test_both_paths_name_files_of_the_core_and_of_a_plugin_package():
+def test_both_code_paths_name_files_of_the_core_and_of_a_plugin_package():
     for title in ("The path of a photo", "The path of `--operator pcgrad`"):
         path = PAGE.partition(f"## {title}")[2].partition("\n## ")[0]
         named = re.findall(r"^\| `(\w+)/", path, re.MULTILINE)
@@ -49,7 +49,7 @@ def test_both_paths_name_files_of_the_core_and_of_a_plugin_package():
         assert "crossgrad_core" in named and set(named) & set(PLUGIN_PACKAGES)
 
 
-def test_the_picture_shows_the_packages():
+def test_the_diagram_shows_the_packages():
     picture = (ROOT / "docs" / "layers.svg").read_text(encoding="utf-8")
     shown = re.findall(r"<text[^>]*>(\w+)</text>", picture)
     assert sorted(shown) == sorted(packages() | set(PLUGIN_PACKAGES))

@@ -26,21 +26,21 @@ def shown():
     return names
 
 
-def test_the_shown_backbone_has_60_lines():
+def test_the_cookbook_backbone_has_60_lines():
     assert len([line for line in CODE[0].splitlines() if line]) <= 60
 
 
 @pytest.mark.parametrize("check", checks_of("backbones"), ids=lambda check: check.__name__)
-def test_the_shown_backbone_keeps_the_contract(shown, check):
+def test_the_cookbook_backbone_keeps_the_contract(shown, check):
     check(shown["Spheres"])
 
 
-def test_the_shown_test_is_parametrized_by_the_checks(shown):
+def test_the_cookbook_test_is_parametrized_by_the_checks(shown):
     (mark,) = shown["test_spheres"].pytestmark
     assert mark.args == ("check", checks_of("backbones"))
 
 
-def test_the_shown_backbone_trains(shown, monkeypatch):
+def test_the_cookbook_backbone_trains(shown, monkeypatch):
     built = selecting.build
 
     def with_spheres(slot, name, options):

@@ -30,12 +30,12 @@ BOTH = [(slot, name) for slot in PAGES for name in ours(slot)]
 
 
 @pytest.mark.parametrize("slot", PAGES)
-def test_every_built_in_has_a_section_and_nothing_else_has(slot):
+def test_exactly_the_built_in_components_have_a_section(slot):
     assert list(sections(slot)) == ours(slot)
 
 
 @pytest.mark.parametrize(("slot", "name"), BOTH)
-def test_a_section_says_the_same_things_in_the_same_order(slot, name):
+def test_every_section_has_the_same_lines_in_the_same_order(slot, name):
     lines = sections(slot)[name]
     assert len(lines) == len(FIRST[slot])
     for line, first in zip(lines, FIRST[slot], strict=True):
@@ -43,7 +43,7 @@ def test_a_section_says_the_same_things_in_the_same_order(slot, name):
 
 
 @pytest.mark.parametrize(("slot", "name"), BOTH)
-def test_a_section_names_every_option_or_whose_they_are(slot, name):
+def test_a_section_names_every_option_or_the_component_it_is_inherited_from(slot, name):
     (options,) = (line for line in sections(slot)[name] if line.startswith("- Options"))
     named = set(re.findall(r"`([\w-]+)`", options))
     known = set(load(slot, name).model_fields)

@@ -75,7 +75,7 @@ def _is_name(node):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT / CORE)))
-def test_no_file_names_a_plugin(path):
+def test_no_core_file_names_a_plugin(path):
     assert not list(named(path.read_text(encoding="utf-8")))
 
 
@@ -89,11 +89,11 @@ def test_no_file_names_a_plugin(path):
         'todo = f"use --sampler near-far {x}"',
     ],
 )
-def test_a_name_would_be_found(source):
+def test_the_guard_finds_the_name_of_a_plugin(source):
     assert list(named(source))
 
 
-def test_each_default_is_installed():
+def test_each_default_component_is_installed():
     own = {name: value for name, value in vars(defaults).items() if name.isupper()}
     for value in own.values():
         assert set(value.split("+")) <= {*NAMES, *registry.entries(PLANNERS)}

@@ -45,5 +45,5 @@ def named():
 
 
 @pytest.mark.parametrize("column", columns())
-def test_each_column_is_explained(named, column):
+def test_the_diagnostics_page_explains_each_column(named, column):
     assert column in named

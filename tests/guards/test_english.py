@@ -22,6 +22,6 @@ def riddles(path):
     ]
 
 
-def test_modules_and_classes_say_what_they_are():
+def test_module_and_class_docstrings_name_their_subject():
     """`What X share` and `What is known of X` are riddles; a thing has a name."""
     assert not {str(path.relative_to(ROOT)): found for path in CODE if (found := riddles(path))}

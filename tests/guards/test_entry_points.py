@@ -28,7 +28,7 @@ def test_each_entry_point_loads(entry):
 
 
 @pytest.mark.parametrize("entry", OURS, ids=lambda entry: f"{entry.slot}-{entry.name}")
-def test_each_name_is_easy_to_type(entry):
+def test_each_plugin_name_is_easy_to_type(entry):
     # Recipes of one paper share the first part of their names.
     assert all(part.replace("-", "").isalnum() for part in entry.name.split("/"))
     assert entry.name == entry.name.lower()

@@ -38,10 +38,10 @@ def can_be_empty(value: ast.expr | None) -> bool:
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.stem)
-def test_every_error_says_what_to_do(path):
+def test_every_error_suggests_a_remedy(path):
     silent = [f"line {call.lineno}" for call in raised(path) if can_be_empty(told(call))]
     assert not silent
 
 
-def test_the_guard_finds_errors():
+def test_the_guard_finds_more_than_100_errors():
     assert sum(len(raised(path)) for path in SOURCES) > 100

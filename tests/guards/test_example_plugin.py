@@ -21,20 +21,20 @@ def lines(group):
     return [line for line in source.read_text(encoding="utf-8").splitlines() if line.strip()]
 
 
-def test_it_has_one_plugin_for_every_slot_and_one_command():
+def test_the_example_has_one_plugin_for_every_slot_and_one_command():
     assert set(GROUPS) == set(OFFERED.values())
     assert all(len(named) == 1 for named in GROUPS.values())
 
 
-def test_an_operator_has_12_lines():
+def test_the_example_operator_has_12_lines():
     assert len(lines("crossgrad.operators")) <= 12
 
 
-def test_a_densifier_has_40_lines():
+def test_the_example_densifier_has_40_lines():
     assert len(lines("crossgrad.densifiers")) <= 40
 
 
-def test_a_rule_has_30_lines_and_with_a_recipe_and_their_documentation_40():
+def test_the_example_rule_has_at_most_30_lines_and_40_with_recipe_and_documentation():
     readme = (EXAMPLE / "README.md").read_text(encoding="utf-8").splitlines()
     rows = [line for line in readme if line.startswith(("| recipe |", "| rule |"))]
     rule, recipe = lines("crossgrad.rules"), lines("crossgrad.recipes")

@@ -51,7 +51,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_both_experiments_are_stated_with_equal_draws(name):
+def test_texts_state_both_experiments_at_equal_rendered_views(name):
     stated = found_in(TEXTS[name]())
     assert of_row(EQUAL_DRAWS) in stated
     assert of_row(SECONDS) in stated
@@ -60,7 +60,7 @@ def test_both_experiments_are_stated_with_equal_draws(name):
 
 
 @pytest.mark.parametrize("name", ["README.md", "crossgrad plan"])
-def test_the_other_experiment_at_equal_seconds_is_stated(name):
+def test_the_texts_state_the_result_of_the_second_experiment_at_equal_seconds(name):
     best = TWO_VIEWS.partition("## Each at its best rates")[2]
     assert of_row("| seconds | overall |", best) in found_in(TEXTS[name]())
 

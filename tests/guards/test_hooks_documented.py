@@ -23,7 +23,7 @@ def headings():
     return {name: arguments.split(", ") for name, arguments in HEADING.findall(text)}
 
 
-def test_there_are_hooks():
+def test_the_hook_specifications_are_found():
     assert "crossgrad_densify" in HOOKS
 
 
@@ -32,7 +32,7 @@ def test_each_hook_is_documented_with_its_arguments(headings, hook):
     assert headings[hook] == HOOKS[hook]
 
 
-def test_no_hook_is_documented_that_does_not_exist(headings):
+def test_every_documented_hook_exists(headings):
     assert headings.keys() == HOOKS.keys()
 
 

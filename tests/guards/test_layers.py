@@ -61,11 +61,11 @@ def package(module):
     return [*module.split("."), "__init__"][1]
 
 
-def test_there_is_no_import_cycle(graph):
+def test_the_imports_contain_no_cycle(graph):
     assert not circle(graph)
 
 
-def test_an_import_cycle_would_be_found(tmp_path):
+def test_the_guard_finds_an_import_cycle(tmp_path):
     (tmp_path / "a.py").write_text(
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from p.b import B\n"
     )
@@ -81,7 +81,7 @@ def test_every_package_of_the_core_has_a_layer():
 
 
 @pytest.mark.parametrize("here", LAYER)
-def test_imports_go_down(here, graph):
+def test_modules_import_lower_layers_only(here, graph):
     upward = [
         f"{module} -> {other}"
         for module, others in graph.items()
@@ -123,12 +123,12 @@ def _in(module, place):
     return module == place or module.startswith(f"{place}.")
 
 
-def test_the_core_has_few_files_at_its_top():
+def test_the_core_has_few_top_level_files():
     files = sorted(path.name for path in (ROOT / CORE).glob("*.py"))
     assert len(files) <= MOST_FILES, files
 
 
-def test_the_page_on_the_architecture_shows_these_layers():
+def test_the_architecture_page_shows_the_layers_of_the_guard():
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| (.+?) \|", page, re.MULTILINE)
     shown = {int(number): tuple(re.findall(r"`([\w_]+)", cell)) for number, cell in rows}

@@ -25,7 +25,7 @@ print("\\n".join(sorted(sys.modules)), file=sys.stderr)
     [("--help",), ("--version",), ("run", "--help"), ("plugins", "list"), ("plugins",)],
     ids=" ".join,
 )
-def test_nothing_heavy_is_imported(arguments):
+def test_help_and_lists_import_no_plugin_and_no_heavy_library(arguments):
     ended = subprocess.run(
         [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True
     )

@@ -15,12 +15,12 @@ ROWS = {name: cells for name, *cells in FOUND}
 BY_DEFAULT = {choice.name for choice in RunConfig().metrics}
 
 
-def test_each_metric_has_a_row_in_order():
+def test_each_metric_has_a_row_and_rows_are_in_order():
     assert list(ROWS) == OURS
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_row_has_the_key_and_the_default(name):
+def test_the_row_of_a_metric_has_its_key_and_default(name):
     key, default = ROWS[name]
     metric = build("metrics", name, {})
     assert key == metric.figure.name
@@ -28,6 +28,6 @@ def test_the_row_has_the_key_and_the_default(name):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_page_documents_every_option(name):
+def test_the_metrics_page_documents_every_option(name):
     for option in type(build("metrics", name, {})).model_fields:
         assert f"- `{option}`: " in PAGE

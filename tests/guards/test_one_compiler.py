@@ -44,11 +44,11 @@ def test_only_one_module_calls_the_compiler():
         "import numba\nnumba.njit()",
     ],
 )
-def test_the_search_finds_each_way_to_the_compiler(source):
+def test_the_guard_finds_each_way_to_call_the_compiler(source):
     assert list(compilers_in(source))
 
 
-def test_all_kernels_load_where_nothing_can_be_cached():
+def test_all_kernels_load_if_no_folder_can_hold_a_cache():
     modules = [name.removesuffix(".py").replace("/", ".") for name in KERNELS]
     modules = [name.removesuffix(".__init__") for name in modules]
     program = "import sys, importlib\nfor name in sys.argv[1:]: importlib.import_module(name)"

@@ -29,7 +29,7 @@ def rows():
     return {row[0].strip("`"): row[1:] for row in cells}
 
 
-def test_every_built_in_has_a_section_and_a_row_and_nothing_else_has():
+def test_exactly_the_built_in_operators_have_a_section_and_a_row():
     assert list(sections()) == OURS
     assert list(rows()) == OURS
 
@@ -44,7 +44,7 @@ def test_a_section_has_its_five_lines_and_names_every_option(name):
     assert lines[3].startswith("- Options: none") == (not options)
 
 
-def test_the_table_of_scales_is_true():
+def test_the_table_of_scales_is_correct():
     lines = PAGE.split("| c(K) | operators |")[1].split("\n\n")[0].splitlines()[2:]
     known = {"K": lambda k: k, "1": lambda _: 1, "sqrt(K)": sqrt, "1 + c, 1 for K = 1": _cagrad}
     named = []
@@ -74,7 +74,7 @@ def _scale(name, views):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_table_tells_which_views_are_admitted_and_kept_apart(name):
+def test_the_operator_table_shows_the_accepted_numbers_of_views(name):
     operator = build("operators", name, {})
     one, two, more, apart, _ = rows()[name]
     admitted = [operator.views.admits(views) for views in (1, 2, 3)]
@@ -83,7 +83,7 @@ def test_the_table_tells_which_views_are_admitted_and_kept_apart(name):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_table_tells_which_operators_leave_a_single_view_as_it_is(name):
+def test_the_operator_table_marks_operators_that_do_not_change_a_single_view(name):
     one = rows()[name][0]
     if not one.startswith("as its") and one != "as the weighting":
         assert (one == "g_1") == build("operators", name, {}).is_identity(1)

@@ -28,26 +28,26 @@ def shown():
     return names
 
 
-def test_the_shown_operator_keeps_the_contract(shown):
+def test_the_operator_on_the_page_keeps_the_contract(shown):
     for check in checks_of("operators"):
         check(shown["EqualLength"])
         check(lambda: shown["EqualLength"](share=0.5))
 
 
-def test_the_shown_test_is_parametrized_by_the_checks(shown):
+def test_the_test_on_the_page_is_parametrized_by_the_checks(shown):
     (mark,) = shown["test_equal_length"].pytestmark
     assert mark.args == ("check", checks_of("operators"))
 
 
-def test_the_shown_operator_has_20_lines():
+def test_the_operator_on_the_page_has_20_lines():
     assert len([line for line in blocks("python")[0].splitlines() if line]) <= 20
 
 
-def test_the_shown_report_counts_the_checks():
+def test_the_report_on_the_page_counts_the_checks():
     assert f"pass  {len(checks_of('operators'))} checks" in GUIDE
 
 
-def test_the_shown_entry_points_are_in_groups_that_exist():
+def test_the_entry_points_on_the_page_are_in_existing_groups():
     for text in blocks("toml"):
         groups = tomllib.loads(text)["project"]["entry-points"]
         assert groups.keys() <= set(OFFERED.values())
@@ -64,13 +64,13 @@ def test_each_slot_is_listed_with_group_base_class_and_methods(slot):
     assert not missing
 
 
-def test_the_public_interface_is_complete():
+def test_the_page_lists_the_complete_public_interface():
     # pytest adds names that begin with @ to the modules of packages that bring a plugin of pytest.
     public = {name for name in vars(plugin) if not name.startswith(("_", "@"))}
     assert public == set(plugin.__all__)
 
 
-def test_the_example_names_its_own_plugins():
+def test_entry_points_of_the_example_name_its_own_plugins():
     example = ROOT / "examples" / "plugin"
     project = tomllib.loads((example / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     readme = (example / "README.md").read_text(encoding="utf-8")

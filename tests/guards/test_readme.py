@@ -42,18 +42,18 @@ def installed(tmp_path, monkeypatch):
     sys.modules.pop("my_plugin", None)
 
 
-def test_the_plugin_has_20_lines():
+def test_the_plugin_in_the_readme_has_20_lines():
     assert len([line for line in SHOWN.splitlines() if line.startswith("    ")]) <= 20
 
 
-def test_the_operator_of_the_readme_keeps_the_contract(installed):
+def test_the_operator_in_the_readme_keeps_the_contract(installed):
     kind = load("operators", "louder")
     for check in checks_of("operators"):
         check(kind)
         check(lambda: kind(sharpness=2.0))
 
 
-def test_the_command_of_the_readme_trains_with_it(installed, tmp_path):
+def test_the_command_in_the_readme_trains_with_the_operator(installed, tmp_path):
     command = re.search(r"`crossgrad run (--operator louder .*?)`", SHOWN)[1].split()
     name, (key, value) = command[1], command[3].split("=")
     scene = write_tiny_scene(tmp_path / "tiny", views=9)

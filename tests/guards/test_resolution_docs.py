@@ -12,7 +12,7 @@ SECTIONS = dict(re.findall(r"^## `(\S+)`\n((?:(?!^## ).*\n?)*)", PAGE, re.MULTIL
 OURS = sorted(n for n, e in entries("resolutions").items() if e.value.startswith("crossgrad_p"))
 
 
-def test_every_built_in_has_a_section_and_a_row_and_nothing_else_has():
+def test_exactly_the_built_in_resolutions_have_a_section_and_a_row():
     rows = re.findall(r"^\| `(\S+)` \|", PAGE, re.MULTILINE)
     assert sorted(SECTIONS) == sorted(rows) == OURS
 
@@ -29,5 +29,5 @@ def test_every_option_is_explained_with_its_default(name):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_every_section_has_its_source(name):
+def test_every_section_names_its_source(name):
     assert re.search(r"^- Source: \S", SECTIONS[name], re.MULTILINE)

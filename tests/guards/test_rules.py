@@ -27,5 +27,5 @@ def test_each_rule_has_a_row_with_its_options_and_their_defaults(rule):
         assert f"`{name}` ({field.default})" in row
 
 
-def test_no_other_rule_has_a_row():
+def test_every_row_belongs_to_an_existing_rule():
     assert sorted(re.findall(r"^\| `rules\.(.+?)` \|", PAGE, re.MULTILINE)) == RULES

@@ -34,7 +34,7 @@ BOTH = [(slot, name) for slot in PAGES for name in ours(slot)]
 
 
 @pytest.mark.parametrize("slot", PAGES)
-def test_every_built_in_has_a_section_and_a_row_and_nothing_else_has(slot):
+def test_exactly_the_built_in_components_have_a_section_and_a_row(slot):
     assert sorted(sections(slot)) == list(sections(slot)) == ours(slot)
     assert list(rows(slot)) == ours(slot)
 
@@ -50,19 +50,19 @@ def test_a_section_has_five_lines_and_names_every_option(slot, name):
 
 
 @pytest.mark.parametrize("name", ours("samplers"))
-def test_the_table_of_samplers_tells_the_numbers_of_views_and_the_groups(name):
+def test_the_sampler_table_shows_numbers_of_views_and_default_groupings(name):
     sampler = build("samplers", name, {})
     grouping = f"`{sampler.default_grouping}`" if sampler.default_grouping else "none"
     assert rows("samplers")[name] == [str(sampler.views), str(sampler.default_views), grouping]
 
 
 @pytest.mark.parametrize("name", ours("groupings"))
-def test_the_table_of_groupings_tells_the_labels(name):
+def test_the_grouping_table_shows_the_labels(name):
     labels = build("groupings", name, {}).labels
     assert rows("groupings")[name][0] == (", ".join(labels) if labels else "the user's")
 
 
 @pytest.mark.parametrize("name", ours("samplers"))
-def test_default_groupings_exist(name):
+def test_default_groupings_exist_for_all_samplers(name):
     default = build("samplers", name, {}).default_grouping
     assert default is None or default in ours("groupings")

@@ -40,19 +40,19 @@ def options():
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_each_setting_has_a_row_in_its_order(model):
+def test_settings_have_rows_in_the_order_of_the_schema(model):
     assert list(TABLES[model]) == list(MODELS[model].model_fields)
 
 
 @pytest.mark.parametrize(("model", "name"), FIELDS)
-def test_the_option_of_a_setting_is_the_command_line_s(model, name, options):
+def test_a_row_names_the_command_line_option_of_its_setting(model, name, options):
     option = TABLES[model][name][0].strip("`")
     expected = {"scene": "SCENE"}.get(name) or options.get(name, "-")
     assert option == expected
 
 
 @pytest.mark.parametrize(("model", "name"), FIELDS)
-def test_the_default_of_a_setting_is_the_schema_s(model, name):
+def test_a_row_names_the_schema_default_of_its_setting(model, name):
     default = MODELS[model].model_fields[name].default
     stated = TABLES[model][name][1]
     if isinstance(default, ComponentChoice):
@@ -72,7 +72,7 @@ def empty_settings(config, prefix=""):
             yield from empty_settings(inner, f"{prefix}{name}.")
 
 
-def test_null_in_a_finished_configuration_means_none(tmp_path):
+def test_null_in_a_finished_configuration_is_documented(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=8, points=120)
     out = tmp_path / "run"
     assert ended("run", scene, "--steps", 2, "--rasterizer", "torch", "-q", "--out", out) == 0

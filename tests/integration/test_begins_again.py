@@ -48,7 +48,7 @@ def measured(out):
     return [{name: row[name] for name in MEASURED} for row in read_metrics(out)]
 
 
-def test_a_run_without_a_checkpoint_begins_again_and_says_so(whole, killed):
+def test_a_run_without_a_checkpoint_is_restarted_with_a_note(whole, killed):
     assert app.run({}, resume=killed, verbosity=-1) == 0
     ours, theirs = load(latest(killed)), load(latest(whole))
     assert all(torch.equal(ours.parameters[name], theirs.parameters[name])
@@ -61,14 +61,14 @@ def test_a_run_without_a_checkpoint_begins_again_and_says_so(whole, killed):
     assert {path.name for path in killed.iterdir()} == {path.name for path in whole.iterdir()}
 
 
-def test_a_run_that_was_killed_before_its_table(whole, killed):
+def test_a_run_killed_before_its_metrics_file_is_restarted(whole, killed):
     (killed / "metrics.csv").unlink()
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
     assert measured(killed) == measured(whole)[:1]
 
 
 @pytest.mark.parametrize("stop", [1, 2, 10_000])
-def test_a_step_to_stop_at_that_is_past_or_never_comes_is_refused(killed, stop):
+def test_a_stop_step_in_the_past_or_after_the_end_is_refused(killed, stop):
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
     before = (killed / "log.txt").read_bytes()
     where = "past the step" if stop < 3 else "ends before the step"
@@ -78,7 +78,7 @@ def test_a_step_to_stop_at_that_is_past_or_never_comes_is_refused(killed, stop):
     assert app.run({"stop_after": 3}, resume=killed, verbosity=-1) == 0
 
 
-def test_its_settings_stay(killed):
+def test_a_restarted_run_keeps_its_settings(killed):
     with pytest.raises(UserError, match="keeps its settings"):
         app.run({"seed": 4}, resume=killed, verbosity=-1)
 
@@ -97,7 +97,7 @@ def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
         evaluate.evaluate(killed)
 
 
-def test_a_new_run_into_its_folder_is_told_to_resume(killed):
+def test_a_new_run_into_the_folder_of_a_killed_run_is_refused(killed):
     settings = {"scene": "nowhere", "out": str(killed), "steps": 2}
     with pytest.raises(UserError, match="continue that run with --resume"):
         app.run(settings, verbosity=-1)

@@ -33,7 +33,7 @@ def scene(tmp_path_factory):
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=9)
 
 
-def test_laps_count_cpu_time_without_what_is_left_out(monkeypatch):
+def test_cpu_time_is_counted_for_training_phases_only(monkeypatch):
     times = iter([10.0, 10.5, 12.0, 12.25])
     monkeypatch.setattr(states, "process_time", lambda: next(times))
     clock, laps = Clock(), PhaseTimer(cpu_border=next(times))
@@ -47,7 +47,7 @@ def test_laps_count_cpu_time_without_what_is_left_out(monkeypatch):
 
 
 @pytest.mark.parametrize(("kind", "steps"), [("wall", 100), ("cpu", 400)])
-def test_a_budget_counts_the_clock_that_it_is_in(kind, steps):
+def test_a_budget_ends_the_run_by_its_own_clock(kind, steps):
     length, state = Timed(10.0, kind), SimpleNamespace(step=0, rewinds=0, clock=Clock())
     looks = 0
     while state.clock.trained(kind) < 10.0 - 1e-9:
@@ -83,7 +83,7 @@ def test_the_cpu_clock_is_refused_if_cpu_time_does_not_measure_work(
         ({"seconds": 1.0}, 2),
     ],
 )
-def test_other_budgets_may_have_threads(settings, threads, monkeypatch):
+def test_other_budgets_accept_any_number_of_threads(settings, threads, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     check_clock(RunConfig(**settings))
 
@@ -109,7 +109,7 @@ def test_a_run_on_the_cpu_clock_is_recorded_and_repeated(scene, tmp_path, monkey
     assert all(torch.equal(tensor, states[1][name]) for name, tensor in states[0].items())
 
 
-def test_the_peak_of_primitives_outlives_pruning(scene, tmp_path):
+def test_the_peak_of_primitives_is_kept_after_pruning(scene, tmp_path):
     times = {"densify_from": 1, "densify_every": 4, "densify_until": 40}
     setup = assemble(parsed({"steps": 30, "views": 1, **times}), sample_scene(), "none")
     state = first_state(setup)
@@ -120,13 +120,13 @@ def test_the_peak_of_primitives_outlives_pruning(scene, tmp_path):
     assert totals(setup, state).peak_primitives == max(counts)
 
 
-def test_a_calibration_says_how_fast_the_machine_is():
+def test_the_calibration_measures_the_speed_of_the_machine():
     known = calibrated(0.05)
     assert 0.05 <= known.seconds < 5.0
     assert known.cpu_rate >= 0.9 * known.rate > 0
 
 
-def test_only_runs_of_some_length_are_calibrated_and_once(monkeypatch):
+def test_only_long_runs_are_calibrated_and_only_once(monkeypatch):
     calls = []
     monkeypatch.setattr(machine, "calibrated", lambda: calls.append(1) or calibrated(0.01))
     watch = Machine()
@@ -136,7 +136,7 @@ def test_only_runs_of_some_length_are_calibrated_and_once(monkeypatch):
     assert figures[0]["calibration"].keys() == {"seconds", "rate", "cpu_rate"}
 
 
-def test_the_load_is_looked_at_once_in_a_second(monkeypatch):
+def test_the_machine_load_is_read_once_in_a_second(monkeypatch):
     now, loads = iter([5.0, 5.5, 6.5, 9.0]), iter([1.0, 3.0, 2.0])
     monkeypatch.setattr(machine, "perf_counter", lambda: next(now))
     monkeypatch.setattr(machine.os, "getloadavg", lambda: (next(loads), 0.0, 0.0))

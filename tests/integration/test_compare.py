@@ -10,7 +10,7 @@ from crossgrad_core.run import app
 from crossgrad_plugins.compare.load_runs import read_runs
 
 
-def test_runs_as_they_are_written(tmp_path, capsys):
+def test_compare_reads_the_folders_that_run_writes(tmp_path, capsys):
     scene = write_tiny_scene(tmp_path / "scene", views=9)
     for views in ("1", "2"):
         out = str(tmp_path / "runs" / views)
@@ -39,7 +39,7 @@ def test_runs_as_they_are_written(tmp_path, capsys):
     assert "views.csv" in {path.name for path in folder.iterdir()}
 
 
-def test_a_run_within_seconds_keeps_its_length_when_it_is_resumed(tmp_path, monkeypatch):
+def test_a_run_with_a_time_budget_keeps_its_length_when_it_is_resumed(tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene", views=9)
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (12, "twelve steps", 0.6))
     each_step_takes(monkeypatch, 0.125)

@@ -50,7 +50,7 @@ def trained(number, *plugins, **settings):
 
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 @pytest.mark.parametrize("step", [1, 20, 40])
-def test_a_factor_multiplies_every_rate_of_the_backbone(backbone, step):
+def test_lr_factor_multiplies_every_learning_rate_of_the_backbone(backbone, step):
     plain, doubled = (
         assembled(
             backbone={"name": backbone},
@@ -92,7 +92,7 @@ EIGHTH = 8.0**0.45
         ({"steps": 9, "schedule": "absolute", "schedule_length": 7_500, "views": 2}, EIGHTH),
     ],
 )
-def test_a_shorter_run_has_larger_rates(settings, factor):
+def test_a_shorter_run_uses_larger_learning_rates(settings, factor):
     setup = assembled(**settings)
     published = {block.name: block.lr for block in setup.blocks}
     # Not so few views of nine photos that sizes have a rate of their own, but in runs of 5 steps.
@@ -165,7 +165,7 @@ def test_sh_start_is_refused_if_no_sh_bands_are_left_to_add(settings, monkeypatc
     assert "sh_start" in late and "sh_start" not in none
 
 
-def test_distance_weights_learn_at_a_tenth_of_the_rate_of_their_parameter():
+def test_distance_weights_use_a_tenth_of_the_learning_rate_of_their_parameter():
     setup = assembled(backbone={"name": "distance"}, steps=5)
     found = {name: rate for name, rate in rates_at(setup, 1).items() if "distance_" in name}
     assert len(found) == 3
@@ -226,7 +226,7 @@ def test_runs_with_few_passes_use_smaller_adam_betas(length, settings, beta2, vi
         ({"steps": 5, "beta1": 0.5, "recipe": {"name": "published"}}, 0.5),
     ],
 )
-def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, beta1):
+def test_a_shorter_run_averages_the_first_moment_over_fewer_steps(settings, beta1):
     setup = assembled(**{"views": 1, **settings})
     for step in (1, 5):
         assert rule_at(setup, step).betas[0] == pytest.approx(beta1, abs=1e-4)
@@ -238,9 +238,7 @@ def test_the_first_moment_averages_over_fewer_steps_in_shorter_runs(settings, be
 
 @pytest.mark.parametrize("steps", [60, 5_000])
 @pytest.mark.parametrize("views", [2, 5, 10])
-def test_under_the_batch_rule_beta2_averages_over_the_same_number_of_steps(
-    steps, views, monkeypatch
-):
+def test_the_batch_rule_averages_beta2_over_the_same_number_of_steps(steps, views, monkeypatch):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     setup = assembled(steps=steps, views=views, batch_rule="sqrt")
     first, second = rule_at(setup, 1).betas
@@ -261,7 +259,7 @@ def test_the_planned_adam_rule_stays_when_the_clock_changes_the_length(planned, 
     assert setup.numbers.rate_factor == min(most, (30_000 / steps) ** power)
 
 
-def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(monkeypatch):
+def test_many_photos_make_the_second_moment_average_over_a_part_of_the_steps(monkeypatch):
     monkeypatch.setattr(auto, "FEW_PASSES", 10_000)
     for steps, memory in ((2_000, 50), (5_000, 100), (29_999, 599.98), (30_000, 1_000)):
         setup = assembled(steps=steps)
@@ -269,7 +267,7 @@ def test_with_many_photos_the_second_moment_averages_over_a_part_of_the_steps(mo
         assert setup.numbers.rate_factor == pytest.approx(min(6.3, (30_000 / steps) ** 0.65))
 
 
-def test_in_runs_within_seconds_learning_rates_follow_the_planned_length():
+def test_learning_rates_follow_the_planned_length_in_runs_with_a_time_budget():
     setup = assembled(steps=None, seconds=60.0)
     for name in ("rate_factor", "beta1", "beta2"):
         (row,) = (row for row in setup.decisions if row.setting == name)
@@ -292,7 +290,7 @@ def test_rate_factor_multiplies_the_first_step():
 
 
 @pytest.mark.parametrize("views", [2, 4, 10])
-def test_the_batch_rule_follows_the_views(views):
+def test_the_batch_rule_scales_with_the_number_of_views(views):
     setup, plain = (
         assembled(views=views, batch_rule=rule, beta2=0.999) for rule in ("sqrt", "none")
     )
@@ -458,7 +456,7 @@ def test_densify_views_changes_no_bit_before_the_first_edit(choice, operator):
 
 
 @pytest.mark.parametrize("choice", ["one", "extra"])
-def test_densify_views_changes_the_edits(choice):
+def test_densify_views_changes_the_edits_of_density_control(choice):
     asked = {"views": 2, "min_refinements": 6}
     edited = [trained(40, densify_views=each, **asked)[1] for each in ("all", choice)]
     shapes = [state.parameters["means"].shape[0] for state in edited]

@@ -159,7 +159,7 @@ def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
     assert not (tmp_path / "c.ply").exists()
 
 
-def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, capsys):
+def test_export_writes_next_to_the_files_of_the_run_and_overwrites_none(trained, capsys):
     before = {path.name: path.read_bytes() for path in trained.iterdir() if path.is_file()}
     before.pop("SHA256SUMS", None)  # It follows each file that is added.
     assert ended("export", trained, "--coordinates", "utm") == 0
@@ -188,7 +188,7 @@ def test_evaluating_a_ply_in_other_coordinates_is_refused(trained, tmp_path):
         evaluate.evaluated_file(trained, path)
 
 
-def test_options_of_the_reader_are_kept(scene, tmp_path):
+def test_options_of_the_reader_are_used_again_when_a_run_is_opened(scene, tmp_path):
     """They say what a scene is, so that its run has to be opened with them."""
     out = tmp_path / "run"
     options = {"name": "colmap", "gps": str(scene / "images"), "model": "sparse/0"}

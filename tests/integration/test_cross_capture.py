@@ -123,7 +123,7 @@ def test_a_zoom_path_is_rendered_as_frames_and_a_video(trained, tmp_path, capsys
         (("--frames", "9", "--path", "tour.json"), "--frames", "zoom"),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(trained, options, idle, other, capsys):
+def test_options_without_an_effect_are_refused(trained, options, idle, other, capsys):
     before = sorted(trained.rglob("*"))
     assert ended("render", trained, *options) == 2
     said = capsys.readouterr().err
@@ -131,7 +131,7 @@ def test_options_that_would_do_nothing_are_refused(trained, options, idle, other
     assert sorted(trained.rglob("*")) == before
 
 
-def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
+def test_captures_that_cannot_be_compared_are_refused(trained, scene, tmp_path):
     before = sorted(trained.rglob("*"))
     # Without a second photo there are no points left: none are needed.
     only = without(scene, tmp_path / "only", lambda name: name != "aerial/0001.png")
@@ -147,7 +147,7 @@ def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
     assert np.isfinite(float(per_view(trained / "per_view.csv")["aerial/0000.png"]["psnr"]))
 
 
-def test_scenes_of_one_name_have_tables_of_their_own(trained, scene, tmp_path):
+def test_scenes_with_the_same_name_get_separate_tables(trained, scene, tmp_path):
     table = trained / "per_view_on_place.csv"
     evaluate.evaluated_on(trained, scene)
     before = table.read_text()

@@ -105,7 +105,7 @@ def test_resuming_a_damaged_run_gives_the_same_results_or_is_refused(
 @pytest.mark.parametrize(
     "name", ["eval", pytest.param("export", marks=SLOW), pytest.param("render", marks=SLOW)]
 )
-def test_using_a_damaged_run_gives_the_same_output_or_is_refused(
+def test_opening_a_damaged_run_gives_the_same_output_or_is_refused(
     finished, tmp_path, capsys, name, thorough
 ):
     def looked(run):
@@ -147,7 +147,7 @@ def compared_tables(folder):
 
 
 @THOROUGH
-def test_a_comparison_has_the_same_tables_or_is_refused(finished, tmp_path, thorough):
+def test_comparing_damaged_runs_gives_the_same_tables_or_is_refused(finished, tmp_path, thorough):
     runs = tmp_path / "runs"
     shutil.copytree(finished, runs / "other")
     config = runs / "other" / "config.yaml"
@@ -172,7 +172,7 @@ def moved(finished, scene, folder):
 
 
 @THOROUGH
-def test_a_scene_is_the_one_that_was_trained_on_or_refused(
+def test_a_damaged_scene_gives_the_same_evaluation_or_is_refused(
     scene, finished, tmp_path, capsys, thorough
 ):
     run, place = moved(finished, scene, tmp_path)
@@ -201,7 +201,7 @@ def prepared(tmp_path_factory):
 
 
 @THOROUGH
-def test_a_prepared_scene_is_the_one_that_was_trained_on_or_refused(
+def test_a_damaged_prepared_scene_gives_the_same_export_or_is_refused(
     prepared, tmp_path, capsys, thorough
 ):
     trained = tmp_path / "trained"
@@ -222,7 +222,7 @@ def test_a_prepared_scene_is_the_one_that_was_trained_on_or_refused(
 
 
 @THOROUGH
-def test_a_sweep_has_the_same_table_or_is_refused(tmp_path, capsys, thorough):
+def test_continuing_a_damaged_sweep_gives_the_same_table_or_is_refused(tmp_path, capsys, thorough):
     scene = write_tiny_scene(tmp_path / "tiny", views=4, width=32, height=24, points=60)
     grid, whole, out = tmp_path / "grid.yaml", tmp_path / "whole", tmp_path / "out"
     grid.write_text(json.dumps({"scenes": [str(scene)], "base": {"steps": 2}}))

@@ -65,7 +65,7 @@ OBSERVER = {"name": "diagnostics", "every": 6, "views": 4}
     ],
     ids=["one view", "pair", "random background"],
 )
-def test_watching_changes_no_bit_of_the_training(scene, tmp_path, settings):
+def test_the_diagnostics_observer_changes_no_bit_of_the_training(scene, tmp_path, settings):
     plain = run(scene, tmp_path / "plain", **settings)
     watched = run(scene, tmp_path / "watched", observers=[OBSERVER], **settings)
     assert same(plain.parameters, watched.parameters)
@@ -76,7 +76,7 @@ def test_watching_changes_no_bit_of_the_training(scene, tmp_path, settings):
     assert sorted({int(row["step"]) for row in table(tmp_path / "watched")}) == [6, 12]
 
 
-def test_a_probe_uses_the_run_s_own_groups(scene, tmp_path):
+def test_a_probe_uses_the_grouping_of_the_run(scene, tmp_path):
     settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
     run(scene, tmp_path / "run", observers=[OBSERVER], **settings)
     assert {row["grouping"] for row in table(tmp_path / "run")} == {"of the run"}
@@ -89,7 +89,7 @@ def test_each_probe_records_its_duration(scene, tmp_path):
     assert all(seconds > 0 for seconds in probing.values())
 
 
-def test_a_resumed_run_continues_its_table(scene, tmp_path):
+def test_a_resumed_run_continues_its_diagnostics_table(scene, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run(scene, whole, observers=[OBSERVER])
     run(scene, parts, observers=[OBSERVER], stop_after=7)
@@ -118,7 +118,7 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
         assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_run_is_diagnosed_where_it_is(scene, tmp_path, capsys):
+def test_a_finished_run_is_diagnosed_at_its_final_state(scene, tmp_path, capsys):
     settings = {"sampler": {"name": "near-far"}, "operator": {"name": "symmetric"}}
     run(scene, tmp_path / "run", **settings)
     arguments = ["diagnose", "--run", str(tmp_path / "run"), "--views", "3", "--threads", "1"]
@@ -143,7 +143,7 @@ def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):
     run(scene, tmp_path / "second", sampler={"name": "near-far"}, grouping=grouping)
 
 
-def test_bad_requests_are_refused(scene, tmp_path):
+def test_invalid_diagnose_requests_are_refused(scene, tmp_path):
     with pytest.raises(UserError, match="either a scene"):
         diagnose(scene, tmp_path, {}, QUICK, None)
     with pytest.raises(UserError, match="nosuch"):
@@ -157,7 +157,7 @@ def test_bad_requests_are_refused(scene, tmp_path):
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3])
-def test_too_few_photos_are_refused_as_such(tmp_path, photos):
+def test_too_few_photos_are_refused_with_the_required_number(tmp_path, photos):
     scene = write_tiny_scene(tmp_path / "few", views=photos)
     with pytest.raises(UserError) as told:
         diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
@@ -184,7 +184,7 @@ def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
         ("--accept-scene",),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(arguments, tmp_path, monkeypatch, capsys):
+def test_options_without_an_effect_are_refused(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert ended("diagnose", *arguments) == 2
     assert f"{arguments[-2 if len(arguments) > 1 else 0]} does nothing" in capsys.readouterr().err
@@ -225,7 +225,7 @@ def test_a_training_that_fails_reports_its_probes_and_the_reason(
 
 
 @pytest.mark.parametrize("compiling", [True, False], ids=["compiling", "training"])
-def test_a_training_that_fails_before_the_first_probe_says_so(
+def test_a_training_that_fails_before_the_first_probe_is_reported(
     scene, tmp_path, monkeypatch, capfd, compiling
 ):
     if not compiling:

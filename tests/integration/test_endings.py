@@ -105,7 +105,7 @@ class Broken:
         (SystemExit("enough"), "SystemExit: enough"),
     ],
 )
-def test_an_unexpected_error_keeps_everything(scene, whole, tmp_path, with_plugin, capsys, case):
+def test_an_unexpected_error_keeps_all_results(scene, whole, tmp_path, with_plugin, capsys, case):
     error, words = case
     out = tmp_path / "run"
     with_plugin["broken"] = Broken(error)
@@ -126,7 +126,9 @@ def test_an_unexpected_error_keeps_everything(scene, whole, tmp_path, with_plugi
     assert_same(out, whole)
 
 
-def test_a_photo_that_cannot_be_read_at_an_evaluation(scene, whole, tmp_path, monkeypatch, capsys):
+def test_a_photo_that_cannot_be_read_at_an_evaluation_keeps_the_run(
+    scene, whole, tmp_path, monkeypatch, capsys
+):
     def unreadable(*args, **kwargs):
         raise UserError("the photo cannot be decoded", where="0003.png", todo="copy it again")
 
@@ -150,7 +152,7 @@ def test_a_photo_that_cannot_be_read_at_an_evaluation(scene, whole, tmp_path, mo
         ("export_scene", "point_cloud.ply"), ("write_summary", "summary.json"),
     ],
 )  # fmt: skip
-def test_one_failing_result_at_the_end_of_a_run_does_not_prevent_the_others(
+def test_one_failing_result_at_the_end_of_a_run_does_not_prevent_other_results(
     scene, whole, tmp_path, monkeypatch, capsys, case
 ):
     function, missing = case
@@ -191,7 +193,9 @@ class Unkind:
             raise ValueError("no end")
 
 
-def test_an_observer_that_raises_when_the_run_ends(scene, tmp_path, with_plugin, capsys):
+def test_an_observer_that_raises_when_the_run_ends_loses_no_results(
+    scene, tmp_path, with_plugin, capsys
+):
     with_plugin["unkind"] = Unkind("end")
     assert run(scene, tmp_path / "run") == 1
     assert "ValueError: no end" in capsys.readouterr().err
@@ -200,7 +204,9 @@ def test_an_observer_that_raises_when_the_run_ends(scene, tmp_path, with_plugin,
     assert found["step"] == STEPS and found["overall"]["psnr"] > 5
 
 
-def test_an_observer_that_raises_when_the_run_starts(scene, tmp_path, with_plugin, capsys):
+def test_an_observer_that_raises_when_the_run_starts_fails_the_run(
+    scene, tmp_path, with_plugin, capsys
+):
     with_plugin["unkind"] = Unkind("start")
     assert run(scene, tmp_path / "run") == 1
     assert "ValueError: no start" in capsys.readouterr().err
@@ -270,7 +276,9 @@ def test_a_second_signal_skips_evaluation_but_saves_a_checkpoint(
     assert_same(out, whole)
 
 
-def test_a_second_signal_while_the_finished_run_is_evaluated(scene, whole, tmp_path, with_plugin):
+def test_a_second_signal_stops_the_evaluation_of_a_finished_run(
+    scene, whole, tmp_path, with_plugin
+):
     out = tmp_path / "run"
     with_plugin["signals"] = Signals(STEPS, signal.SIGINT, signal.SIGINT, evaluation=True)
     assert run(scene, out) == 130
@@ -280,7 +288,7 @@ def test_a_second_signal_while_the_finished_run_is_evaluated(scene, whole, tmp_p
     assert_same(out, whole)
 
 
-def test_signals_that_the_process_ignores_stay_ignored(scene, tmp_path, with_plugin):
+def test_signals_that_the_process_ignores_are_still_ignored(scene, tmp_path, with_plugin):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with_plugin["signals"] = Signals(3, signal.SIGHUP)
@@ -308,7 +316,7 @@ def rotten(path):
     path.write_bytes(content)
 
 
-def test_a_held_out_photo_that_cannot_be_decoded_costs_no_step(tmp_path):
+def test_a_held_out_photo_that_cannot_be_decoded_is_refused_before_training(tmp_path):
     scene = write_tiny_scene(tmp_path / "tiny", views=9)
     rotten(scene / "images" / "0008.png")
     with pytest.raises(UserError, match=r"cannot be decoded(.|\n)*0008\.png"):
@@ -317,7 +325,7 @@ def test_a_held_out_photo_that_cannot_be_decoded_costs_no_step(tmp_path):
 
 
 @pytest.mark.parametrize("dry", [False, True])
-def test_check_decodes_the_training_photos_too_before_anything_is_written(tmp_path, dry):
+def test_check_option_also_decodes_training_photos_before_anything_is_written(tmp_path, dry):
     scene = write_tiny_scene(tmp_path / "tiny", views=9)
     rotten(scene / "images" / "0003.png")
     rotten(scene / "images" / "0005.png")
@@ -342,7 +350,7 @@ class Waiting:
                 thread.join(30)
 
 
-def test_a_training_photo_that_cannot_be_decoded_is_found_beside_training(
+def test_a_training_photo_that_cannot_be_decoded_is_found_during_training(
     tmp_path, with_plugin, capsys, monkeypatch
 ):
     """It is drawn in no step here: the sampler keeps to the first views."""

@@ -43,7 +43,7 @@ def exported(request, tmp_path_factory):
     return setup, state, cloud, count, path
 
 
-def test_names_order_and_count(exported):
+def test_a_ply_has_the_standard_properties_in_order_and_the_right_count(exported):
     *_, count, path = exported
     header = path.read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [line.split()[2] for line in header if line.startswith("property float ")]
@@ -54,7 +54,7 @@ def test_names_order_and_count(exported):
     assert len(plyread(path)) == count > 0
 
 
-def test_values(exported):
+def test_a_ply_contains_the_values_of_the_exported_cloud(exported):
     _, _, cloud, count, path = exported
     found = plyread(path)
     assert found.is_scales_ply and found.is_opacities_ply and found.is_sh0_sh
@@ -69,7 +69,7 @@ def test_values(exported):
 
 
 @pytest.mark.parametrize("exported", ["vanilla"], indirect=True)
-def test_values_of_vanilla_are_its_parameters(exported):
+def test_a_vanilla_ply_contains_the_parameters_of_the_backbone(exported):
     setup, state, _, _, path = exported
     found = plyread(path)
     parameters = {name: t.detach().double().numpy() for name, t in state.parameters.items()}

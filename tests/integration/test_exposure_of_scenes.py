@@ -39,7 +39,7 @@ def test_the_bundled_scene_differs_in_exposure_at_any_size():
 
 
 @pytest.mark.parametrize("name", KNOWN)
-def test_the_table_of_scenes(name):
+def test_the_exposure_rule_decides_known_scenes_as_in_the_table(name):
     if not (SCENES / name).is_dir():
         pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
     spread, reduction, differ = KNOWN[name]
@@ -52,7 +52,7 @@ def test_the_table_of_scenes(name):
 @pytest.mark.parametrize(
     ("name", "differ"), [("ochota_kap_hybrid", True), ("ochota_kap_hybrid_gain", False)]
 )
-def test_near_and_far_photos_that_share_thirty_points(name, differ):
+def test_the_exposure_rule_needs_only_thirty_shared_points_of_near_and_far_photos(name, differ):
     if not (SCENES / name).is_dir():
         pytest.skip("CROSSGRAD_SCENES names no folder with this scene")
     scene, _ = read_scene(configured({"scene": SCENES / name, "threads": 1}))

@@ -69,7 +69,7 @@ def notes(out):
     return " ".join(read_run(out).summary["notes"])
 
 
-def test_auto_is_off_where_photos_agree_and_changes_no_bit(scene, tmp_path):
+def test_exposure_auto_is_off_if_photos_agree_and_changes_no_bit(scene, tmp_path):
     assert run(scene, tmp_path / "none", exposure={"name": "none"}) == 0
     assert run(scene, tmp_path / "auto") == 0
     assert same(tmp_path / "none", tmp_path / "auto")
@@ -79,7 +79,7 @@ def test_auto_is_off_where_photos_agree_and_changes_no_bit(scene, tmp_path):
     assert not (tmp_path / "none" / "exposure.json").exists()
 
 
-def test_auto_is_a_gain_if_photos_differ_and_none_suggests_the_gain(varied, tmp_path):
+def test_exposure_auto_is_gain_if_photos_differ_and_none_suggests_gain(varied, tmp_path):
     assert run(varied, tmp_path / "auto") == 0
     assert run(varied, tmp_path / "gain", exposure={"name": "gain"}) == 0
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
@@ -90,7 +90,7 @@ def test_auto_is_a_gain_if_photos_differ_and_none_suggests_the_gain(varied, tmp_
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_each_model_is_right_from_its_first_step(varied, tmp_path, model):
+def test_each_exposure_model_starts_at_the_measured_values(varied, tmp_path, model):
     assert run(varied, tmp_path / "run", steps=1, exposure={"name": model}) == 0
     name, found = photos(tmp_path / "run")
     assert name == model
@@ -109,7 +109,7 @@ def test_each_model_is_right_from_its_first_step(varied, tmp_path, model):
 
 
 @pytest.mark.parametrize("model", with_long("channel"))
-def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(varied, tmp_path, model):
+def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(varied, tmp_path, model):
     settings = {"exposure": {"name": model, "rate": 0.05}, "views_per_step": 3}
     assert run(varied, tmp_path / "whole", **settings) == 0
     assert run(varied, tmp_path / "broken", stop_after=5, **settings) == 0
@@ -118,7 +118,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(varied, tmp_pa
     assert photos(tmp_path / "whole") == photos(tmp_path / "broken")
 
 
-def test_rates_fall_to_a_hundredth_and_zero_keeps_the_start(varied, tmp_path):
+def test_exposure_rates_fall_to_a_hundredth_and_rate_zero_keeps_initial_values(varied, tmp_path):
     kept = {"name": "gain", "rate": 0.0}
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
     assert run(varied, tmp_path / "more", exposure=kept) == 0
@@ -143,7 +143,9 @@ def test_exposure_from_starts_at_the_values_of_another_run(varied, tmp_path):
 
 
 @pytest.mark.parametrize("model", ["gain", "affine"])
-def test_photos_that_the_file_lacks_keep_their_distance(varied, tmp_path, model):
+def test_photos_missing_from_the_file_keep_their_exposure_relative_to_other_photos(
+    varied, tmp_path, model
+):
     """The file has three photos, each three stops brighter than in the run before."""
     kind = "matrix" if model == "affine" else "stops"
 
@@ -196,7 +198,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_file_is_refused_before_anything_is_written(varied, tmp_path, case):
+def test_an_invalid_exposure_file_is_refused_before_anything_is_written(varied, tmp_path, case):
     content, why = WRONG[case]
     (tmp_path / "values.json").write_bytes(content)
     settings = {"exposure": {"name": "gain"}, "exposure_from": str(tmp_path / "values.json")}
@@ -205,7 +207,7 @@ def test_a_wrong_file_is_refused_before_anything_is_written(varied, tmp_path, ca
     assert not (tmp_path / "run").exists()
 
 
-def test_values_for_an_exposure_without_any_are_refused(scene, tmp_path):
+def test_an_exposure_file_for_an_exposure_without_values_is_refused(scene, tmp_path):
     (tmp_path / "values.json").write_text("{}")
     with pytest.raises(UserError, match="do nothing") as caught:
         run(scene, tmp_path / "run", exposure_from=str(tmp_path / "values.json"))
@@ -238,7 +240,7 @@ def check_extremes(scene, tmp_path, case, model, views):
 @pytest.mark.parametrize(
     ("case", "model"), [("ten stops", "gain"), ("a black photo", "affine")], ids=" ".join
 )
-def test_extreme_photos_are_finite_and_named(scene, tmp_path, case, model):
+def test_extreme_photos_give_finite_results_and_are_named(scene, tmp_path, case, model):
     check_extremes(scene, tmp_path, case, model, 2)
 
 
@@ -246,12 +248,14 @@ def test_extreme_photos_are_finite_and_named(scene, tmp_path, case, model):
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("case", EXTREMES)
-def test_all_extreme_photos_with_all_models(scene, tmp_path, case, model, views):
+def test_all_extreme_photos_give_finite_results_with_all_models(
+    scene, tmp_path, case, model, views
+):
     check_extremes(scene, tmp_path, case, model, views)
 
 
 @pytest.mark.parametrize("model", with_long("gain"))
-def test_gains_of_ten_stops_from_a_file_are_finite_and_named(varied, tmp_path, model):
+def test_gains_of_ten_stops_from_a_file_give_finite_results_and_are_named(varied, tmp_path, model):
     assert run(varied, tmp_path / "first", steps=1, exposure={"name": "gain"}) == 0
     names = sorted(photos(tmp_path / "first")[1])
     kind = "matrix" if model == "affine" else "stops"
@@ -271,7 +275,7 @@ def test_gains_of_ten_stops_from_a_file_are_finite_and_named(varied, tmp_path, m
 
 
 @pytest.mark.parametrize("model", [*with_long("gain"), "auto"])
-def test_photos_without_tracks_start_at_their_regime(varied, tmp_path, model):
+def test_photos_without_tracks_start_at_the_exposure_of_their_regime(varied, tmp_path, model):
     folder = tmp_path / "scene"
     shutil.copytree(varied, folder)
     (folder / "sparse" / "0" / "points3D.bin").unlink()
@@ -282,7 +286,7 @@ def test_photos_without_tracks_start_at_their_regime(varied, tmp_path, model):
 
 
 @pytest.mark.parametrize("model", [*with_long("channel"), "auto"])
-def test_one_photo_has_no_other_to_differ_from(scene, tmp_path, model):
+def test_a_single_photo_gets_no_exposure_correction(scene, tmp_path, model):
     folder = tmp_path / "scene"
     shutil.copytree(scene, folder)
     names = sorted(path.name for path in (folder / "images").iterdir())

@@ -151,20 +151,20 @@ def run(scene, out, *options):
     return ended("run", scene, *given, *options)
 
 
-def test_a_figure_is_a_number_in_every_file(scene, tmp_path, monkeypatch):
+def test_a_metric_value_is_a_number_in_every_file(scene, tmp_path, monkeypatch):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--metrics", "tensor") == 0
     with (tmp_path / "run" / "per_view.csv").open() as file:
         assert {row["tensor"] for row in csv.DictReader(file)} == {"0.5"}
 
 
-def test_views_may_be_numbers_of_numpy(scene, tmp_path, monkeypatch):
+def test_numbers_of_views_may_be_numpy_integers(scene, tmp_path, monkeypatch):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--sampler", "numpy", "--stop-after", "2") == 0
     assert ended("run", "--resume", tmp_path / "run", "-q") == 0
 
 
-def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, capsys):
+def test_a_run_that_loses_all_primitives_reports_so(scene, tmp_path, monkeypatch, capsys):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--densifier", "emptying") == 0
     words = "no primitive is left: look at densifier emptying"
@@ -196,7 +196,7 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )
-def test_it_is_one_message_before_anything_is_written(
+def test_a_faulty_plugin_gives_one_error_before_anything_is_written(
     scene, tmp_path, monkeypatch, capsys, options, words
 ):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
@@ -228,7 +228,7 @@ def test_a_hook_that_fails_in_training_is_named_with_its_plugin(
     assert whose in capsys.readouterr().err
 
 
-def test_a_plugin_that_fails_during_selection_does_not_block_the_others(
+def test_a_plugin_that_fails_during_selection_does_not_block_other_plugins(
     scene, tmp_path, monkeypatch, capsys
 ):
     # They are asked by every run that leaves the choice to crossgrad.
@@ -242,7 +242,7 @@ def test_a_plugin_that_fails_during_selection_does_not_block_the_others(
     assert "rasterizer slow left out: ValueError: who knows" in notes
 
 
-def test_a_module_that_leaves_when_it_is_imported_does_not_end_the_command(
+def test_a_plugin_module_that_calls_exit_on_import_does_not_end_the_command(
     scene, tmp_path, monkeypatch, capsys
 ):
     leaving = {slot: {"leaving": "made_up_leaving:A"} for slot in ("observers", "commands")}

@@ -120,14 +120,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(scene, tmp_path, case):
+def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_path, case):
     settings = {**ALTOGETHER, **CASES[case]}
     assert run(scene, tmp_path / "whole", **settings) == 0
     assert resumed(scene, tmp_path / "broken", **settings) == 0
     same(tmp_path / "whole", tmp_path / "broken")
 
 
-def test_the_record_of_a_step_has_the_scales(scene, tmp_path):
+def test_the_record_of_a_step_contains_the_scales(scene, tmp_path):
     assert run(scene, tmp_path / "run", **ALTOGETHER, sampler={"name": "near-far"}, views=2) == 0
     last = load(latest(tmp_path / "run")).scalars["last"]
     expected = [0.5 if name.startswith("near") else 1.0 for name in last["names"]]
@@ -135,7 +135,7 @@ def test_the_record_of_a_step_has_the_scales(scene, tmp_path):
     assert last["scales"] == expected
 
 
-def test_extra_renders_count_and_take_training_time(scene, tmp_path):
+def test_extra_renders_are_counted_and_take_training_time(scene, tmp_path):
     settings = {**ALTOGETHER, "densifier": {"name": "unseen"}, "sampler": {"name": "one-then-two"}}
     assert run(scene, tmp_path / "run", **settings, reset_every=None) == 0
     edits = load(latest(tmp_path / "run")).plugins["densifier"].values["losses"]
@@ -146,7 +146,7 @@ def test_extra_renders_count_and_take_training_time(scene, tmp_path):
     assert all(0.0 < loss < 1.0 for losses in edits for loss in losses)
 
 
-def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
+def test_a_requested_render_equals_the_image_of_training(scene, tmp_path):
     asked = []
 
     class Asks(Observer):
@@ -168,7 +168,7 @@ def test_a_render_on_request_is_what_training_compares(scene, tmp_path):
 
 
 @pytest.mark.parametrize(("view", "scale"), [(-1, 1.0), (99, 1.0), (0, 0.0), (0, 1.5)])
-def test_a_render_that_there_cannot_be_is_refused(view, scale):
+def test_an_impossible_render_request_is_refused(view, scale):
     setup = SimpleNamespace(train_views=(None,) * 3)
     with pytest.raises(UserError, match="asked for a render"):
         RenderCallback(setup, None, counted=False)(view, scale)
@@ -183,7 +183,7 @@ class PairOnly(Operator):
         return AggregateResult(context.gradients.total()), state
 
 
-def test_an_operator_without_a_meaning_for_some_step_is_refused():
+def test_an_operator_that_some_step_cannot_use_is_refused():
     selection = selection_of(
         sampler=load_plugin("samplers", "one-then-two")(), operator=PairOnly(), views_per_step=2
     )
@@ -208,7 +208,7 @@ def test_the_hook_of_the_scales_can_be_wrapped(scene, tmp_path, monkeypatch):
     assert load(latest(tmp_path / "run")).scalars["last"]["scales"] == [0.25, 0.25]
 
 
-def test_a_plugin_metric_has_columns_and_its_name_creates_no_regime(scene, tmp_path):
+def test_a_plugin_metric_adds_columns_and_its_name_creates_no_regime(scene, tmp_path):
     assert run(scene, tmp_path / "run", **ALTOGETHER) == 0
     columns = list(rows(tmp_path / "run")[0])
     assert columns[5:11] == [
@@ -236,7 +236,7 @@ def stops_of(out):
 
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
-def test_gains_per_photo_find_the_photos_that_are_darker(scene, tmp_path, views, backbone):
+def test_gains_per_photo_identify_the_darker_photos(scene, tmp_path, views, backbone):
     dark = dimmed(scene, tmp_path / "dark", 1.0)
     settings = {"steps": 90 // views, "views": views, "reset_every": None}
     exposure = {"name": "stops", "lr": 0.1}
@@ -250,7 +250,7 @@ def test_gains_per_photo_find_the_photos_that_are_darker(scene, tmp_path, views,
     assert sum(stops.values()) == pytest.approx(0.0, abs=1e-5)
 
 
-def test_photos_that_a_step_did_not_draw_move_by_the_projection_only(scene, tmp_path):
+def test_photos_not_rendered_in_a_step_change_by_the_projection_only(scene, tmp_path):
     assert run(scene, tmp_path / "run", steps=1, exposure={"name": "stops"}, views=1) == 0
     stops = stops_of(tmp_path / "run")
     drawn = load(latest(tmp_path / "run")).scalars["last"]["names"]
@@ -260,7 +260,7 @@ def test_photos_that_a_step_did_not_draw_move_by_the_projection_only(scene, tmp_
     assert abs(stops[drawn[0]] - rest.pop()) == pytest.approx(0.05, rel=1e-4)
 
 
-def test_without_an_exposure_nothing_is_kept_per_photo(scene, tmp_path):
+def test_a_run_without_an_exposure_stores_no_values_per_photo(scene, tmp_path):
     assert run(scene, tmp_path / "run", steps=2) == 0
     assert "photos" not in load(latest(tmp_path / "run")).plugins
 
@@ -273,7 +273,7 @@ def test_training_seconds_are_reported_by_phase(scene, tmp_path):
     assert all(seconds["phases"][phase] > 0 for phase in PHASES)
 
 
-def test_two_columns_of_one_name_are_refused(tmp_path):
+def test_two_columns_with_the_same_name_are_refused(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=4, folders=("cc", "far"))
     with pytest.raises(UserError, match="psnr_cc") as caught:
         run(scene, tmp_path / "run", **ALTOGETHER)
@@ -281,7 +281,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_scales_out_of_bounds_end_the_run_by_name(scene, tmp_path, monkeypatch, capsys):
+def test_scales_out_of_bounds_end_the_run_and_name_the_plugin(scene, tmp_path, monkeypatch, capsys):
     from support.hook_plugins import NearAtHalf
 
     monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))

@@ -34,5 +34,5 @@ def test_a_hostile_file_ends_in_one_error_within_the_memory_limit(name, found):
     assert found[name] in {"UserError", "ValueError"}
 
 
-def test_without_the_bound_a_hostile_file_exhausts_the_memory(found):
+def test_a_hostile_file_exhausts_the_memory_without_the_limit(found):
     assert found["lists without a bound"] == "MemoryError"

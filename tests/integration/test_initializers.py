@@ -27,7 +27,7 @@ def run(scene, out, *options):
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
-def test_by_default_the_start_is_filled_and_says_so(scene, tmp_path, backbone):
+def test_the_default_initializer_fills_gaps_and_reports_so(scene, tmp_path, backbone):
     options = ("--backbone", backbone, "--densifier", "none")
     assert run(scene, tmp_path / "plain", *options, "--initializer", "points") == 0
     assert run(scene, tmp_path / "filled", *options) == 0
@@ -36,7 +36,7 @@ def test_by_default_the_start_is_filled_and_says_so(scene, tmp_path, backbone):
     assert not any(note.startswith("start: ") for note in read_notes(tmp_path / "plain"))
 
 
-def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
+def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
     options = ("--initializer", "fill-gaps", "--set", "initializer.cells=6")
     assert run(scene, tmp_path / "whole", *options) == 0
     assert run(scene, tmp_path / "broken", *options, "--stop-after", "4") == 0
@@ -48,7 +48,7 @@ def test_a_run_that_goes_on_has_the_same_bits(scene, tmp_path):
 
 
 @pytest.mark.parametrize("options", [("--init", "random"), ("--recipe", "published")], ids=str)
-def test_runs_with_these_options_use_the_points_initializer(scene, tmp_path, options):
+def test_options_that_exclude_filling_use_the_points_initializer(scene, tmp_path, options):
     """Their configuration says so, and repeats the run."""
     assert run(scene, tmp_path / "run", *options) == 0
     stored = read_config(tmp_path / "run")
@@ -71,7 +71,7 @@ def sparse(tmp_path_factory):
 
 @pytest.mark.parametrize("points", [0, 1, 2])
 @pytest.mark.parametrize("initializer", sorted(entries("initializers")))
-def test_every_initializer_trains_a_scene_with_no_points_or_few_of_them(
+def test_every_initializer_trains_a_scene_with_few_or_no_points(
     sparse, tmp_path, capsys, initializer, points
 ):
     given = ("--steps", "4", "--threads", "1", "-q", "--out", tmp_path / "run")
@@ -85,7 +85,7 @@ def test_every_initializer_trains_a_scene_with_no_points_or_few_of_them(
         assert "the scene has no SfM points to start from" in capsys.readouterr().err
 
 
-def test_an_initializer_with_init_random_is_refused(scene, tmp_path, capsys):
+def test_an_initializer_together_with_init_random_is_refused(scene, tmp_path, capsys):
     assert run(scene, tmp_path / "run", "--init", "random", "--initializer", "fill-gaps") == 2
     assert "initializer: --init random has points of its own" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -21,12 +21,12 @@ def reference():
 
 
 @pytest.mark.parametrize("name", known_bits.CASES)
-def test_bits_are_the_known_ones(name, reference, tmp_path):
+def test_trained_bits_equal_the_recorded_bits(name, reference, tmp_path):
     assert known_bits.made(name, tmp_path) == reference[name]
 
 
 @pytest.mark.parametrize("name", ["vanilla", "scaffold", "exposure"])
-def test_bits_do_not_depend_on_who_does_which_job(name, monkeypatch, tmp_path):
+def test_bits_do_not_depend_on_the_thread_that_does_a_job(name, monkeypatch, tmp_path):
     usual = known_bits.made(name, tmp_path / "usual")
     of_threads = jobs._jobs
     # As if the last of three threads did all of them, from its own ones on.
@@ -34,6 +34,6 @@ def test_bits_do_not_depend_on_who_does_which_job(name, monkeypatch, tmp_path):
     assert known_bits.made(name, tmp_path / "turned") == usual
 
 
-def test_every_known_processor_has_all_cases():
+def test_every_known_processor_has_results_for_all_cases():
     for results in known_bits.known().values():
         assert results.keys() == known_bits.CASES.keys()

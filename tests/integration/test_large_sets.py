@@ -27,7 +27,7 @@ def trained(scene, out, *, check=False, **reading):
     return bits(out)
 
 
-def test_memory_disk_and_files_give_the_same_bits(scene, tmp_path, monkeypatch):
+def test_photos_from_memory_disk_cache_and_files_give_the_same_bits(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("CROSSGRAD_CACHE", str(tmp_path / "cache"))
     in_memory = trained(scene, tmp_path / "in memory")
     assert not (tmp_path / "cache").exists()

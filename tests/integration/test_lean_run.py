@@ -45,13 +45,13 @@ def imported(tmp_path_factory):
 
 
 @pytest.mark.parametrize("unused", UNUSED)
-def test_a_run_on_a_colmap_scene_does_not_import(imported, unused):
+def test_a_run_on_a_colmap_scene_does_not_import_unused_modules(imported, unused):
     assert f"{OURS}readers.colmap" in imported
     module = OURS + unused
     assert not [each for each in imported if each == module or each.startswith(f"{module}.")]
 
 
-def test_each_module_of_the_list_exists(imported):
+def test_each_module_of_the_import_list_exists(imported):
     from support.imports import modules
 
     assert {OURS + unused for unused in UNUSED} <= modules().keys()

@@ -61,7 +61,7 @@ def trained(**settings):
     return setup, state, seen
 
 
-def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
+def test_evaluations_only_at_the_end_change_no_result(scene, tmp_path):
     often = run(scene, tmp_path / "often", steps=9, eval_every=2)
     late = run(scene, tmp_path / "late", steps=9, eval_every=2, eval_from=5)
     assert [row["step"] for row in often] == ["2", "4", "6", "8", "9"]
@@ -70,7 +70,7 @@ def test_evaluations_may_wait_for_the_end_and_change_nothing(scene, tmp_path):
 
 
 @pytest.mark.parametrize(("margin", "told"), [(-100.0, True), (100.0, False)])
-def test_a_run_that_ends_worse_than_an_earlier_step_reports_it(
+def test_a_run_that_ends_worse_than_an_earlier_step_reports_so(
     scene, tmp_path, monkeypatch, capsys, margin, told
 ):
     monkeypatch.setattr("crossgrad_core.run.finish.WORSE", margin)
@@ -85,7 +85,7 @@ def test_a_run_that_ends_worse_than_an_earlier_step_reports_it(
     ("views", "length", "steps", "drawn"),
     [(1, 13, 13, 13), (2, 13, 6, 12), ("1..2@0.5", 13, 8, 12), (3, 12, 4, 12)],
 )
-def test_a_length_in_views_is_one_in_steps(views, length, steps, drawn):
+def test_a_length_in_views_is_converted_to_steps(views, length, steps, drawn):
     setup, state, seen = trained(views=views, max_views=length)
     assert (setup.schedule.total, setup.config.steps) == (steps, steps)
     assert setup.config.max_views is None
@@ -98,7 +98,7 @@ def test_a_run_shorter_than_a_step_is_refused():
         assembled(views=4, max_views=3)
 
 
-def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path):
+def test_max_views_ends_a_run_before_its_seconds_are_used(scene, tmp_path):
     settings = {"seconds": 60.0, "max_views": 9, "views": 2, "sampler": {"name": "epoch"}}
     rows = run(scene, tmp_path / "run", **settings)
     assert (rows[-1]["step"], rows[-1]["views"]) == ("4", "8")
@@ -112,7 +112,7 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
 
 
-def test_a_run_in_seconds_notes_options_of_resets_that_it_has_none_for(scene, tmp_path):
+def test_a_run_in_seconds_notes_reset_options_without_an_effect(scene, tmp_path):
     out, densifier = tmp_path / "run", {"name": "adc", "prune_scale": 0.3}
     run(scene, out, seconds=60.0, max_views=9, densifier=densifier)
     line = "densifier.prune_scale does nothing: the run has no opacity resets"
@@ -124,7 +124,7 @@ def test_a_run_in_seconds_notes_options_of_resets_that_it_has_none_for(scene, tm
     assert app.run(again, verbosity=-1) == 0
 
 
-def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
+def test_seconds_end_a_run_before_max_views_is_reached(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0
     assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
@@ -143,7 +143,7 @@ def test_a_resumed_run_with_seconds_and_max_views_ends_at_max_views(scene, tmp_p
     assert read_config(out)["planned_views"] == 12
 
 
-def test_a_dry_run_of_views_within_seconds_is_a_configuration_of_it(scene, tmp_path, capsys):
+def test_a_dry_run_with_seconds_and_max_views_prints_its_configuration(scene, tmp_path, capsys):
     given = {"scene": str(scene), "seconds": 60.0, "max_views": 500, "threads": 1}
     assert app.run(given, dry_run=True, verbosity=-1) == 0
     (tmp_path / "config.yaml").write_text(capsys.readouterr().out)
@@ -153,20 +153,20 @@ def test_a_dry_run_of_views_within_seconds_is_a_configuration_of_it(scene, tmp_p
 
 
 @pytest.mark.parametrize("views", [9, "1..9@0.5"])
-def test_a_dry_run_refuses_more_different_views_than_there_are(scene, views):
+def test_a_dry_run_refuses_more_different_views_than_training_views(scene, views):
     given = {"scene": str(scene), "steps": 8, "views_per_step": views, "threads": 1}
     given["sampler"] = {"name": "epoch"}
     with pytest.raises(UserError, match="9 different views of 7 training views"):
         app.run(given, dry_run=True, verbosity=-1)
 
 
-def test_views_within_seconds_are_at_least_a_step():
+def test_max_views_with_seconds_must_cover_at_least_one_step():
     with pytest.raises(UserError, match="at least 4, the views of a step"):
         assembled(views=4, max_views=3, seconds=1.0)
 
 
 @pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "steps": 4}])
-def test_a_run_has_one_length(lengths):
+def test_more_than_one_length_is_refused(lengths):
     with pytest.raises(UserError, match="one length"):
         app.with_defaults(RunConfig(**lengths))
 
@@ -184,7 +184,7 @@ def test_the_bundled_scene_has_its_own_default_length(asked, seconds, views):
     assert (config.seconds, config.max_views, config.steps) == (seconds, views, None)
 
 
-def test_the_dry_run_of_a_budget_is_a_configuration_of_it(scene, tmp_path, capsys):
+def test_a_dry_run_with_seconds_prints_its_configuration(scene, tmp_path, capsys):
     settings = {"scene": str(scene), "seconds": 60.0, "threads": 1}
     assert app.run(settings, dry_run=True, verbosity=-1) == 0
     (tmp_path / "config.yaml").write_text(capsys.readouterr().out)
@@ -208,7 +208,7 @@ def test_schedule_unit_steps_counts_events_in_steps():
     assert trained(views=2, steps=72, **given)[2].edits == [30, 50]
 
 
-def test_k_follows_its_plan_and_repeats_bit_for_bit(scene, tmp_path):
+def test_k_follows_its_schedule_and_repeats_bit_for_bit(scene, tmp_path):
     settings = {"views": "1..2@0.5", "steps": 20, "sampler": {"name": "epoch"}}
     rows = run(scene, tmp_path / "whole", **settings)
     assert [(row["step"], row["views"]) for row in rows] == [
@@ -225,7 +225,7 @@ def test_k_follows_its_plan_and_repeats_bit_for_bit(scene, tmp_path):
 
 
 @pytest.mark.parametrize("operator", ["gradvac", "gradnorm"])
-def test_operators_that_remember_go_on_when_k_changes(operator):
+def test_operators_with_memory_continue_when_k_changes(operator):
     _, state, seen = trained(
         views="1..3@0.3..2@0.6", steps=10, operator={"name": operator}, grouping={"name": "radial"}
     )
@@ -251,7 +251,7 @@ def test_an_invalid_views_value_is_refused_with_the_expected_form(text, form):
         parsed({"views": text})
 
 
-def test_cost_ahead_counts_the_views_per_step_of_the_coming_steps():
+def test_predicted_cost_counts_the_views_per_step_of_the_coming_steps():
     settings = {"steps": 1000, "densifier": {"name": "none"}}
     plain, changing = (assembled(views=views, **settings) for views in (2, "1..3@0.5"))
     crowd = PrimitiveCounts(start=100, present=100)

@@ -40,7 +40,7 @@ def contents(folder):
 
 
 @pytest.mark.parametrize("status", ["finished", "stopped"])
-def test_results_without_checkpoints_are_not_begun_again(run, status):
+def test_results_without_checkpoints_are_not_overwritten_by_a_restart(run, status):
     shutil.rmtree(run / "checkpoints")
     summary = (run / "summary.json").read_text()
     (run / "summary.json").write_text(summary.replace('"finished"', f'"{status}"'))
@@ -56,7 +56,7 @@ def test_results_without_checkpoints_are_not_begun_again(run, status):
         assert contents(run) == before
 
 
-def test_a_run_that_failed_without_a_checkpoint_begins_again(run):
+def test_a_run_that_failed_without_a_checkpoint_is_restarted(run):
     shutil.rmtree(run / "checkpoints")
     summary = (run / "summary.json").read_text()
     (run / "summary.json").write_text(summary.replace('"finished"', '"failed"'))
@@ -65,7 +65,7 @@ def test_a_run_that_failed_without_a_checkpoint_begins_again(run):
 
 
 @pytest.mark.parametrize("name", ["per_view.csv", "point_cloud.ply"])
-def test_a_missing_file_is_added(run, name):
+def test_a_missing_result_file_is_added(run, name):
     before = (run / name).read_bytes()
     (run / name).unlink()
     assert app.run({}, resume=run, verbosity=-1) == 0
@@ -75,7 +75,7 @@ def test_a_missing_file_is_added(run, name):
 
 
 @pytest.mark.parametrize("act", ["evaluate", "save"])
-def test_a_folder_that_was_moved_is_not_made_again(run, act):
+def test_a_folder_moved_during_a_run_is_not_created_again(run, act):
     setup, state = cg.open(run)._open()
     session = Session.resumed(run, setup, 5)
     run.rename(run.with_name("moved"))
@@ -84,7 +84,7 @@ def test_a_folder_that_was_moved_is_not_made_again(run, act):
     assert not run.exists()
 
 
-def test_a_run_whose_folder_is_moved_says_so_and_no_more(scene, tmp_path, monkeypatch, capsys):
+def test_a_run_whose_folder_is_moved_gives_one_error(scene, tmp_path, monkeypatch, capsys):
     out, original = tmp_path / "run", Session.save
 
     def moved(session, setup, state):
@@ -149,7 +149,7 @@ def test_points_that_no_photo_shows_are_refused(scene, tmp_path):
         ("steps: 6", "steps: 8", "steps"),
     ],
 )
-def test_a_changed_configuration_is_refused(run, old, new, named):
+def test_a_changed_configuration_file_is_refused(run, old, new, named):
     text = (run / "config.yaml").read_text()
     assert text.count(old) == 1
     (run / "config.yaml").write_text(text.replace(old, new))
@@ -168,7 +168,7 @@ def test_settings_that_do_not_affect_training_may_be_changed(run):
     evaluate.evaluate(run)
 
 
-def test_an_outdated_video_is_removed_if_no_new_one_is_made(run, monkeypatch, capsys):
+def test_an_outdated_video_is_removed_if_no_new_video_is_made(run, monkeypatch, capsys):
     render.render_path(run, path=ZOOM, frames=3, out=None)
     (made,) = run.glob("renders/*/path_zoom/video.*")
     monkeypatch.setattr(video, "_LARGEST", 100)

@@ -27,7 +27,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_the_page_on_python_runs_in_a_notebook(folder):
+def test_the_code_on_the_python_page_runs_in_a_notebook(folder):
     blocks = re.findall(
         r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )
@@ -41,7 +41,7 @@ def test_the_page_on_python_runs_in_a_notebook(folder):
 
 
 @pytest.mark.slow
-def test_an_interrupted_cell_stops_its_run_which_goes_on_with_the_same_bits(folder):
+def test_an_interrupted_cell_stops_its_run_and_resuming_gives_the_same_bits(folder):
     log = folder / "run" / "log.txt"
     stopped = executed([RUN], folder, lambda: log.is_file() and "step 24/" in log.read_text())
     (error,) = errors(stopped)

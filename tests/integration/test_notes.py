@@ -48,7 +48,7 @@ def test_a_run_killed_before_its_first_checkpoint_repeats_its_notes(scene, tmp_p
     assert notes(tmp_path / "killed")[1:] == before
 
 
-def test_a_budget_in_seconds_stays_known(scene, tmp_path, monkeypatch):
+def test_a_resumed_run_with_a_time_budget_keeps_its_planned_steps(scene, tmp_path, monkeypatch):
     out = tmp_path / "run"
     each_step_takes(monkeypatch, 0.05)
     run(scene, out, seconds=1.5, stop_after=14)
@@ -58,7 +58,7 @@ def test_a_budget_in_seconds_stays_known(scene, tmp_path, monkeypatch):
     assert len(of(notes(out), GROWTH)) == 1
 
 
-def test_notes_are_not_settings(scene, tmp_path):
+def test_notes_are_not_stored_as_settings(scene, tmp_path):
     run(scene, tmp_path / "run", steps=2)
     stored = read_config(tmp_path / "run")
     assert "notes" not in stored
@@ -68,6 +68,6 @@ def test_notes_are_not_settings(scene, tmp_path):
 @pytest.mark.parametrize(
     ("length", "known"), [({"max_views": 599}, 1), ({"max_views": 600}, 0), ({"seconds": 60.0}, 0)]
 )
-def test_a_dry_run_says_that_there_is_no_density_control(scene, capsys, length, known):
+def test_a_dry_run_reports_that_density_control_is_off(scene, capsys, length, known):
     assert app.run({"scene": str(scene), **length}, dry_run=True, verbosity=-1) == 0
     assert capsys.readouterr().out.count(f"# {GROWTH}") == known

@@ -30,7 +30,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_a_run_that_is_under_way_is_not_continued_a_second_time(stopped):
+def test_a_running_run_cannot_be_resumed_a_second_time(stopped):
     with locked(stopped, "training"):
         before = content(stopped)
         with pytest.raises(UserError, match=f"process {os.getpid()}, training since"):
@@ -38,7 +38,7 @@ def test_a_run_that_is_under_way_is_not_continued_a_second_time(stopped):
         assert content(stopped) == before
 
 
-def test_a_second_run_into_a_folder_that_one_has_just_begun_in_is_refused(scene, tmp_path):
+def test_a_second_run_into_the_folder_of_a_run_that_just_began_is_refused(scene, tmp_path):
     settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 2}
     (tmp_path / "run").mkdir()
     with locked(tmp_path / "run", "training"):
@@ -48,7 +48,7 @@ def test_a_second_run_into_a_folder_that_one_has_just_begun_in_is_refused(scene,
         assert content(tmp_path / "run") == before
 
 
-def test_a_folder_that_was_filled_while_the_run_compiled_is_refused(scene, tmp_path, monkeypatch):
+def test_a_folder_that_was_filled_during_compilation_is_refused(scene, tmp_path, monkeypatch):
     out = tmp_path / "run"
 
     def another_run_comes_and_goes(*args):
@@ -62,13 +62,13 @@ def test_a_folder_that_was_filled_while_the_run_compiled_is_refused(scene, tmp_p
     assert (out / "metrics.csv").read_text() == "precious"
 
 
-def test_a_folder_that_is_no_run_gets_no_lock_file(tmp_path):
+def test_a_folder_that_is_not_a_run_gets_no_lock_file(tmp_path):
     with pytest.raises(UserError, match="not the folder of a run"):
         app.run({}, resume=tmp_path, verbosity=-1)
     assert content(tmp_path) == {}
 
 
-def test_where_there_are_no_locks_the_run_says_so(stopped, monkeypatch, caplog):
+def test_a_run_warns_if_the_file_system_has_no_locks(stopped, monkeypatch, caplog):
     import fcntl
 
     def unsupported(file, operation):

@@ -27,7 +27,7 @@ def photos_alone(folder: Path) -> Path:
     return folder
 
 
-def test_the_recipe_makes_a_scene_that_can_be_trained(tmp_path):
+def test_the_photos_recipe_makes_a_scene_that_can_be_trained(tmp_path):
     photos_alone(tmp_path / "scene" / "images")
     (tmp_path / "poses.py").write_text(RECIPE, encoding="utf-8")
     command = [sys.executable, "poses.py", "scene"]
@@ -40,7 +40,7 @@ def test_the_recipe_makes_a_scene_that_can_be_trained(tmp_path):
 
 
 @pytest.mark.parametrize("photos", ["images", "."], ids=["in images", "in the folder itself"])
-def test_the_error_for_photos_alone_names_the_command(tmp_path, photos):
+def test_the_error_for_photos_without_a_model_names_the_command(tmp_path, photos):
     photos_alone(tmp_path / "scene" / photos)
     with pytest.raises(UserError, match="no COLMAP model") as refused:
         ColmapReader().read(tmp_path / "scene", SceneOptions())
@@ -54,5 +54,5 @@ def test_every_pycolmap_name_on_the_page_exists():
     assert pycolmap.FeatureExtractionOptions(num_threads=2).num_threads == 2
 
 
-def test_the_readme_leads_to_the_recipe():
+def test_the_readme_links_to_the_recipe():
     assert "docs/photos.md" in (ROOT / "README.md").read_text(encoding="utf-8")

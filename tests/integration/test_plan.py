@@ -45,7 +45,7 @@ def trained(bare, tmp_path_factory):
     return out
 
 
-def test_the_table(scene, capsys, monkeypatch):
+def test_plan_prints_a_table_of_at_most_120_columns(scene, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     assert ended("plan", scene, "--set", "exposure=gain") == 0
     out = capsys.readouterr().out
@@ -54,7 +54,7 @@ def test_the_table(scene, capsys, monkeypatch):
     assert max(map(len, out.splitlines())) <= 120
 
 
-def test_the_command_that_follows_has_what_was_asked_for(scene, tmp_path, capsys):
+def test_the_printed_run_command_repeats_the_given_options(scene, tmp_path, capsys):
     file = tmp_path / "my plan.yaml"
     file.write_text("seed: 3\n")
     asked = ("--config", file, "--seconds", 90, "--max-size", 24, "--set", "background=1, 1, 1")
@@ -67,7 +67,7 @@ def test_the_command_that_follows_has_what_was_asked_for(scene, tmp_path, capsys
 
 
 @pytest.mark.parametrize("length", [(), ("--seconds", 60)])
-def test_a_length_that_was_decided_is_written_down(scene, tmp_path, length):
+def test_a_length_chosen_by_the_planner_is_written_to_the_file(scene, tmp_path, length):
     file = tmp_path / "plan.yaml"
     assert ended("plan", scene, *length, "--write", file) == 0
     stored = read_mapping(file, "a configuration", "repair it")
@@ -76,7 +76,7 @@ def test_a_length_that_was_decided_is_written_down(scene, tmp_path, length):
     assert ended("run", "--config", file, "--dry-run", "-q") == 0
 
 
-def test_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
+def test_a_plan_for_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
     file = tmp_path / "plan.yaml"
     assert ended("plan", "--max-size", 64, "--write", file) == 0
     stored = read_mapping(file, "a configuration", "repair it")
@@ -87,7 +87,7 @@ def test_the_bundled_scene_keeps_its_seconds(tmp_path, capsys):
     assert last == "run it: crossgrad run --max-size 64"
 
 
-def test_json_has_every_figure(bare, capsys):
+def test_json_output_contains_every_measured_number(bare, capsys):
     assert ended("plan", bare, "--json", "--steps", 4) == 0
     plan = json.loads(capsys.readouterr().out)
     assert plan["settings"] == {"initializer": "triangulated"}
@@ -99,7 +99,7 @@ def test_json_has_every_figure(bare, capsys):
     assert all(each["rule"] and each["source"] for each in parts.values())
 
 
-def test_a_plan_that_is_written_down_is_a_run_s(bare, tmp_path, trained):
+def test_a_run_from_a_written_plan_equals_a_run_that_plans_itself(bare, tmp_path, trained):
     file, out = tmp_path / "plan.yaml", tmp_path / "run"
     assert ended("plan", bare, "--steps", 4, "--write", file) == 0
     assert ended("run", "--config", file, *FEW[2:], "--out", out) == 0
@@ -122,13 +122,13 @@ def test_the_configuration_repeats_the_run_without_the_planner(trained, tmp_path
     assert (again / "point_cloud.ply").read_bytes() == (trained / "point_cloud.ply").read_bytes()
 
 
-def test_a_new_length_asks_the_planner_again(trained, tmp_path):
+def test_a_new_length_makes_the_planner_decide_again(trained, tmp_path):
     file, out = trained / "config.yaml", tmp_path / "run"
     assert ended("run", "--config", file, "--steps", 2, "-q", "--out", out) == 0
     assert settings(out)["decided"]["initializer"] == "the scene has no SfM points"
 
 
-def test_what_the_user_set_wins(bare, tmp_path):
+def test_settings_of_the_user_override_the_plan(bare, tmp_path):
     out = tmp_path / "run"
     given = ("--init", "random", "--exposure", "gain")
     assert ended("run", bare, *FEW, *given, "--out", out) == 0
@@ -141,7 +141,7 @@ def test_the_plan_triangulates_points_for_a_scene_without_points(bare, capsys):
     assert "triangulated" in capsys.readouterr().out
 
 
-def test_a_single_photo_trains(tmp_path):
+def test_a_scene_with_a_single_photo_can_be_trained(tmp_path):
     write_tiny_scene(tmp_path / "one", views=1, points=0)
     out = tmp_path / "run"
     assert ended("run", tmp_path / "one", *FEW, "--out", out) == 0
@@ -160,7 +160,7 @@ def test_a_probe_measures_quantities_that_need_gradients(tmp_path, capsys):
     assert 0.0 <= parts["operator"]["figures"]["conflict"] <= 1.0
 
 
-def test_nothing_is_overwritten_and_bad_input_writes_nothing(scene, tmp_path, capsys):
+def test_plan_overwrites_no_file_and_bad_input_writes_nothing(scene, tmp_path, capsys):
     file = tmp_path / "plan.yaml"
     assert ended("plan", tmp_path / "nothing", "--write", file) == 2
     assert not file.exists()
@@ -185,7 +185,7 @@ LEFT_OUT = (
 )
 
 
-def test_components_that_are_not_used_are_not_imported(scene, tmp_path):
+def test_unused_components_are_not_imported(scene, tmp_path):
     out = tmp_path / "run"
     arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
     done = subprocess.run(
@@ -198,7 +198,7 @@ def test_components_that_are_not_used_are_not_imported(scene, tmp_path):
         assert f"crossgrad_plugins.{name}" not in loaded
 
 
-def test_bands_that_are_left_out_are_not_allocated(scene, tmp_path, monkeypatch):
+def test_sh_bands_that_the_plan_leaves_out_are_not_allocated(scene, tmp_path, monkeypatch):
     from crossgrad_plugins.planner import view_dependence as measured
 
     matte = measured.ViewDependence(500, -0.02, -0.03, -0.01)

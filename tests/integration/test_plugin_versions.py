@@ -72,7 +72,7 @@ def contents(run):
     return {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
-def test_a_run_writes_down_its_packages_and_what_they_bring(scene, tmp_path, stopped):
+def test_a_run_records_its_packages_and_their_components(scene, tmp_path, stopped):
     assert packages(stopped) == {
         "crossgrad": {"versions": [cg.__version__], "components": []},
         "versioned-package": {"versions": ["1.0"], "components": ["operator own-sum"]},
@@ -84,9 +84,7 @@ def test_a_run_writes_down_its_packages_and_what_they_bring(scene, tmp_path, sto
     assert packages(inside)["versioned-package"]["components"] == ["operator own-pcgrad"]
 
 
-def test_another_version_is_refused_unless_it_is_accepted_and_then_written_down(
-    stopped, install, capsys
-):
+def test_another_package_version_must_be_accepted_and_is_then_recorded(stopped, install, capsys):
     before = contents(stopped)
     install("1.1")
     assert ended("run", "--resume", stopped, "-q") == 2
@@ -111,13 +109,15 @@ def signed(run):
     return [note for note in notes if "versioned-package" in note]
 
 
-def test_the_same_version_goes_on_without_a_word(stopped, capsys):
+def test_a_run_with_unchanged_package_versions_is_resumed_without_a_message(stopped, capsys):
     assert ended("run", "--resume", stopped, "-q") == 0
     assert "version" not in capsys.readouterr().err
     assert signed(stopped) == ["from versioned-package 1.0: operator own-sum"]
 
 
-def test_another_version_of_crossgrad_is_one_of_a_package(stopped, capsys):
+def test_another_version_of_crossgrad_must_be_accepted_like_that_of_a_plugin_package(
+    stopped, capsys
+):
     text = (stopped / FILE).read_text().replace(cg.__version__, "0.1.9")
     (stopped / FILE).write_text(text)
     with pytest.raises(cg.UserError, match=r"crossgrad 0\.1\.9(.|\n)*--accept-plugins"):
@@ -133,7 +133,7 @@ def test_eval_reports_a_changed_package_version(stopped, install, capsys):
     assert words in capsys.readouterr().err
 
 
-def test_a_run_without_a_readable_file_goes_on_with_a_note(stopped, capsys):
+def test_a_run_without_a_readable_package_file_is_resumed_with_a_note(stopped, capsys):
     for content in (None, "{", '{"crossgrad": {"versions": []}}', "[1]"):
         (stopped / FILE).unlink()
         if content is not None:
@@ -149,9 +149,7 @@ def packages_before(run):
     return json.loads((run / "summary.json").read_text())["step"] + 1
 
 
-def test_a_package_that_is_gone_is_named_with_its_version(
-    scene, tmp_path, stopped, install, capsys
-):
+def test_a_missing_package_is_named_with_its_version(scene, tmp_path, stopped, install, capsys):
     whole = tmp_path / "whole"
     assert ended("run", scene, *GIVEN, "--backbone", "own-vanilla", "--out", whole) == 0
     install(None)

@@ -20,7 +20,7 @@ def write_cloud(path, count=300):
 SHORT = {"steps": 2, "threads": 1, "metrics": ["psnr"], "max_gaussians": 10_000}
 
 
-def test_a_run_without_sfm_points_starts_from_a_cloud_and_goes_on_elsewhere(tmp_path, monkeypatch):
+def test_a_run_from_a_point_cloud_can_be_resumed_in_another_folder(tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene", views=4, width=24, height=16)
     (scene / "sparse" / "0" / "points3D.bin").unlink()
     write_cloud(tmp_path / "cloud.ply")
@@ -37,7 +37,7 @@ def test_a_run_without_sfm_points_starts_from_a_cloud_and_goes_on_elsewhere(tmp_
         open_run(tmp_path / "run", {})
 
 
-def test_points_beside_a_start_that_takes_none_are_refused(tmp_path):
+def test_a_point_cloud_with_random_initialization_is_refused(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=4, width=24, height=16)
     write_cloud(tmp_path / "cloud.ply")
     with pytest.raises(UserError, match=r"data\.points"):

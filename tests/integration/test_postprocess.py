@@ -62,7 +62,7 @@ def export_file(folder, **options):
     export.export(folder, **{"file_format": "ply", "out": None, **options})
 
 
-def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys):
+def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, capsys):
     before = content(finished)
     export_file(finished, camera="street/0002.png")
     assert new_files(finished, before) == {"point_cloud_street__0002.ply"}
@@ -76,7 +76,7 @@ def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys
         export_file(finished, camera="nobody")
 
 
-def test_a_file_of_another_format_than_its_name_says_is_refused(finished, tmp_path):
+def test_an_output_name_of_another_file_format_is_refused(finished, tmp_path):
     with pytest.raises(UserError, match=r"a name that ends in \.ply"):
         export_file(finished, out=tmp_path / "scene.splat")
     assert not (tmp_path / "scene.splat").exists()
@@ -91,13 +91,13 @@ def test_the_same_export_writes_the_same_file(finished):
     assert new_files(finished, before) == set()
 
 
-def test_a_backbone_that_is_not_baked_has_no_file_for_a_view(scene, tmp_path):
+def test_a_backbone_without_baking_cannot_export_for_a_view(scene, tmp_path):
     run(scene, tmp_path / "run", stop_after=1)
     with pytest.raises(UserError, match="vanilla has nothing to bake"):
         export_file(tmp_path / "run", camera="street/0002.png")
 
 
-def test_results_of_another_step_than_the_summary_get_names_of_their_own(finished):
+def test_results_of_a_step_newer_than_the_summary_get_separate_file_names(finished):
     """A run that went on and was killed has a checkpoint that is newer than its summary."""
     path = finished / "summary.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "step": 2}))
@@ -109,7 +109,7 @@ def test_results_of_another_step_than_the_summary_get_names_of_their_own(finishe
     assert content(finished)["per_view_step-000003.csv"] == before["per_view.csv"]
 
 
-def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys):
+def test_a_run_in_training_is_only_read(finished, tmp_path, caplog, capsys):
     with locked(finished, "training"):
         before = content(finished)
         evaluate.evaluate(finished)
@@ -129,7 +129,7 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
 
-def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp_path):
+def test_render_overwrites_no_image_in_a_folder_named_by_the_user(finished, tmp_path):
     for name, draw in (
         ("street__0001", lambda out: render.render(finished, split="all", out=out)),
         ("00001", lambda out: render.render_path(finished, "zoom", frames=2, out=out)),
@@ -144,14 +144,14 @@ def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp
         render.render(finished, split="test", out=None)
 
 
-def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
+def test_a_folder_that_is_not_a_run_is_not_changed(tmp_path):
     for look in (evaluate.evaluate, export_file):
         with pytest.raises(UserError, match="not the folder of a run"):
             look(tmp_path)
     assert content(tmp_path) == {}
 
 
-def test_memory_of_an_evaluation_is_not_shown_as_that_of_the_run(finished, capsys):
+def test_an_evaluation_does_not_show_its_memory_as_memory_of_the_run(finished, capsys):
     evaluate.evaluate(finished)
     said = capsys.readouterr().out
     assert "3 steps" in said and "memory" not in said
@@ -169,7 +169,7 @@ def test_evaluation_uses_all_threads_and_resuming_uses_the_threads_of_the_run(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine with CUDA needs no way out")
-def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path, caplog):
+def test_a_run_trained_with_cuda_can_be_used_on_a_machine_without_cuda(finished, tmp_path, caplog):
     path = finished / "config.yaml"
     stored = yaml.safe_load(path.read_text())
     options = {name: stored["rasterizer"][name] for name in ("near", "dilation", "max_alpha")}
@@ -189,7 +189,7 @@ def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path,
     assert "rasterizer gsplat does not run on cpu: another one draws" in caplog.text
 
 
-def test_the_command_line_has_these_options():
+def test_eval_render_and_export_have_the_options_device_and_threads():
     from typer.testing import CliRunner
 
     from crossgrad_core.cli.main import app as command
@@ -228,7 +228,9 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     assert "drawn on black" in printed
 
 
-def test_a_message_reports_what_a_background_costs_the_ply(scene, tmp_path, capsys):
+def test_a_message_reports_the_quality_that_the_ply_loses_by_its_background(
+    scene, tmp_path, capsys
+):
     settings = {"scene": str(scene), "steps": STEPS, "threads": 1}
     for name in ("white", "black", "random"):
         out = tmp_path / name

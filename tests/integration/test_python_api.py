@@ -97,14 +97,14 @@ def disturbed():
     torch.set_num_threads(threads)
 
 
-def test_a_run_does_not_depend_on_what_its_process_has_set(disturbed, scene, reference, tmp_path):
+def test_a_run_does_not_depend_on_settings_of_its_process(disturbed, scene, reference, tmp_path):
     trained = run(scene, tmp_path / "run")
     assert bits(trained.folder) == bits(reference)
     assert trained.evaluate().overall["psnr"] == trained.metrics["psnr"][-1]
     assert trained.render(trained.scene.test_views[0].camera).max() > 0.1
 
 
-def test_a_stopped_run_goes_on_with_the_bits_of_the_command(scene, reference, tmp_path):
+def test_a_stopped_run_resumed_from_python_has_the_bits_of_the_command(scene, reference, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     assert stopped.summary["status"] == "stopped"
     finished = cg.resume(stopped.folder, quiet=True)
@@ -138,14 +138,14 @@ def test_an_interrupt_stops_after_the_step_and_the_run_can_be_resumed(
     assert bits(resumed.folder, EVALUATED) == bits(reference)
 
 
-def test_a_run_that_is_told_to_terminate_saves_and_ends_the_process(scene, tmp_path, monkeypatch):
+def test_a_run_that_receives_sigterm_saves_and_ends_the_process(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Session, "save", lambda *_: signal.raise_signal(signal.SIGTERM))
     with pytest.raises(SystemExit) as ended:
         run(scene, tmp_path / "run", save_every=4)
     assert ended.value.code == 128 + signal.SIGTERM
 
 
-def test_a_failed_run_raises_with_its_folder_and_cause(scene, tmp_path, monkeypatch):
+def test_a_failed_run_raises_an_error_with_its_folder_and_cause(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(Session, "evaluate", lambda *_, **__: 1 / 0)
     with pytest.raises(cg.RunFailedError, match="ZeroDivisionError") as failed:
         run(scene, tmp_path / "run")
@@ -166,7 +166,7 @@ def test_a_failed_run_raises_with_its_folder_and_cause(scene, tmp_path, monkeypa
         ),
     ],
 )
-def test_a_wrong_option_is_the_error_of_the_command(scene, tmp_path, options, words, capfd):
+def test_an_invalid_option_gives_the_error_of_the_command(scene, tmp_path, options, words, capfd):
     with pytest.raises(cg.UserError, match=words) as raised:
         cg.run(scene, out=tmp_path / "run", quiet=True, **options)
     assert not (tmp_path / "run").exists()
@@ -176,7 +176,7 @@ def test_a_wrong_option_is_the_error_of_the_command(scene, tmp_path, options, wo
     assert f"error: {raised.value}" in capfd.readouterr().err
 
 
-def test_options_are_not_changed_and_may_be_numbers_of_numpy(scene, tmp_path):
+def test_options_are_not_changed_and_may_be_numpy_numbers(scene, tmp_path):
     backbone = {"name": "vanilla"}
     given = {"backbone": backbone, "backbone.sh_degree": np.int32(1), "max_size": 40}
     trained = run(scene, tmp_path / "run", steps=np.int64(2), **given)
@@ -211,7 +211,7 @@ def test_an_opened_run_returns_metrics_summary_and_renders(reference, tmp_path, 
         cg.open(tmp_path)
 
 
-def test_a_run_that_has_gone_on_is_opened_again(scene, tmp_path):
+def test_an_opened_run_is_read_again_after_it_was_resumed(scene, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     name = stopped.scene.test_views[0].name
     before = stopped.render(name)
@@ -219,7 +219,7 @@ def test_a_run_that_has_gone_on_is_opened_again(scene, tmp_path):
     assert not np.array_equal(stopped.render(name), before)
 
 
-def test_two_threads_do_not_write_into_one_folder(scene, tmp_path):
+def test_two_threads_cannot_write_into_one_run_folder(scene, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     with (
         locked(stopped.folder, "training"),
@@ -228,7 +228,7 @@ def test_two_threads_do_not_write_into_one_folder(scene, tmp_path):
         cg.resume(stopped.folder, quiet=True)
 
 
-def test_importing_is_light():
+def test_importing_the_core_imports_no_heavy_library():
     program = (
         "import sys, crossgrad_core as cg; cg.UserError; dir(cg)\n"
         "heavy = {'torch', 'numba', 'numpy', 'pydantic', 'typer', 'yaml'} & sys.modules.keys()\n"

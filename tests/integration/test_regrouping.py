@@ -28,7 +28,7 @@ def known_labels(run):
     return json.loads((checkpoint / "state.json").read_text())["plugins"].get("grouping")
 
 
-def test_views_are_grouped_anew_and_a_stopped_run_has_the_same_bits(scene, tmp_path):
+def test_views_are_regrouped_and_a_stopped_run_has_the_same_bits(scene, tmp_path):
     whole = run(scene, tmp_path / "whole")
     parts = run(scene, tmp_path / "parts", stop_after=13)
     assert known_labels(parts) is not None
@@ -39,6 +39,6 @@ def test_views_are_grouped_anew_and_a_stopped_run_has_the_same_bits(scene, tmp_p
     assert "by gradients after step 9" in (whole.folder / "summary.json").read_text()
 
 
-def test_a_run_that_ends_before_keeps_its_first_groups(scene, tmp_path):
+def test_a_run_that_ends_before_regrouping_keeps_its_first_groups(scene, tmp_path):
     early = run(scene, tmp_path / "early", **{"grouping.at": 50})
     assert known_labels(early) is None

@@ -89,7 +89,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(scene, tmp_path, case):
+def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_path, case):
     assert run(scene, tmp_path / "whole", **CASES[case]) == 0
     assert run(scene, tmp_path / "parts", stop_after=7, **CASES[case]) == 0
     assert load(latest(tmp_path / "parts")).scalars["last"]["scales"][0] < 1.0
@@ -99,7 +99,7 @@ def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_one(scene, tmp_pat
 
 
 @pytest.mark.parametrize("resolution", [OCTAVES, SPECTRAL])
-def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(
+def test_the_configuration_of_a_run_with_a_time_budget_repeats_it_bit_for_bit(
     scene, tmp_path, monkeypatch, resolution
 ):
     # Whatever the probe of this machine says, the first plan is wrong: the run gets longer.
@@ -123,7 +123,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(
         assert "far 1/" in note and "near 1/" in note and note.count("full size from step 19") == 2
 
 
-def test_figures_are_those_of_the_full_size(scene, tmp_path):
+def test_metrics_are_measured_at_full_size(scene, tmp_path):
     settings = {"steps": 1, "rate_factor": 1e-9, "eval_every": 1}
     run(scene, tmp_path / "full", **settings)
     run(scene, tmp_path / "small", **settings, resolution=OCTAVES)
@@ -159,7 +159,7 @@ PARTS = {"far": {"photos": 4, "scales": [0.25]}, "near": {"photos": 5, "scales":
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_a_further_view_has_the_scale_of_its_own_regime_and_changes_none(views):
+def test_an_extra_view_has_the_scale_of_its_own_regime_and_changes_no_other_view(views):
     asked = {"resolution": {"name": "spectral", "smallest": 1, "courses": PARTS}, "views": views}
     scales = {"far": 0.25, "near": 0.5}
     streams = []

@@ -47,7 +47,7 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys, drawn):
+def test_a_run_writes_all_documented_files(scene, tmp_path, capsys, drawn):
     out = tmp_path / "run"
     assert run(scene, out) == 0
     assert (out / "curve.png").stat().st_size > 10_000
@@ -68,7 +68,7 @@ def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys, drawn):
     assert rows[1]["views"] == "12"
 
 
-def test_training_brings_the_loss_down(scene, tmp_path):
+def test_training_reduces_the_loss(scene, tmp_path):
     run(scene, tmp_path / "short", steps=2, eval_every=1)
     run(scene, tmp_path / "long", steps=120)
     first = float(quality(tmp_path / "short")[0]["psnr"])
@@ -76,7 +76,7 @@ def test_training_brings_the_loss_down(scene, tmp_path):
     assert last > first + 2.0
 
 
-def test_same_seed_same_bits_other_seed_other_bits(scene, tmp_path):
+def test_only_the_same_seed_gives_the_same_bits(scene, tmp_path):
     run(scene, tmp_path / "a")
     run(scene, tmp_path / "b")
     run(scene, tmp_path / "c", seed=1)
@@ -109,7 +109,7 @@ def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     assert rows == quality(tmp_path / "whole")
 
 
-def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scene, tmp_path):
+def test_an_averaged_run_resumes_bit_for_bit_and_exports_the_average(scene, tmp_path):
     settings = {"steps": 20, "eval_every": 4}
     tail = {"lr-tail": {"share": 0.5}}
     settings["rules"] = {**tail, "weight-averaging": {"share": 0.5}}
@@ -136,7 +136,9 @@ def test_a_run_that_is_averaged_goes_on_bit_for_bit_and_exports_the_average(scen
     )
 
 
-def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_path, monkeypatch):
+def test_the_configuration_of_a_run_with_a_time_budget_repeats_it_bit_for_bit(
+    scene, tmp_path, monkeypatch
+):
     # Whatever the probe of this machine says, the first plan is wrong.
     monkeypatch.setattr(app, "steps_for", lambda setup, seconds: (40, "forty steps", 0.6))
     each_step_takes(monkeypatch, 0.025)
@@ -150,7 +152,7 @@ def test_a_run_within_seconds_is_repeated_bit_for_bit_by_its_config(scene, tmp_p
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
-def test_statements_that_a_changed_length_makes_wrong_are_withdrawn(
+def test_notes_that_a_changed_length_makes_wrong_are_withdrawn(
     scene, tmp_path, monkeypatch, capsys
 ):
     # The plan is too short for density control (it would end in step 14), the run is not.
@@ -171,7 +173,7 @@ def test_statements_that_a_changed_length_makes_wrong_are_withdrawn(
     assert line.startswith("density control after all") and line in logged
 
 
-def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_path):
+def test_a_stopped_run_resumes_with_the_length_revised_at_its_step(scene, tmp_path):
     lengths = {"steps": 30, "revisions": [[10, 50], [20, 44], [34, 48]]}
     assert run(scene, tmp_path / "whole", **lengths) == 0
     assert load(latest(tmp_path / "whole")).step == 48
@@ -182,7 +184,7 @@ def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_p
     assert (tmp_path / "parts" / "config.yaml").read_bytes() == written
 
 
-def test_a_run_that_started_from_a_file_goes_on_without_it(scene, tmp_path):
+def test_a_run_that_started_from_a_file_can_be_resumed_without_the_file(scene, tmp_path):
     run(scene, tmp_path / "source", steps=3)
     cloud = tmp_path / "cloud.ply"
     cloud.write_bytes((tmp_path / "source" / "point_cloud.ply").read_bytes())
@@ -194,7 +196,7 @@ def test_a_run_that_started_from_a_file_goes_on_without_it(scene, tmp_path):
     assert same(parameters(tmp_path / "whole"), parameters(tmp_path / "parts"))
 
 
-def test_sum_kept_apart_for_a_watcher_gives_the_same_bits(scene, tmp_path, monkeypatch):
+def test_separate_gradients_kept_for_an_observer_give_the_same_bits(scene, tmp_path, monkeypatch):
     from crossgrad_core.training.setup import Setup
 
     run(scene, tmp_path / "accumulated", steps=45, **GROWTH)
@@ -224,7 +226,7 @@ def in_place(scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.001])
-def test_the_unit_of_length_does_not_matter(in_place, tmp_path, scale):
+def test_the_unit_of_length_of_a_scene_does_not_change_the_result(in_place, tmp_path, scale):
     write_tiny_scene(tmp_path / "scaled", views=9, scale=scale)
     run(tmp_path / "scaled", tmp_path / "b", steps=40)
     a, b = quality(in_place)[-1], quality(tmp_path / "b")[-1]
@@ -233,7 +235,7 @@ def test_the_unit_of_length_does_not_matter(in_place, tmp_path, scale):
 
 
 @pytest.mark.parametrize("offset", [(4e5, 5.6e6, 120.0), (1e6, 1e6, 1e6)])
-def test_far_from_the_origin_the_export_is_in_place(in_place, tmp_path, offset):
+def test_an_export_far_from_the_origin_has_the_right_position(in_place, tmp_path, offset):
     write_tiny_scene(tmp_path / "utm", views=9, offset=offset)
     run(tmp_path / "utm", tmp_path / "b", steps=40)
     near = read_ply(in_place / "point_cloud.ply").means
@@ -242,26 +244,26 @@ def test_far_from_the_origin_the_export_is_in_place(in_place, tmp_path, offset):
 
 
 @pytest.mark.parametrize("views", [1, 2, 3])
-def test_any_number_of_views_on_photos_of_different_sizes(tmp_path, views):
+def test_any_number_of_views_can_have_photos_of_different_sizes(tmp_path, views):
     write_tiny_scene(tmp_path / "mixed", views=6, mixed=True, folders=("aerial", "street"))
     assert run(tmp_path / "mixed", tmp_path / "run", views=views) == 0
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert set(summary["regimes"]) == {"aerial", "street"}
 
 
-def test_published_order_differs_and_runs(scene, tmp_path):
+def test_the_published_recipe_trains_and_gives_different_parameters(scene, tmp_path):
     assert run(scene, tmp_path / "a", recipe={"name": "published"}, steps=60, **GROWTH) == 0
     run(scene, tmp_path / "b", steps=60, **GROWTH)
     assert not same(parameters(tmp_path / "a"), parameters(tmp_path / "b"))
 
 
-def test_a_short_run_leaves_density_control_out_and_says_so(scene, tmp_path):
+def test_a_short_run_without_density_control_reports_so(scene, tmp_path):
     run(scene, tmp_path / "run", steps=4, initializer={"name": "points"})
     assert quality(tmp_path / "run")[-1]["primitives"] == "200"
     assert "no density control" in (tmp_path / "run" / "log.txt").read_text()
 
 
-def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
+def test_growth_stops_at_max_gaussians_with_a_message(scene, tmp_path):
     # Every Gaussian is above a threshold of 1e-12, so the first edit wants to double them all.
     settings = {"steps": 60, **GROWTH, "densifier": {"name": "adc", "grad_threshold": 1e-12}}
     settings["initializer"] = {"name": "points"}
@@ -327,16 +329,14 @@ def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("seconds", [0.001, 1.0])
-def test_where_training_goes_back_to_does_not_depend_on_the_clock(
-    scene, tmp_path, monkeypatch, seconds
-):
+def test_the_rewind_step_does_not_depend_on_the_clock(scene, tmp_path, monkeypatch, seconds):
     each_step_takes(monkeypatch, seconds)  # Of a second: the run thinks about its length at once.
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100) == 0
     assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
 
 
-def test_a_run_within_a_budget_that_was_rewound_is_repeated(scene, tmp_path, monkeypatch):
+def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, monkeypatch):
     each_step_takes(monkeypatch, 1.0)
     poisoned(monkeypatch, Poison([17]))
     given = {"scene": str(scene), "save_every": 1000, "eval_every": 1000}
@@ -347,7 +347,7 @@ def test_a_run_within_a_budget_that_was_rewound_is_repeated(scene, tmp_path, mon
     assert same(parameters(tmp_path / "timed"), parameters(tmp_path / "again"))
 
 
-def test_a_bad_value_right_before_the_length_is_revised_is_rewound(scene, tmp_path, monkeypatch):
+def test_a_bad_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
     assert "rewound to step 4" in (tmp_path / "run" / "log.txt").read_text()
@@ -399,7 +399,7 @@ class Louder:
         return RegularizeResult(context.parameters["opacities"].sum())
 
 
-def test_wrappers_replace_what_the_hooks_answer(scene, tmp_path, monkeypatch):
+def test_hook_wrappers_replace_the_results_of_hooks(scene, tmp_path, monkeypatch):
     watcher = Louder()
     poisoned(monkeypatch, watcher)
     run(scene, tmp_path / "run", steps=4, eval_every=4)

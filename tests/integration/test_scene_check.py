@@ -33,7 +33,7 @@ def settings(scenes, name, out):
     return {"scene": str(scenes / name), "out": str(out), "steps": 2}
 
 
-def test_a_run_is_refused_with_the_cause_and_writes_nothing(scenes, tmp_path):
+def test_a_contradictory_scene_is_refused_with_the_cause_before_writing(scenes, tmp_path):
     with pytest.raises(UserError, match="the scene contradicts itself") as error:
         app.run(settings(scenes, "wrong", tmp_path / "run"), verbosity=-1)
     assert "principal point" in error.value.found
@@ -51,7 +51,7 @@ def test_an_accepted_scene_is_trained_and_its_configuration_repeats_the_run(scen
     assert app.run(repeated, verbosity=-1) == 0
 
 
-def test_a_stopped_run_of_an_accepted_scene_goes_on(scenes, tmp_path):
+def test_a_stopped_run_of_an_accepted_scene_can_be_resumed(scenes, tmp_path):
     run = tmp_path / "run"
     asked = {**settings(scenes, "wrong", run), "stop_after": 1}
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
@@ -60,7 +60,7 @@ def test_a_stopped_run_of_an_accepted_scene_goes_on(scenes, tmp_path):
     assert summary["scene_check"]["verdict"] == "the scene disagrees"
 
 
-def test_summary_json_has_the_figures_of_a_right_scene(scenes, tmp_path):
+def test_summary_json_has_the_numbers_of_a_consistent_scene(scenes, tmp_path):
     assert app.run(settings(scenes, "right", tmp_path / "run"), verbosity=-1) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     found = summary["scene_check"]
@@ -69,20 +69,20 @@ def test_summary_json_has_the_figures_of_a_right_scene(scenes, tmp_path):
     assert not [note for note in summary["notes"] if note.startswith("check:")]
 
 
-def test_check_prints_the_photos_that_disagree_first_and_the_verdict_last(scenes):
+def test_check_prints_inconsistent_photos_first_and_the_verdict_last(scenes):
     lines = lines_of(scenes / "exchanged", [])
     assert "0003.png, 0006.png" in lines[0]
     assert lines[-1].startswith("verdict: some photos disagree; 10 of 10 photos")
     assert len(lines) <= 15
 
 
-def test_check_of_a_right_scene_prints_no_warning(scenes):
+def test_check_of_a_consistent_scene_prints_no_warning(scenes):
     lines = lines_of(scenes / "right", ["data.max_size=64"])
     assert not [line for line in lines if line.startswith("check:")]
     assert lines[-1].startswith("verdict: agrees")
 
 
-def test_check_ends_with_2_and_the_cause_where_the_scene_is_refused(scenes):
+def test_check_ends_with_code_2_and_the_cause_if_the_scene_is_refused(scenes):
     command = [sys.executable, "-m", "crossgrad_core", "check", str(scenes / "wrong")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -119,7 +119,7 @@ def test_read_only_commands_accept_a_changed_scene_with_accept_scene(root, chang
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):
+def test_a_run_resumes_with_changed_photos_only_with_accept_scene(root):
     words = spoilt(root / "scene", "a photo")
     with pytest.raises(UserError, match=rf"{words}(.|\n)*--accept-scene"):
         resume(root)
@@ -131,13 +131,13 @@ def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):
     evaluate.evaluate(root / "run")
 
 
-def test_a_run_goes_on_only_with_its_own_held_out_views(root):
+def test_a_run_with_changed_held_out_views_cannot_be_resumed(root):
     words = spoilt(root / "scene", "held out")
     with pytest.raises(UserError, match=rf"{words}(.|\n)*eval, render and export take it"):
         resume(root, accept_scene=True)
 
 
-def test_a_run_of_an_older_version_goes_on_and_knows_its_scene_from_then_on(root, caplog):
+def test_resuming_a_run_of_an_older_version_records_its_scene(root, caplog):
     (root / "run" / FILE).unlink()
     evaluate.evaluate(root / "run")
     assert caplog.text.count("the run is of an older version") == 1

@@ -7,7 +7,7 @@ from support.commands import ended
 from support.scenes import write_tiny_scene
 
 
-def test_a_run_of_a_grid_is_carried_out_once(tmp_path, capsys):
+def test_each_run_of_a_grid_is_executed_once(tmp_path, capsys):
     write_tiny_scene(tmp_path / "tiny", views=6)
     grid, out = tmp_path / "grid.yaml", tmp_path / "out"
     content = {"scenes": ["tiny"], "base": {"steps": 2}, "seeds": [3]}
@@ -24,7 +24,7 @@ def test_a_run_of_a_grid_is_carried_out_once(tmp_path, capsys):
     assert f"{summary.parent.name}  finished " in capsys.readouterr().out
 
 
-def test_a_folder_that_holds_something_else_stays_as_it_is(tmp_path, capsys):
+def test_a_folder_with_other_content_is_not_changed(tmp_path, capsys):
     write_tiny_scene(tmp_path / "tiny", views=6)
     grid, out = tmp_path / "grid.yaml", tmp_path / "out"
     grid.write_text(yaml.safe_dump({"scenes": ["tiny"], "base": {"steps": 2}}))

@@ -105,7 +105,7 @@ def replace(path, old, new):
     path.write_text(text.replace(old, new))
 
 
-def test_it_is_listed_and_shown(crossgrad):
+def test_the_example_plugins_are_listed_and_shown(crossgrad):
     assert "equal-length crossgrad-example 0.1.0" in crossgrad("plugins", "list")[1]
     code, shown, _ = crossgrad("plugins", "show", "clip")
     assert code == 0
@@ -113,7 +113,7 @@ def test_it_is_listed_and_shown(crossgrad):
     assert "max_norm (float, default 1.0, > 0.0)" in shown
 
 
-def test_it_keeps_the_contract(crossgrad):
+def test_the_example_plugins_keep_their_contracts(crossgrad):
     code, report, _ = crossgrad("plugins", "check", "crossgrad_example")
     assert code == 0
     assert "operator equal-length pass" in report
@@ -124,7 +124,7 @@ def test_it_keeps_the_contract(crossgrad):
 
 
 @pytest.mark.usefixtures("broken")
-def test_a_broken_one_fails_with_the_reasons(python):
+def test_a_broken_example_plugin_fails_the_check_with_the_reasons(python):
     code, report = checked(python, "crossgrad-example")
     assert code == 1
     assert "operator equal-length FAIL" in report
@@ -134,14 +134,14 @@ def test_a_broken_one_fails_with_the_reasons(python):
     assert "14 of 17 plugins keep the contract of their slot" in report
 
 
-def test_its_command_is_one_of_crossgrad_s(crossgrad, tmp_path):
+def test_the_command_of_the_example_package_is_a_command_of_crossgrad(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "tiny", views=6)
     assert "count-views Count the training views of a scene." in crossgrad("--help")[1]
     counted = crossgrad("count-views", scene)
     assert counted[:2] == (0, "tiny: 5 training views, read by colmap")
 
 
-def test_a_run_uses_it_by_name(crossgrad, tmp_path):
+def test_a_run_uses_the_example_plugins_by_name(crossgrad, tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=6)
     out = tmp_path / "run"
     choice = ["--sampler", "least-seen", "--operator", "equal-length", "--observe", "clip"]

@@ -41,7 +41,7 @@ print(json.dumps(sorted(kernels() - before)))
 
 
 @pytest.mark.parametrize("length", [{"steps": 160}, {"seconds": 3.0}], ids=["steps", "seconds"])
-def test_training_compiles_nothing_after_the_warm_up(tmp_path, length):
+def test_training_compiles_no_kernel_after_the_warm_up(tmp_path, length):
     settings = {
         "scene": str(bundled_scene()),
         "data": {"max_size": 48},
@@ -130,7 +130,7 @@ def _miss(*, kept=True):
         listener(kept=kept)
 
 
-def test_the_other_process_starts_with_the_first_missing_kernel(started):
+def test_the_helper_process_starts_with_the_first_missing_kernel(started):
     with start.compiling_beside(_setup()):
         assert started == []
         _miss()
@@ -141,14 +141,14 @@ def test_the_other_process_starts_with_the_first_missing_kernel(started):
     assert kernel_cache._LISTENERS == []
 
 
-def test_a_process_that_hangs_is_ended(started, monkeypatch):
+def test_a_helper_process_that_hangs_is_terminated(started, monkeypatch):
     monkeypatch.setattr(_Process, "hangs", True)
     with start.compiling_beside(_setup()):
         _miss()
     assert started[1:] == ["waited for", "terminated", "waited for"]
 
 
-def test_the_other_process_ends_with_a_run_that_is_refused(started):
+def test_the_helper_process_ends_with_a_run_that_is_refused(started):
     def refuse():
         with start.compiling_beside(_setup()):
             _miss()
@@ -166,7 +166,9 @@ def test_no_helper_process_starts_without_a_free_core_or_a_kernel_cache(started,
     assert started == []
 
 
-def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeypatch):
+def test_kernels_for_sparse_rows_are_compiled_before_the_first_step_if_a_block_uses_them(
+    monkeypatch,
+):
     # Whether a view draws few rows is found out on the clock.
     asked = []
     monkeypatch.setattr(start, "compile_rows", lambda: asked.append("rows"))
@@ -178,7 +180,7 @@ def test_kernels_of_few_rows_and_of_many_are_there_before_the_first_step(monkeyp
     assert asked == ["rows"]
 
 
-def test_a_probe_begins_again_after_a_kernel_was_compiled(monkeypatch):
+def test_a_speed_probe_restarts_after_a_kernel_was_compiled(monkeypatch):
     clock = SimpleNamespace(seconds=0.0)
     clock.trained = lambda kind: clock.seconds
     clock.copy = lambda: SimpleNamespace(trained=lambda kind, at=clock.seconds: at)
@@ -206,7 +208,7 @@ def test_a_probe_begins_again_after_a_kernel_was_compiled(monkeypatch):
     assert 2 * each == pytest.approx(0.1)
 
 
-def test_a_probe_ends_where_every_step_compiles(monkeypatch):
+def test_a_speed_probe_ends_after_a_limit_if_every_step_compiles(monkeypatch):
     clock = SimpleNamespace(trained=lambda kind: 1.0, copy=lambda: clock)
     state = SimpleNamespace(step=0, clock=clock)
     pace = SimpleNamespace(views=lambda step: step)

@@ -75,7 +75,7 @@ def test_a_run_cannot_be_resumed_without_its_plugins(run, capsys):
     assert "own-" in capsys.readouterr().err
 
 
-def test_settings_that_were_changed_are_still_refused(run, capsys):
+def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("own-losses", "other-losses"))
     assert ended("eval", run) == 2
@@ -106,7 +106,7 @@ def test_changed_render_and_length_settings_are_refused_without_the_plugins(
     assert (run / "per_view.csv").read_text() == before
 
 
-def test_a_figure_that_cannot_be_measured_now_stays(run, capsys):
+def test_a_metric_that_cannot_be_measured_keeps_its_value_in_the_file(run, capsys):
     lines = (run / "per_view.csv").read_text().splitlines()
     at = lines[0].split(",").index("lpips")
     cells = [line.split(",") for line in lines[1:]]

@@ -59,21 +59,21 @@ def default_densifier_of(backbone):
 
 
 @pytest.mark.matrix
-def test_exactly_the_written_combinations_are_refused_for_the_written_reasons():
+def test_exactly_the_listed_combinations_are_refused_for_the_listed_reasons():
     rows = every_combination()
     found = as_lines(refused(rows), rows)
     assert found == WRITTEN, "python -m support.refusals writes them anew"
 
 
 @pytest.mark.parametrize("line", WRITTEN)
-def test_a_run_is_refused_for_the_written_reason(line):
+def test_a_run_of_a_refused_combination_reports_the_listed_reason(line):
     row = next(iter(from_lines([line], every_combination())))
     with pytest.raises(IncompatibleSelectionError) as refusal:
         setup(row)
     assert line.split(": ", 1)[1] in refusal.value.found
 
 
-def test_every_two_components_that_can_work_together_meet():
+def test_the_design_contains_every_pair_of_components_that_can_work_together():
     met = {pair for row in DESIGN for pair in pairs_of(row)}
     assert met == {pair for row in ADMITTED for pair in pairs_of(row)}
     names = {(slot, name) for row in every_combination() for slot, name in enumerate(row)}
@@ -101,7 +101,7 @@ def require_same_again(row):
 
 
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
-def test_combination_trains_and_repeats(row):
+def test_a_combination_trains_and_gives_the_same_bits_when_it_is_repeated(row):
     """Each component is in at least two runs that are repeated."""
     if row in REPEATED:
         require_same_again(row)
@@ -111,12 +111,12 @@ def test_combination_trains_and_repeats(row):
 
 @pytest.mark.matrix
 @pytest.mark.parametrize("row", [row for row in DESIGN if row not in REPEATED], ids=" x ".join)
-def test_every_two_components_repeat(row):
+def test_every_pair_of_components_trains_repeatably(row):
     require_same_again(row)
 
 
 @pytest.mark.parametrize("densifier", DENSIFIERS)
-def test_density_control_acts_within_these_few_steps(densifier):
+def test_density_control_edits_primitives_within_the_few_steps_of_the_test(densifier):
     rows = [row for row in DESIGN if row[SLOTS.index("densifier")] == densifier]
     # On its own backbone where there is one: others may leave it nothing to do in five steps.
     own = [row for row in rows if default_densifier_of(row[SLOTS.index("backbone")]) == densifier]
@@ -127,5 +127,5 @@ def test_density_control_acts_within_these_few_steps(densifier):
 
 
 @pytest.mark.matrix
-def test_member_of_the_full_product_trains(member):
+def test_every_member_of_the_full_product_trains(member):
     require_sound(train(setup(member), STEPS))

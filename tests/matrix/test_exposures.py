@@ -62,7 +62,7 @@ def check(row, steps):
 
 
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
-def test_exposures_backbones_and_views_meet(row):
+def test_the_design_contains_all_pairs_of_exposures_backbones_and_views(row):
     check(row, FEW)
 
 

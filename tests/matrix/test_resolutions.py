@@ -87,7 +87,7 @@ def check(row):
 
 
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
-def test_resolutions_backbones_and_views_meet(row):
+def test_the_design_contains_all_pairs_of_resolutions_backbones_and_views(row):
     check(row)
 
 

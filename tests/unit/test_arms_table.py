@@ -21,7 +21,7 @@ def printed(monkeypatch, capsys):
     return run
 
 
-def test_means_and_spread_over_seeds(tmp_path, printed):
+def test_the_table_shows_means_and_spread_over_seeds(tmp_path, printed):
     for seed, final in ((0, 20.0), (1, 22.0)):
         made_with = {"commit": "abcdef0"}
         run = RunFolder(seed=seed, final=final, environment=made_with, cpu_seconds=50.0 + seed)
@@ -46,20 +46,20 @@ def test_each_length_of_an_arm_has_a_row(tmp_path, printed):
     assert found == {"300 steps": ("1", "20.00"), "1,200 steps": ("1", "22.00")}
 
 
-def test_other_figures_can_be_named(tmp_path, printed):
+def test_other_metrics_can_be_selected(tmp_path, printed):
     RunFolder().write(tmp_path / "run")
     (row,) = printed(tmp_path, "--figures", "ssim")
     assert "psnr" not in row and row["ssim"] == "0.7000"
 
 
-def test_a_folder_without_runs_is_one_message(tmp_path, printed, capsys):
+def test_a_folder_without_runs_gives_one_message(tmp_path, printed, capsys):
     with pytest.raises(SystemExit) as ended:
         printed(tmp_path)
     assert ended.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_differences_from_a_baseline_by_regime(tmp_path, printed):
+def test_differences_from_a_baseline_are_shown_by_regime(tmp_path, printed):
     for seed in (0, 1, 2):
         RunFolder(seed=seed, final=20.0).write(tmp_path / f"long{seed}")
         settings = {"steps": 300}
@@ -70,7 +70,7 @@ def test_differences_from_a_baseline_by_regime(tmp_path, printed):
         assert row[f"{regime}, less 600 steps"].startswith("+0.50 [+0.50, +0.50], ")
 
 
-def test_a_baseline_that_is_no_arm_is_refused(tmp_path, printed, capsys):
+def test_a_baseline_that_is_not_an_arm_is_refused(tmp_path, printed, capsys):
     RunFolder().write(tmp_path / "run")
     with pytest.raises(SystemExit) as ended:
         printed(tmp_path, "--baseline", "other")
@@ -102,7 +102,7 @@ def test_runs_of_earlier_grids_are_left_out(tmp_path, printed, capsys):
     assert (row["seeds"], row["rates"]) == ("1", "x 20")
 
 
-def test_an_arm_that_was_renamed_keeps_its_runs(tmp_path, printed):
+def test_a_renamed_arm_keeps_its_runs(tmp_path, printed):
     new = "a0,city,B,0", "a1,city,B,1", "m0,city,once B,0", "m1,city,once B,1"
     write_sweep(tmp_path, *new, "m0,city,B,0", "m1,city,B,1")
     found = {row["arm"]: (row["seeds"], row["rates"]) for row in printed(tmp_path)}

@@ -42,7 +42,7 @@ def write_run(folder, place, steps, seed, figures):
         )
 
 
-def test_near_views_come_first_and_arms_are_compared_band_by_band(tmp_path, place, printed):
+def test_near_views_are_listed_first_and_arms_are_compared_band_by_band(tmp_path, place, printed):
     for seed, more in ((0, 0.0), (1, 0.2), (2, 0.4)):
         base = {"street": 20.0 + more, "aerial": 25.0 + more}
         write_run(tmp_path / f"runs/a{seed}", place, 300, seed, base)
@@ -71,7 +71,7 @@ def test_near_views_come_first_and_arms_are_compared_band_by_band(tmp_path, plac
     assert row[3].strip().startswith("+1.00 [") and "different (3)" in row[3]
 
 
-def test_a_scene_or_an_arm_that_is_not_there_is_named(tmp_path, place, printed, capsys):
+def test_an_unknown_scene_or_arm_is_reported(tmp_path, place, printed, capsys):
     write_run(tmp_path / "runs/a", place, 300, 0, {"street": 20.0, "aerial": 25.0})
     for options, said in (
         (("--of", "city", "--baseline", "other"), "no arm other"),
@@ -114,7 +114,9 @@ def psnr_of(printed, *options):
     return [cell.strip() for cell in row[2:]]
 
 
-def test_figures_of_another_scene_of_that_name_are_not_taken(tmp_path, place, printed, evaluated):
+def test_tables_of_another_scene_with_the_same_name_are_not_used(
+    tmp_path, place, printed, evaluated
+):
     write_evaluable(tmp_path / "runs" / "a")
     options = tmp_path / "runs", "--of", "city", "--on"
     assert psnr_of(printed, *options, place) == ["20.00"] * 2
@@ -128,9 +130,7 @@ def test_figures_of_another_scene_of_that_name_are_not_taken(tmp_path, place, pr
 
 
 @pytest.mark.parametrize("files", [(), ("--files",)], ids=["model", "ply"])
-def test_figures_of_another_state_of_a_run_are_not_taken(
-    tmp_path, place, printed, evaluated, files
-):
+def test_tables_of_another_state_of_a_run_are_not_used(tmp_path, place, printed, evaluated, files):
     run = write_evaluable(tmp_path / "runs" / "a")
     options = tmp_path / "runs", "--of", "city", "--on", place, *files
     assert psnr_of(printed, *options) == ["20.00"] * 2
@@ -149,7 +149,7 @@ def test_figures_of_another_state_of_a_run_are_not_taken(
     assert psnr_of(printed, *options) == ["30.00"] * 2 and len(evaluated.on) == 3
 
 
-def test_a_kept_table_that_is_of_other_views_is_refused(tmp_path, place, printed, capsys):
+def test_a_stored_table_of_other_views_is_refused(tmp_path, place, printed, capsys):
     write_run(tmp_path / "runs/a", place, 300, 0, {"street": 20.0, "aerial": 25.0})
     assert psnr_of(printed, tmp_path / "runs", "--of", "city", "--on", place)
     other = write_tiny_scene(tmp_path / "other" / place.name, views=4, folders=("elsewhere",))
@@ -159,7 +159,7 @@ def test_a_kept_table_that_is_of_other_views_is_refused(tmp_path, place, printed
     assert "figures of a run are of other views" in capsys.readouterr().err
 
 
-def test_a_figure_that_no_run_has_is_one_message_before_anything_is_evaluated(
+def test_an_unknown_metric_gives_one_message_before_anything_is_evaluated(
     tmp_path, place, printed, evaluated, capsys
 ):
     write_evaluable(tmp_path / "runs" / "a")

@@ -29,7 +29,7 @@ def script(monkeypatch):
     return SimpleNamespace(**runpy.run_path(str(SCRIPT), run_name="gpu"))
 
 
-def test_without_a_gpu_it_says_so_and_ends_with_2(script, monkeypatch, capsys):
+def test_the_benchmark_without_a_gpu_ends_with_code_2(script, monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(sys, "argv", ["gpu.py", "scene"])
     with pytest.raises(SystemExit) as ended:
@@ -38,7 +38,7 @@ def test_without_a_gpu_it_says_so_and_ends_with_2(script, monkeypatch, capsys):
     assert "sees no GPU" in capsys.readouterr().err
 
 
-def test_every_case_is_one_that_crossgrad_takes(script, tmp_path):
+def test_every_benchmark_case_is_accepted_by_crossgrad(script, tmp_path):
     """All options are known; a machine without a GPU is the only thing to object to."""
     cases = list(script.cases(10, 60))
     assert len(cases) == len({case.name for case in cases})
@@ -52,7 +52,7 @@ def test_every_case_is_one_that_crossgrad_takes(script, tmp_path):
 
 
 @pytest.mark.parametrize("gaussians", [0, 500])
-def test_short_cases_are_steps_in_this_process(script, tmp_path, monkeypatch, gaussians):
+def test_short_cases_run_in_the_process_of_the_benchmark(script, tmp_path, monkeypatch, gaussians):
     """Measured here on the CPU, with what a GPU would be asked left out."""
     cloud = import_module("scale").Run
     begun, config, on_cpu = cloud.__init__, script.Case.config, {"device": "cpu"}
@@ -82,7 +82,7 @@ def test_short_cases_are_steps_in_this_process(script, tmp_path, monkeypatch, ga
     assert script.Short(SCENE, tmp_path / "short.jsonl", "there").known(good) is None
 
 
-def test_what_fails_is_noted_and_tried_again(script, tmp_path, monkeypatch):
+def test_a_failed_case_is_recorded_and_tried_again(script, tmp_path, monkeypatch):
     def fails(_short, _case):
         raise RuntimeError("out of\nmemory")
 
@@ -98,7 +98,7 @@ def test_what_fails_is_noted_and_tried_again(script, tmp_path, monkeypatch):
         short.row(case)
 
 
-def test_a_text_that_no_case_has_ends_with_2(script, monkeypatch, capsys):
+def test_a_filter_that_matches_no_case_ends_with_code_2(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["gpu.py", "scene", "--only", "sizes", "tall"])
     with pytest.raises(SystemExit) as ended:
         script.main()
@@ -106,7 +106,7 @@ def test_a_text_that_no_case_has_ends_with_2(script, monkeypatch, capsys):
     assert "no case has 'tall' in its name: sizes-gsplat" in capsys.readouterr().err
 
 
-def test_what_was_measured_before_stays_in_the_table(script, tmp_path, monkeypatch):
+def test_earlier_measurements_are_kept_in_the_table(script, tmp_path, monkeypatch):
     case = next(iter(script.cases(10, 60)))
     monkeypatch.setattr(script.Short, "_measured", lambda *_: {"ms_per_step": 1.5})
     short = script.Short(tmp_path, tmp_path / "short.jsonl", "here")
@@ -116,7 +116,7 @@ def test_what_was_measured_before_stays_in_the_table(script, tmp_path, monkeypat
     assert len(script.case_rows(case, again, tmp_path, new=False)[0]) == 1
 
 
-def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monkeypatch):
+def test_long_runs_are_trained_once_and_refusals_are_recorded(script, tmp_path, monkeypatch):
     asked, run = [], subprocess.run
 
     def crossgrad(command, **options):
@@ -160,7 +160,7 @@ def test_long_runs_are_trained_once_and_refusals_are_kept(script, tmp_path, monk
     assert [command[command.index("--views") + 1] for command in asked] == ["1"]
 
 
-def test_the_trainer_of_gsplat_is_read_from_its_files(script, tmp_path):
+def test_results_of_the_gsplat_trainer_are_read_from_its_files(script, tmp_path):
     """At every stop that it reached; it is not started again where it reached the last one."""
     stats = tmp_path / "runs" / "gsplat-trainer-8000" / "stats"
     stats.mkdir(parents=True)
@@ -175,7 +175,7 @@ def test_the_trainer_of_gsplat_is_read_from_its_files(script, tmp_path):
     assert (late["psnr"], late["primitives"], late["peak_mib"]) == (21.25, 123, 1536.0)
 
 
-def test_what_the_trainer_of_gsplat_did_not_reach_has_no_figures(script, tmp_path, monkeypatch):
+def test_steps_that_the_gsplat_trainer_did_not_reach_have_no_results(script, tmp_path, monkeypatch):
     ended = SimpleNamespace(returncode=1, stderr="no\nmemory")
     asked = []
     monkeypatch.setattr(subprocess, "run", lambda command, **_: asked.append(command) or ended)

@@ -27,7 +27,7 @@ def town(tmp_path_factory):
     return folder, pycolmap.Reconstruction(str(folder / "sparse" / "0"))
 
 
-def test_points_lie_where_their_photos_show_them(town):
+def test_points_are_at_the_positions_that_photos_show(town):
     folder, model = town
     assert len(model.images) == 18
     assert min(point.track.length() for point in model.points3D.values()) >= 2
@@ -49,7 +49,7 @@ def test_points_lie_where_their_photos_show_them(town):
     assert np.mean(apart) < 0.7 * np.mean(by_lot)
 
 
-def test_the_drone_looks_down_from_above_and_people_along_the_street(town):
+def test_drone_photos_look_down_from_above_and_street_photos_along_the_street(town):
     _, model = town
     for image in model.images.values():
         low, high = (60, 115) if image.name.startswith("aerial/") else (1.6, 2.2)

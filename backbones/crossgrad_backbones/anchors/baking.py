@@ -77,7 +77,7 @@ def evenly(cameras: Sequence[Camera], most: int) -> list[Camera]:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The appearance of A anchors with k slots each in one camera.
+    """The appearance of A anchors with k slots each, as seen by one camera.
 
     Attributes:
         opacities: [A, k], 0 if nothing is drawn.
@@ -146,7 +146,7 @@ def baked(
 
     Args:
         heads: The networks.
-        parameters: As for `decoded`.
+        parameters: The parameters, as for `decoded`.
         views: Cameras and the anchors that each camera sees.
         code: [C] appearance code, or None.
 

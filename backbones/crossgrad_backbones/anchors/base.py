@@ -42,9 +42,9 @@ _HALF_PIXEL = 0.5
 def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     """Return a mask [P] of the anchors whose own Gaussian would reach the image.
 
-    The anchor counts as an opaque, unrotated Gaussian with the scales that stretch its offsets. It
-    is projected with the rasterizers' formulas. It passes if the bounding box of its footprint
-    (alpha >= 1/255) contains a pixel centre.
+    An anchor is treated as an opaque, unrotated Gaussian whose scales are the scales of the
+    anchor's offsets. The Gaussian is projected with the rasterizers' formulas. The anchor passes if
+    the bounding box of this Gaussian's footprint (alpha >= 1/255) contains a pixel centre.
 
     Args:
         positions: [P, 3] local units.
@@ -60,7 +60,7 @@ def in_frustum(positions: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
 
 
 def _axes(camera: Camera) -> list[tuple[float, ...]]:
-    """Return for x and y: focal length, centre, clamp of the slope, first and last position."""
+    """Return for x and y: focal length, centre, limits of the slope, first and last position."""
     sizes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     axes: list[tuple[float, ...]] = []
     for focal, center, size in sizes:
@@ -121,7 +121,7 @@ class Used:
 
     Attributes:
         mask: [P] bool.
-        factor: [P] in [0, 1], factor of their opacities; None for 1.
+        factor: [P] in [0, 1], factor of the anchors' opacities; None for 1.
     """
 
     mask: Tensor
@@ -136,8 +136,8 @@ class AnchorBackbone(AnchorOptions):
     Blocks: anchors [P, 3] (frozen); offsets [P, k, 3] in units of exp(scales[:, :3]); features
     [P, F]; scales [P, 6] (log: stretch of the offsets, then size of the Gaussians); mlp_opacity,
     mlp_cov, mlp_color and, if enabled, mlp_bank (four tensors each); voxel_size (frozen). The
-    rotation and opacity of an anchor, which the published code stores but never trains, are left
-    out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
+    published code also stores a rotation and an opacity of each anchor but never trains them; both
+    are left out. Source: Scaffold-GS (Lu et al. 2024); methods of section 2.
     """
 
     positions: ClassVar[str] = "anchors"
@@ -198,7 +198,7 @@ class AnchorBackbone(AnchorOptions):
 
     @abstractmethod
     def used(self, parameters: Mapping[str, Tensor], camera: Camera, phase: Phase) -> Used | None:
-        """Return the anchors that a camera uses, inside its frustum or not; None for all anchors.
+        """Return the anchors that a camera uses, regardless of its frustum; None for all anchors.
 
         Args:
             parameters: The parameters.

@@ -64,7 +64,7 @@ class _Back:
         return cls(heads, torch.zeros_like(inputs.features), first, second, *buffers)
 
     def sweep(self, inputs: Inputs, kept: Kept, fill: Callable[..., None]) -> None:
-        """Process all anchors in stretches; `fill(first, n)` writes `raw`."""
+        """Process all anchors in stretches; `fill(first, n)` writes `raw` for n anchors."""
         width, feature = self.second[0].shape[1], inputs.features.shape[1]
         begin = self.heads[0] * width
         mine = slice(begin, begin + self.hidden.shape[1])
@@ -106,7 +106,7 @@ class _Back:
 
 
 def backward(inputs: Inputs, kept: Kept, given: Gradients) -> Gradients:
-    """Compute the gradients of the inputs.
+    """Compute the gradients of the inputs of the forward pass.
 
     Args:
         inputs: Inputs of the forward pass.
@@ -175,7 +175,7 @@ class _Decode(torch.autograd.Function):
 
 
 def gaussians_of(view: View, *tensors: Tensor) -> Gaussians:
-    """Return the Gaussians of positive opacity, differentiable in all tensors.
+    """Return the Gaussians with positive opacity, differentiable in all tensors.
 
     Args:
         view: The constant part.

@@ -26,12 +26,12 @@ Layer = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Constants in the decoding of a view; A of P anchors are seen.
+    """Constants of the decoding for one view that sees A of P anchors.
 
     Attributes:
         positions: [P, 3].
         rows: [A] int64, the anchors that are seen, without duplicates.
-        factor: [A] factor of their opacities; None for 1.
+        factor: [A] factor of the anchors' opacities; None for 1.
         views: [A, V] direction (and distance) from the camera.
         feature_rows: [A] int64, the row of each anchor's feature, without duplicates.
     """
@@ -74,7 +74,7 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Values saved for the backward pass in addition to the inputs; G Gaussians are drawn.
+    """Values that the backward pass needs in addition to the inputs; G Gaussians are drawn.
 
     Attributes:
         joined: [A or more, F + V] inputs of the networks, padded with rows of 0.

@@ -35,8 +35,8 @@ class Network:
     """A perceptron with one hidden layer and ReLU: Linear, ReLU, Linear.
 
     Attributes:
-        name: Name of its block; its tensors are `name.0.weight` [hidden, inputs], `name.0.bias`,
-            `name.2.weight` [outputs, hidden] and `name.2.bias`.
+        name: Name of the network's block; its tensors are `name.0.weight` [hidden, inputs],
+            `name.0.bias`, `name.2.weight` [outputs, hidden] and `name.2.bias`.
         inputs: Width of the input.
         hidden: Width of the hidden layer.
         outputs: Width of the output.
@@ -49,11 +49,11 @@ class Network:
 
     @property
     def tensors(self) -> tuple[str, ...]:
-        """Names of its tensors."""
+        """The names of the network's tensors."""
         return tuple(f"{self.name}.{n}.{kind}" for n in LAYERS for kind in ("weight", "bias"))
 
     def block(self, kind: BlockKind, lr: LearningRate) -> Block:
-        """Return the block of all its tensors."""
+        """Return a block that contains all tensors of the network."""
         return Block(self.name, self.tensors, per_primitive=False, kind=kind, lr=lr)
 
     def created(self, rng: np.random.Generator) -> Parameters:
@@ -90,7 +90,7 @@ class Raw:
 
 @dataclass(frozen=True)
 class Heads:
-    """The networks that map an anchor's feature and viewing direction to its Gaussians.
+    """The networks that compute an anchor's Gaussians from its feature and the viewing direction.
 
     Attributes:
         offsets: k, Gaussians of an anchor.
@@ -147,7 +147,8 @@ class Heads:
 
         Args:
             parameters: The parameters.
-            code: [C] appearance code, or None. It is equal for all anchors and enters the bias.
+            code: [C] appearance code, or None. The code is equal for all anchors and is added to
+                the bias.
         """
         weights, biases = [], []
         for network, far in zip(self.networks[:3], self.far, strict=True):
@@ -194,10 +195,10 @@ class Heads:
 
 @dataclass(frozen=True)
 class Seen:
-    """The anchors that a view decodes.
+    """The anchors that are decoded for one view.
 
     Attributes:
-        rows: [A] int64, their rows, without duplicates.
+        rows: [A] int64 rows of the anchors, without duplicates.
         factor: [A] in [0, 1], factor of the opacities of each anchor; None for 1.
     """
 

@@ -56,7 +56,7 @@ class AnchorOptions(Backbone):
     lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         bank = "there is no feature bank (feature_bank = false); leave it out"
         codes = "photos have no codes (appearance = 0); leave it out"
         return {
@@ -115,10 +115,10 @@ def created_codes(scene: Scene, codes: Tensor) -> Parameters:
 
 
 def code_of(codes: Tensor, poses: Tensor, camera: Camera, *, training: bool) -> Tensor:
-    """Return the code [C] of a training view during training, or else the mean code.
+    """Return the code [C] of a training view during training, else the mean code.
 
     Scaffold-GS evaluates a held-out view with the code of the training view of the same index.
-    These two views are unrelated, so this code does not follow it.
+    The two views have nothing in common, so this implementation uses the mean code instead.
 
     Args:
         codes: [V, C].

@@ -19,7 +19,7 @@ FARTHEST = 2**40
 def automatic_voxel_size(points: NDArray[np.float64]) -> float:
     """Return twice the median distance of the points to their nearest neighbour, local units.
 
-    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. That
+    Scaffold-GS uses the median of the mean *squared* distance to three neighbours as a length. This
     value depends on the unit of the input, so it is not reproduced here.
 
     Args:
@@ -47,7 +47,7 @@ def voxel_centers(points: NDArray[np.float64], size: float) -> NDArray[np.float6
 
 
 def cells_of(positions: Tensor, size: float) -> Tensor:
-    """Return the cell [N, 3] int64 of each position [N, 3]; half-way positions go to the even cell.
+    """Return the cell [N, 3] int64 of each position [N, 3]; halfway positions go to the even cell.
 
     Positions beyond `FARTHEST` cells and non-finite positions are moved to cell `FARTHEST`.
     """
@@ -74,7 +74,7 @@ def numbered(cells: Tensor) -> Tensor:
 
 
 def free_cells(wanted: Tensor, taken: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distinct wanted cells that are free, and the index of each request in them.
+    """Return the distinct free cells among the wanted cells, and the index of each wanted cell.
 
     Args:
         wanted: [N, 3] int64.

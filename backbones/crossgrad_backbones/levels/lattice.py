@@ -44,7 +44,8 @@ class Lattice:
         root_cell: [] edge of a cell of level 0, local units.
         fork: [] number of cells of the next level along an edge.
         levels: [] number of levels.
-        distance: [] standard distance D, local units: L* = log_fork(D / distance) is 0 there.
+        distance: [] standard distance D, local units: L* = log_fork(D / distance) is 0 at this
+            distance.
         lead: [] number of levels beyond L* that a camera sees: 0 if L* is rounded down, 1/2 if it
             is rounded to the nearest level, 1 if it is rounded up.
         visible_share: [] anchors that at most this share of the cameras sees are pruned.
@@ -69,7 +70,7 @@ class Lattice:
         return torch.cat([self.origin, torch.stack([*scalars, self.visible_share])]).double()
 
     def with_prune_threshold(self, visible_share: float) -> "Lattice":
-        """Return the same lattices with another pruning threshold."""
+        """Return the same lattices with another threshold for pruning."""
         return replace(self, visible_share=torch.full_like(self.visible_share, visible_share))
 
     @property
@@ -126,8 +127,9 @@ class Lattice:
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
         """Return opacity factors [A] in [0, 1] that fade in the boundary level (Octree-GS).
 
-        The finest visible level has the fraction of L* + 1 as its factor, so that no anchor appears
-        or vanishes abruptly if the camera moves. Coarser levels and level 0 have the factor 1.
+        The finest visible level has the fractional part of L* + 1 as its factor, so that no anchor
+        appears or vanishes abruptly when the camera moves. Coarser levels and level 0 have the
+        factor 1.
         """
         factor = (self.detail(distances, extra) + 1.0 - levels.to(distances)).clamp(0.0, 1.0)
         return torch.where(levels == 0, torch.ones_like(factor), factor)
@@ -182,7 +184,7 @@ def number_of_levels(largest: float, smallest: float, fork: int) -> int:
 
 
 def bounding_range(points: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the corner's coordinate, the same for all axes, and the cube's edge (Octree-GS).
+    """Return the lowest coordinate, equal for all axes, and the edge of the cube (Octree-GS).
 
     The bounds are 1.1 times the smallest and the largest coordinate of all points and axes. If all
     coordinates are equal, the edge is 0.

@@ -40,7 +40,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Requests:
-    """The cells that N offsets request.
+    """The cells that N offsets request for new anchors.
 
     Attributes:
         sites: [N, 4] int64, level and position in its lattice.
@@ -126,7 +126,7 @@ def grown(
 def seen_from_farther(
     parameters: Mapping[str, Tensor], request: GrowthRequest, thresholds: Thresholds
 ) -> Tensor:
-    """Return a mask [P] of anchors whose eligible offsets have a mean gradient above a threshold.
+    """Return a mask [P] of anchors whose eligible offsets have a mean gradient above the threshold.
 
     Args:
         parameters: Parameters of an octree backbone, detached.
@@ -145,21 +145,24 @@ _LENGTH, _FROM, _UNTIL, _EVERY = 40_000, 1500, 25_000, 100
 
 
 class OctreeControl(AnchorDensifier):
-    """A densifier that adds anchors of the own level or, at larger gradients, of the next level.
+    """A densifier that adds anchors on the requesting level or, at larger gradients, on the next.
 
     Pruning follows Scaffold-GS; no candidate is dropped at random. Anchors whose offsets have large
     mean gradients are afterwards seen from slightly farther away. Differences from the published
     code:
 
-    - An offset of the last level grows there at any gradient above the level's threshold. The code
-      grows nothing if the gradient exceeds the threshold of the level after the last.
+    - An offset of the last level adds anchors on that level at any gradient above the level's
+      threshold. The published code adds nothing if the gradient exceeds the threshold of the level
+      after the last.
     - Each anchor is tested once per edit for its extra level, against the threshold of its own
-      level. The code tests all anchors against the threshold of every level in turn and adds up.
-    - The next level receives anchors even if it is still empty; in the code it stays empty.
+      level. The published code tests all anchors against the threshold of every level in turn and
+      adds all results.
+    - The next level receives anchors even if it is still empty; in the published code an empty
+      level stays empty.
     - If both levels request a cell in one edit, the cell uses the features of its own level.
 
-    As in the code, next levels and extra levels grow from the first edit on. The apparent intention
-    of the code is to wait until the coarse phase ends.
+    As in the published code, the next level and the extra levels grow from the first edit on. The
+    authors apparently intended to wait until the coarse phase ends.
     """
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {
@@ -206,6 +209,6 @@ class OctreeControl(AnchorDensifier):
         return {**super().changed(parameters, request), "extra_levels": extra}
 
     def _thresholds(self, parameters: Parameters, share: float = 1.0) -> Thresholds:
-        """Return the thresholds of all levels, times `share`."""
+        """Return the thresholds of all levels, multiplied by `share`."""
         fork = float(Lattice.of(parameters["lattice"]).fork)
         return Thresholds(share * self.grad_threshold, fork**self.update_ratio)

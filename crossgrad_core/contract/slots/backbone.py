@@ -25,23 +25,24 @@ class Backbone(Component):
         default_densifier: Name of the densifier that is used unless the user names another. In
             short runs of many photos, another densifier replaces the densifier of the published
             Gaussians.
-        response: How its Gaussians fill a pixel.
-        plain: Whether it decodes to the same plain Gaussians for every camera, so that a standard
-            PLY loses nothing.
-        sets_dilation: Whether its Gaussians set their own dilation, whatever the rasterizer's
-            dilation is.
+        response: How the Gaussians of the backbone fill a pixel.
+        plain: True if the backbone decodes to the same plain Gaussians for every camera, so that a
+            standard PLY loses nothing.
+        sets_dilation: True if the backbone's Gaussians set their own dilation, regardless of the
+            rasterizer's dilation.
         passthrough: Field of the Gaussians -> tensor that `decode` returns unchanged as this field
-            (or not at all) and does not read. Only the rows that are drawn need to be up to date.
+            (or omits) and does not read. Then only the rendered rows need to be up to date.
             Subclasses do not inherit this value.
         positions: Name of the tensor [N, 3] of the primitives' positions in the local frame. Before
             the first step and after steps with edits, the primitives are sorted in memory by
-            position: all rows of all per-primitive tensors together, without a call of `prepare`.
-            At the end of a run, rows may be removed in the same way, after calls of `decode` with
-            some rows only (floaters). If it is empty, only edits move or remove rows.
-        axes: Names of two tensors, if each primitive is one Gaussian about its position: [N, 3]
+            position: all rows of all per-primitive tensors are sorted together, and `prepare` is
+            not called. At the end of a run, rows may be removed in the same way, after calls of
+            `decode` with some rows only (floaters). If the list is empty, rows are moved or removed
+            only by edits.
+        axes: Names of two tensors, if each primitive is one Gaussian at its position: [N, 3]
             logarithms of standard deviations and [N, 4] rotations (wxyz, of any length). Positions
-            may then step along these axes, and the deviations may be bounded. Empty if primitives
-            are not Gaussians. Subclasses do not inherit this value.
+            may then be updated along these axes, and the deviations may be bounded. Empty if
+            primitives are not Gaussians. Subclasses do not inherit this value.
     """
 
     slot: ClassVar[str] = "backbones"
@@ -81,9 +82,10 @@ class Backbone(Component):
 
     @property
     def gaussian_tensors(self) -> tuple[str, str, str] | None:
-        """Names of the tensors of positions, scales and rotations, if steps update them as a whole.
+        """Names of the tensors of positions, scales and rotations, if steps update all their rows.
 
-        None if primitives are not Gaussians with axes, or if rows may be updated later.
+        None if primitives are not Gaussians with axes, or if the update of some rows may be
+        deferred.
         """
         names = self.positions, *self.axes
         late = not set(self.passthrough.values()).isdisjoint(names)
@@ -91,7 +93,7 @@ class Backbone(Component):
 
     @property
     def learns_scales(self) -> bool:
-        """Whether Gaussians with axes learn their scales, so that the scales can be bounded."""
+        """True if Gaussians with axes learn their scales, so that the scales can be bounded."""
         names = self.gaussian_tensors
         learning = (block for block in self.trained_blocks() if block.lr.initial > 0.0)
         return names is not None and any(names[1] in block.tensors for block in learning)
@@ -121,7 +123,7 @@ class Backbone(Component):
         """Return the parameters with derived tensors updated.
 
         This is called before the first step and after every topology edit. A backbone that stores
-        derived tensors without gradient (filters, levels) computes them again here.
+        derived tensors without gradient (filters, levels) computes them again in this method.
         """
         return parameters
 

@@ -1,4 +1,4 @@
-"""The densifier slot: screen statistics -> clone, split, grow, relocate, prune."""
+"""The densifier slot: screen statistics are used to clone, split, grow, relocate and prune."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -15,15 +15,16 @@ class Densifier(Component):
     """A method that collects per-view statistics in every step and edits the set of primitives.
 
     Attributes:
-        needs: Screen statistics that it needs in addition to the radii and the mean gradient
-            (`pixels`, `abs_gradient`, `directions`, `count`), while `schedule.collects(step)`.
+        needs: Screen statistics that the densifier needs in addition to the radii and the mean
+            gradient (`pixels`, `abs_gradient`, `directions`, `count`), while
+            `schedule.collects(step)`.
         tensors: Names of the parameter tensors that the backbone must provide.
-        edits: Whether it ever edits the set of primitives.
-        resets: Whether it resets opacities when the schedule requires it.
-        reset_options: Its options that have an effect only in runs with resets. A subclass that
-            reads an inherited option in other runs, too, must change this set.
-        observes: Whether it collects statistics of the views that the steps render.
-        budgeted: Whether growth follows the budget of Gaussians for the length of the run if the
+        edits: True if the densifier ever edits the set of primitives.
+        resets: True if the densifier resets opacities when the schedule requires it.
+        reset_options: Options that have an effect only in runs with resets. A subclass that also
+            reads one of these inherited options in other runs must change this set.
+        observes: True if the densifier collects statistics of the views that the steps render.
+        budgeted: True if growth follows the budget of Gaussians for the length of the run when the
             user sets no bound.
     """
 
@@ -55,12 +56,13 @@ class Densifier(Component):
         An edit must keep at least a tenth of the primitives of a model that trains well, because a
         model does not recover from the loss of nearly all primitives.
 
-        The core gathers `state.per_primitive` of *the returned state* along with the edit.
+        The core gathers the rows of `state.per_primitive` of *the returned state* together with the
+        edit.
         """
 
     @hookimpl
     def crossgrad_densify(self, context: DensifyContext) -> DensifyResult:
-        """Implement the hook with this densifier's edit."""
+        """Implement the hook with the edit of this densifier."""
         answer = self.densify(context, context.state(STATE))
         edit, state = with_state(answer, Edit, self, "densify")
         return DensifyResult(edit, states={STATE: state})

@@ -1,4 +1,4 @@
-"""The exporter slot: the trained Gaussians -> a file that other programs open."""
+"""The exporter slot: a component writes the trained Gaussians to a file for other programs."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class Exporter(Component):
     """A writer of Gaussians to files of one format.
 
     Attributes:
-        suffix: Suffix of its files, without the dot.
+        suffix: Suffix of the exporter's files, without the dot.
     """
 
     slot: ClassVar[str] = "exporters"
@@ -43,7 +43,7 @@ class Exporter(Component):
     def write(
         self, gaussians: Gaussians, similarity: Similarity, path: Path, comments: Sequence[str]
     ) -> tuple[str, ...]:
-        """Write the file; it appears complete or not at all.
+        """Write the file; either the complete file appears or no file.
 
         Args:
             gaussians: View-independent Gaussians in the local frame, without a graph.
@@ -55,11 +55,11 @@ class Exporter(Component):
             Messages for the user about the file, one sentence each; usually none.
 
         Raises:
-            UserError: The disk is full or the folder may not be written to.
+            UserError: The disk is full, or the folder is not writable.
         """
 
     def rounding(self, gaussians: Gaussians, similarity: Similarity) -> Rounding:
-        """Return offset and rounding of positions in the file that `write` creates for these."""
+        """Return offset and rounding error of positions in the file that `write` creates."""
         return Rounding(np.zeros(3))
 
     def stored(self, gaussians: Gaussians) -> Gaussians:
@@ -67,7 +67,7 @@ class Exporter(Component):
         return gaussians
 
     def read(self, path: Path, similarity: Similarity) -> Gaussians:
-        """Return the Gaussians in a file of this format, to start from; by default an error.
+        """Return the Gaussians in a file of this format as a starting point; by default an error.
 
         Args:
             path: The file.

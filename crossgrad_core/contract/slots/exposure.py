@@ -18,8 +18,9 @@ class PerPhoto:
 
     Attributes:
         start: [P, ...] float32, the initial values in the order of `scene.train_views`; or a
-            function that computes them, if this takes long. A resumed run does not call it.
-        lr: Its learning rate.
+            function that computes them, if this takes long. A resumed run does not call this
+            function.
+        lr: Learning rate of the parameter.
     """
 
     start: Tensor | Callable[[], Tensor]
@@ -32,12 +33,12 @@ class PerPhoto:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The exposure that suits a scene, with the reasons.
+    """The exposure that was chosen for a scene, with the reasons.
 
     Attributes:
         exposure: The exposure that the run uses.
         name: Name under which this exposure is installed; None if the choice did not change.
-        notes: The decision and its evidence.
+        notes: The decision on the exposure, and the evidence for it.
     """
 
     exposure: "Exposure"
@@ -48,23 +49,23 @@ class Fitted:
 class Exposure(Component):
     """A model that turns a render into the image that the camera of one photo would have taken.
 
-    Its parameters belong to photos, not to the scene, so operators do not receive their gradients.
-    After each step, each photo of the step takes an Adam step of its own with its own step count,
-    for any number of views and every backbone. Then all values are projected. Checkpoints contain
-    the values.
+    The parameters of an exposure belong to photos, not to the scene, so operators do not receive
+    their gradients. After each step, each photo of the step takes a separate Adam step with its own
+    step count, for any number of views and every backbone. Then all values are projected.
+    Checkpoints contain the values.
     """
 
     slot: ClassVar[str] = "exposures"
 
     def fitted_to(self, scene: Scene) -> Fitted:
-        """Return the exposure that suits the scene; by default this exposure.
+        """Return the exposure that was chosen for the scene; by default this exposure.
 
-        The result is written to config.yaml, and a resumed run uses the written one.
+        The result is written to config.yaml, and a resumed run uses the stored exposure.
         """
         return Fitted(self)
 
     def messages(self, scene: Scene, known: Mapping[str, Tensor]) -> tuple[str, ...]:
-        """Return messages about this exposure and the scene; called for new runs only.
+        """Return messages about this exposure and the scene; this is called for new runs only.
 
         `known` contains the initial values [P, ...] by name if the user gives a file; else it is
         empty.

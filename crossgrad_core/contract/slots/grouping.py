@@ -1,4 +1,4 @@
-"""The grouping slot: labels of views, for sampling."""
+"""The grouping slot: a component labels the views for sampling."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from crossgrad_core.contract.scene import Scene, View
 
 @dataclass(frozen=True, eq=False)
 class GroupingRule:
-    """A grouping as fitted to the training cameras of a scene.
+    """A grouping after its fit to the training cameras of a scene.
 
     Attributes:
         labels: One label per view, for any views of the scene, in their order.
@@ -35,9 +35,9 @@ class Quantity:
     """The single number per view by which a grouping splits the views.
 
     Attributes:
-        name: Its description, such as "the log distance from the mean camera".
-        values: [V] float64 in the order of the given views; not finite if it is undefined for a
-            view.
+        name: Description of the quantity, such as "the log distance from the mean camera".
+        values: [V] float64 in the order of the given views; a value is not finite if the quantity
+            is undefined for a view.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Grouping(Component):
     Attributes:
         labels: Every label that the rule can give, near first; empty if the user's input defines
             the labels.
-        needs_probe: Whether the rule reads gradients and cannot label views without a probe.
+        needs_probe: True if the rule reads gradients and cannot label views without a probe.
     """
 
     slot: ClassVar[str] = "groupings"
@@ -82,7 +82,8 @@ class Grouping(Component):
             probe: Gradients of the training views, for rules that need them.
 
         Raises:
-            UserError: The rule leaves a group without training views; the message says what to do.
+            UserError: The rule leaves a group without training views; the message suggests a
+                remedy.
         """
 
     def quantity(self, scene: Scene, views: Sequence[View]) -> Quantity | None:
@@ -92,8 +93,7 @@ class Grouping(Component):
             scene: The scene.
             views: The views to be measured.
 
-        Returns:
-            None (the default) for rules that look at more than one number per view.
+        Returns: None (the default) for rules that use more than one number per view.
         """
         return None
 
@@ -108,9 +108,9 @@ class Regrouping(Grouping):
 
     @abstractmethod
     def refit(self, model: Model, rng: np.random.Generator) -> GroupingRule:
-        """Return the rule for the rest of the run.
+        """Return the grouping rule for the remaining steps of the run.
 
         Args:
-            model: The model after step `refit_after`; nothing in it may be changed.
+            model: The model after step `refit_after`, which must not be changed.
             rng: The only source of random numbers.
         """

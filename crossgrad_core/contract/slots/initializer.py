@@ -1,4 +1,4 @@
-"""The initializer slot: the points from which the first primitives are made."""
+"""The initializer slot: a component provides the points for the first primitives."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -13,15 +13,16 @@ from crossgrad_core.contract.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class MorePoints:
-    """Points in addition to the points of the scene.
+    """Points that are added to the points of the scene.
 
     Attributes:
         positions: [N, 3] float64, local frame.
         colors: [N, 3] uint8 RGB.
         sizes: [N] float64, local units: standard deviation of the Gaussian of a point, if the
-            backbone makes Gaussians from points. NaN computes it from the distance to the
-            neighbours, as for the points of the scene.
-        opacities: [N] float64 in (0, 1): opacity of this Gaussian. NaN uses the backbone's value.
+            backbone makes Gaussians from points. NaN selects the distance to the neighbours, as for
+            the points of the scene.
+        opacities: [N] float64 in (0, 1): opacity of the Gaussian of each point. NaN selects the
+            value of the backbone.
     """
 
     positions: NDArray[np.float64]
@@ -31,13 +32,13 @@ class MorePoints:
 
 
 class Initializer(Component):
-    """A method that adds points to scenes with too few points; repeated calls agree.
+    """A method that adds points to scenes with too few points; repeated calls give the same points.
 
-    It is used only in runs that start from the scene's own points (`--init points`).
+    An initializer is used only in runs that start from the scene's own points (`--init points`).
 
     Attributes:
-        alone: Whether it can make points for a scene without points. If it then finds none, it
-            raises an error.
+        alone: True if the initializer can make points for a scene without points. An initializer
+            raises an error if it finds no points in such a scene.
     """
 
     slot: ClassVar[str] = "initializers"

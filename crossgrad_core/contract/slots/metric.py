@@ -1,4 +1,4 @@
-"""The metric slot: a figure of merit of each held-out view."""
+"""The metric slot: a component measures the quality of each held-out view."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
@@ -15,7 +15,9 @@ from crossgrad_core.contract.scene import View
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A held-out view and its photo, as results compare them. Nothing in it may be changed.
+    """A held-out view and its photo, in the form in which results compare them.
+
+    Metrics must not change any of its contents.
 
     Attributes:
         view: The view.
@@ -36,19 +38,19 @@ class Compared:
 
 
 class Metric(Component):
-    """A measure of one figure of every held-out view.
+    """A component that measures one metric of every held-out view.
 
     Attributes:
-        figure: Name and format of the figure.
+        figure: Name and format of the metric.
     """
 
     slot: ClassVar[str] = "metrics"
     figure: ClassVar[Figure]
 
     def described(self) -> Figure:
-        """Return the figure as the metric measures it with its options; by default `figure`.
+        """Return the description of the metric with its options; by default `figure`.
 
-        `definition` and `undefined` of the figure may depend on the options, its name may not.
+        The fields `definition` and `undefined` may depend on the options, but the name must not.
         """
         return self.figure
 

@@ -1,4 +1,4 @@
-"""The observer slot: watches run events and may wrap the hooks."""
+"""The observer slot: a component observes the events of a run and may wrap hooks."""
 
 from typing import ClassVar
 
@@ -8,14 +8,14 @@ from crossgrad_core.contract.component import Component
 class Observer(Component):
     """A plugin that implements event hooks or wraps hooks (`@hookimpl(wrapper=True)`).
 
-    An observer must not end a run: it catches its own errors. It changes the model through hook
-    results only, and returns finite numbers for finite inputs. It stores at most 0.1 MB per step in
-    memory and delays a step by less than 0.1 s per call on a small scene (the time of events does
-    not count as training).
+    An observer must not end a run: it catches its own errors. An observer changes the model through
+    hook results only, and returns finite numbers for finite inputs. An observer stores at most 0.1
+    MB per step in memory and delays a step by less than 0.1 s per call on a small scene (the time
+    of events does not count as training).
 
     Attributes:
-        needs_separate_gradients: Whether it reads the gradients of single views. The run then
-            stores these gradients separately, which costs memory and changes no bit of the
+        needs_separate_gradients: True if the observer reads the gradients of single views. The run
+            then stores these gradients separately, which costs memory and changes no bit of the
             training.
     """
 

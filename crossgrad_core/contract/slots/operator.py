@@ -1,4 +1,4 @@
-"""The operator slot: the gradients of K views -> one gradient per tensor."""
+"""The operator slot: a component combines the gradients of K views into one gradient per tensor."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ class Operator(Component):
     Most operators need only the K x K Gramians of the gradients: see `GramianOperator`.
 
     Attributes:
-        separate: Whether it needs the separate gradients of the views. If not, the backward passes
-            accumulate into one gradient, with the same bits and without copies.
+        separate: True if the operator needs the separate gradients of the views. Otherwise the
+            backward passes accumulate into one gradient, with the same bits and without copies.
         views: Supported values of K.
-        identity_at_one: Whether it returns the gradient of a single view unchanged. A run with
-            K = 1 then reports that the operator does nothing.
-        default_grouping: Name of the grouping that it needs if the user names none; None if it
-            needs no labels.
-        sparse_rows: Whether `aggregate` returns the results of `total` and `combine` unchanged,
-            sparse or dense. Subclasses inherit this value only if they keep `aggregate`; other
-            classes get dense gradients only.
+        identity_at_one: True if the operator returns the gradient of a single view unchanged. A run
+            with K = 1 then reports that the operator does nothing.
+        default_grouping: Name of the grouping that is used if the user names none; None if the
+            operator needs no labels.
+        sparse_rows: True if `aggregate` returns the results of `total` and `combine` unchanged,
+            sparse or dense. A subclass inherits this value only if it keeps `aggregate`; all other
+            subclasses get dense gradients only.
     """
 
     slot: ClassVar[str] = "operators"
@@ -47,7 +47,7 @@ class Operator(Component):
 
     @property
     def resolved_grouping(self) -> str | None:
-        """The grouping that it needs with its present options if the user names none."""
+        """The grouping that the operator needs with its present options if the user names none."""
         return self.default_grouping
 
     def is_identity(self, views: int) -> bool:
@@ -55,11 +55,11 @@ class Operator(Component):
         return views == 1 and self.identity_at_one
 
     def needs_more_views(self, views: int) -> bool:
-        """Return True if it, or an operator that it contains, does nothing with `views` views."""
+        """Return True if the operator, or one that it contains, does nothing with `views` views."""
         return self.is_identity(views)
 
     def reads_labels(self) -> bool:
-        """Return True if its result depends on the labels of the views."""
+        """Return True if the result of the operator depends on the labels of the views."""
         return False
 
     @abstractmethod
@@ -68,8 +68,8 @@ class Operator(Component):
     ) -> tuple[AggregateResult, PluginState]:
         """Return one gradient per tensor, and the new state.
 
-        The result must not depend on the position of a view in the step, only on labels, losses,
-        distances and gradients. Views that are equal in these count equally.
+        The result must not depend on the positions of the views in the step, only on labels,
+        losses, distances and gradients. Views that agree in all four must have equal weight.
 
         Args:
             context: The gradients of the K views and further data of the views.
@@ -78,7 +78,7 @@ class Operator(Component):
 
     @hookimpl
     def crossgrad_aggregate_gradients(self, context: AggregateContext) -> AggregateResult:
-        """Implement the hook with this operator's gradients."""
+        """Implement the hook with the gradients of this operator."""
         answer = self.aggregate(context, context.state(STATE))
         aggregated, state = with_state(answer, AggregateResult, self, "aggregate")
         states: Mapping[str, PluginState] = {**aggregated.states, STATE: state}

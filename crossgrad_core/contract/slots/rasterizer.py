@@ -1,4 +1,4 @@
-"""The rasterizer slot: Gaussians x Camera -> Render, differentiable."""
+"""The rasterizer slot: a component renders Gaussians for a camera, differentiably."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ class Rasterizer(Component):
         max_alpha: Cap of a Gaussian's alpha (0.99 as in 3DGS and gsplat 1.6; 0.999 in gsplat 1.5).
         near: Camera depth in local units; Gaussians with a nearer centre are not drawn.
         dilation: Added to both diagonal entries of the 2-D covariance, px^2.
-        provides: Optional outputs that it can compute: `depth`, `pixels`, `abs_gradient`,
-            `directions`, `count`.
-        responses: Pixel responses that it draws.
+        provides: Optional outputs that the rasterizer can compute: `depth`, `pixels`,
+            `abs_gradient`, `directions`, `count`.
+        responses: Pixel responses that the rasterizer supports.
         devices: Torch device types that it supports.
-        batched: Whether `render_views` is faster than single renders. The views of a step are then
-            drawn in one call, with the graphs of all views alive.
-        deterministic: Whether the same input gives the same bits.
-        sparse_rows: Whether it supports `Gaussians.on_demand`; subclasses do not inherit this.
+        batched: True if `render_views` is faster than single renders. The views of a step are then
+            rendered in one call, and the graphs of all views are in memory together.
+        deterministic: True if the same input gives the same bits.
+        sparse_rows: True if the rasterizer supports `Gaussians.on_demand`; subclasses do not
+            inherit this value.
     """
 
     slot: ClassVar[str] = "rasterizers"
@@ -54,7 +55,8 @@ class Rasterizer(Component):
         """Return a speed rank on a device; `--rasterizer auto` chooses the highest rank.
 
         The ranks are 1 for the readable reference, 10 for compiled kernels on a CPU, 100 on a GPU.
-        With 0, `auto` never chooses it: it does not support the device, or the user must name it.
+        `auto` never chooses rank 0: the rasterizer does not support the device, or the user must
+        name it.
 
         Args:
             device: Torch device type.
@@ -63,10 +65,10 @@ class Rasterizer(Component):
 
     @classmethod
     def missing(cls, device: str) -> str:  # noqa: ARG003 - for those that need a package
-        """Return what is missing on this machine to run on a device, and how to install it.
+        """Return the missing requirements for a device on this machine, and how to install them.
 
         Empty if nothing is missing, or if the rasterizer does not support the device. `--device
-        auto` shows this text if there is a GPU that no rasterizer uses.
+        auto` shows this text if the machine has a GPU that no rasterizer uses.
 
         Args:
             device: Torch device type.
@@ -74,7 +76,7 @@ class Rasterizer(Component):
         return ""
 
     def self_test(self, device: str) -> None:
-        """Check before training that this machine renders correctly; by default without a check.
+        """Check before training that this machine renders correctly; by default nothing is checked.
 
         Args:
             device: Torch device.
@@ -105,8 +107,9 @@ class Rasterizer(Component):
     ) -> list[Render]:
         """Render several views, each with its own Gaussians and background [3].
 
-        The results equal those of `render`. By default the views are rendered one after another; a
-        rasterizer for a GPU may render them together. One backward pass covers all views.
+        The results equal the results of `render`. By default the views are rendered one after
+        another; a rasterizer for a GPU may render them together. The backward pass for all views is
+        one call.
         """
         return [
             self.render(gaussians, camera, background, outputs)

@@ -1,4 +1,4 @@
-"""The reader slot: a path -> Scene."""
+"""The reader slot: a component reads a scene from a path."""
 
 from abc import abstractmethod
 from pathlib import Path
@@ -21,7 +21,8 @@ class Reader(Component):
     def nearly_accepts(self, path: Path) -> bool:
         """Return True if a file in the folder is nearly in this reader's format.
 
-        This is called if no reader accepts the folder. `read` then reports what is missing.
+        This is called only if no reader accepts the folder. In this case `read` reports what is
+        missing.
         """
         return False
 
@@ -30,5 +31,6 @@ class Reader(Component):
         """Return the scene.
 
         Raises:
-            UserError: The folder cannot be read; names the file, the problem and what to do.
+            UserError: The folder cannot be read; the message names the file, the problem and a
+                remedy.
         """

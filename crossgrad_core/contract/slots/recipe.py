@@ -1,4 +1,4 @@
-"""The recipe slot: the value of every setting that a run does not take from the user."""
+"""The recipe slot: a component decides every setting that the user leaves open."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,13 +22,13 @@ from crossgrad_core.contract.slots.densifier import Densifier
 
 @dataclass(frozen=True, eq=False)
 class Facts:
-    """The facts about a run that a recipe decides from.
+    """The facts about a run from which a recipe makes its decisions.
 
     Attributes:
         device: Torch device type.
         planned: Steps that the run was planned with; None while only its seconds are known.
-        total: Steps that the run has now, after the clock made it longer or shorter.
-        mode: Whether the published schedule is stretched to the run.
+        total: Present number of steps, after the clock made the run longer or shorter.
+        mode: `scaled` if the published schedule is stretched to the run, else `absolute`.
         schedule_length: Length that the schedule is written for; None for the length of the run or
             the published length.
         views_per_step: Views of each step, K.
@@ -36,9 +36,9 @@ class Facts:
         photos: Number of training photos.
         pixels: Pixels of a training photo, mean.
         photos_per_point: Median number of training photos that show an SfM point; 0 without points.
-        own_points: Whether the run starts from the points of the scene.
-        batched: Whether a batch rule scales learning rates and Adam's averages with K.
-        scale: Local units per unit of the scene's own frame.
+        own_points: True if the run starts from the points of the scene.
+        batched: True if a batch rule scales learning rates and Adam's averages with K.
+        scale: Local units per unit of the scene's input frame.
         start: Primitives at the start; None before they are counted.
         backbone: The backbone, fitted to the scene.
         densifier: Name -> the densifier of this name with the options that the user set.
@@ -67,7 +67,7 @@ class Facts:
 
     @property
     def published(self) -> bool:
-        """Whether the schedule uses the published numbers, whatever the length of the run."""
+        """True if the schedule uses the published numbers for any length of the run."""
         return is_published(self.mode, self.schedule_length)
 
     @property
@@ -100,22 +100,22 @@ class Facts:
 
     @property
     def short(self) -> bool:
-        """Whether the run is shorter than the published ones; True before its length is planned."""
+        """True if the run is shorter than the published runs; True before its length is planned."""
         return self.views is None or self.views < REFERENCE
 
     def schedule(self, unit: Unit) -> Schedule:
-        """Return the schedule at the present length of the run, before any decision on it."""
+        """Return the schedule at the present length of the run, before any decision about it."""
         counting = Counting(unit, self.views_per_step, self.photos, self.schedule_length)
         return Schedule.for_run(self.total, self.mode, counting)
 
 
 class Recipe(Component):
-    """A rule set that decides every setting that the user leaves open.
+    """A set of rules that decides every setting that the user leaves open.
 
     Attributes:
         settings: Settings that the recipe fixes before any fact is known, such as the sampler and
             the length. Settings of the user override them.
-        rasterizer_options: Options that a rasterizer must have to be chosen for this recipe.
+        rasterizer_options: Options that a rasterizer must support to be chosen for this recipe.
     """
 
     slot: ClassVar[str] = "recipes"

@@ -1,4 +1,4 @@
-"""The resolution slot: the scale at which the views of a step are rendered and compared."""
+"""The resolution slot: a component chooses the scale at which views are rendered and compared."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -31,8 +31,9 @@ class Resolution(Component):
     statistics in units of the full photo.
 
     Attributes:
-        strided: Whether a view of scale 1 / n is rendered at one pixel of each n x n instead, and
-            compared with these pixels of its photo. The pixel differs from step to step.
+        strided: True if a view of scale 1 / n is rendered at one pixel of each n x n block instead,
+            and compared with these pixels of its photo. The rendered pixel of a block differs from
+            step to step.
     """
 
     slot: ClassVar[str] = "resolutions"
@@ -41,7 +42,7 @@ class Resolution(Component):
     def fitted_to(self, scene: Scene) -> "Resolution":
         """Return this resolution with values measured from the scene; by default unchanged.
 
-        The result is written to config.yaml, and a resumed run uses the written one.
+        The result is written to config.yaml, and a resumed run uses the stored values.
         """
         return self
 
@@ -52,7 +53,7 @@ class Resolution(Component):
     def pixels(self, schedule: Schedule, step: int) -> float:
         """Return the pixels rendered in all steps up to and including this one, in full photos.
 
-        Time budgets use this number for planning. By default every view has its full size.
+        Time budgets use this number for planning. By default all views have their full size.
         """
         return schedule.pace.views(step)
 
@@ -67,7 +68,7 @@ class Resolution(Component):
 
     @hookimpl
     def crossgrad_choose_scales(self, context: ScaleContext) -> ScaleResult:
-        """Implement the hook with this resolution's scales."""
+        """Implement the hook with the scales of this resolution."""
         answer = self.scales(context, context.state(STATE))
         scales, state = with_state(answer, Sequence, self, "scales")
         return ScaleResult(tuple(scales), states={STATE: state})

@@ -16,7 +16,8 @@ from crossgrad_core.contract.slots.backbone import Backbone
 class Rule(Component):
     """A plugin that changes the training through hooks (`@hookimpl`), if a run selects it.
 
-    Its state and its random generator are named after the name under which it is installed.
+    The state and the random generator of the rule are named after the name under which the rule is
+    installed.
 
     Attributes:
         copies: Maximum number of copies of the parameters in its state, including the copies in the
@@ -60,6 +61,6 @@ class GaussiansResult(Answer):
 
 @dataclass(frozen=True, eq=False)
 class FinalEdit(DensifyResult):
-    """Result of `crossgrad_final_edit`: the edit of a finished run, and a line for its log."""
+    """Result of `crossgrad_final_edit`: the edit of a finished run, and a line for the log."""
 
     note: str

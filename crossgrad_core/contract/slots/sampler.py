@@ -1,4 +1,4 @@
-"""The sampler slot: the choice of the views of a step."""
+"""The sampler slot: a component chooses the views of each step."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -14,13 +14,14 @@ class Sampler(Component):
     """A method that chooses the K training views of a step from its state and the last record.
 
     Attributes:
-        views: Supported values of K, unless its options change them.
-        default_views: K if the user sets none, unless its options change it.
-        default_grouping: Name of the grouping that it needs if the user names none; None if it
-            needs no groups.
-        own_labels: Labels of its samples if it makes its own groups and ignores the grouping.
-        reads_groups: Whether its samples depend on the groups of the training views.
-        groups: Number of groups that it needs; None for any number.
+        views: Supported values of K; options of the sampler may change them.
+        default_views: K if the user sets none; options of the sampler may change it.
+        default_grouping: Name of the grouping that is used if the user names none; None if the
+            sampler needs no groups.
+        own_labels: Labels of the samples if the sampler makes its own groups and ignores the
+            grouping.
+        reads_groups: True if the samples depend on the groups of the training views.
+        groups: Number of groups that the sampler needs; None for any number.
     """
 
     slot: ClassVar[str] = "samplers"
@@ -38,7 +39,7 @@ class Sampler(Component):
 
     @property
     def resolved_views(self) -> int:
-        """K if the user sets none."""
+        """The value of K if the user sets none."""
         return self.default_views
 
     def counts(self, views: int) -> frozenset[int]:
@@ -55,7 +56,7 @@ class Sampler(Component):
 
     @hookimpl
     def crossgrad_sample_views(self, context: SampleContext) -> SampleResult:
-        """Implement the hook with this sampler's choice."""
+        """Implement the hook with the views chosen by this sampler."""
         answer = self.sample(context, context.state(STATE))
         draw, state = with_state(answer, ViewSample, self, "sample")
         return SampleResult(draw, states={STATE: state})

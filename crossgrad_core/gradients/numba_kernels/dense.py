@@ -3,8 +3,8 @@
 Tensors are passed by address. `addresses` [T, K] int64 contains the address of the first element of
 view k's gradient of tensor t, or 0 if the view does not touch the tensor. `sizes` [T] contains the
 numbers of elements. The work is split into chunks of `CHUNK` elements, independent of the number of
-threads, and partial sums are added in the order of the chunks. So the same input gives the same
-bits.
+threads, and partial sums are added in the order of the chunks. The same input therefore gives the
+same bits.
 """
 
 from typing import Any
@@ -207,7 +207,7 @@ def _weighted(
 ) -> None:
     """Fill `narrow` with the sum of weights times rows, rounded once.
 
-    In float64 neither weights nor products overflow or underflow, whatever the ratio of the norms.
+    In float64, neither weights nor products overflow or underflow for any ratio of the norms.
     """
     n = narrow.size
     a, u = row(rows[0], start, n), weights[0]
@@ -358,7 +358,7 @@ def combine(
         jobs: From `share` or `alone`.
         addresses: [T, K]; 0 leaves the view out.
         weights: [T, K].
-        plain: [T] whether to add the rows in float32 in the order of the views instead.
+        plain: [T], True to add the rows in float32 in the order of the views instead.
         divisor: Divisor of plain sums, in float32.
         out: [T] addresses of the results; a result may overwrite the gradient of a view.
         sizes: [T].

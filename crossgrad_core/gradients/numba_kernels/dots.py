@@ -1,7 +1,8 @@
 """Dot products of a few float32 rows in float64, each row read once.
 
 Sums may be reordered within a call, so that they run in vector registers. Products of float32
-numbers are exact in float64, and squares from 1e-90 to 1e77 neither underflow nor overflow there.
+numbers are exact in float64, and squares from 1e-90 to 1e77 neither underflow nor overflow in
+float64.
 """
 
 import numpy as np

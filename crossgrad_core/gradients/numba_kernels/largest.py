@@ -23,7 +23,7 @@ def largest_bits(
 ) -> None:
     """Write the bits of the largest magnitude in each part of float32 arrays.
 
-    Without sign, a larger number has larger bits; infinity and NaN have the largest bits.
+    Without its sign, a larger number has larger bits; infinity and NaN have the largest bits.
 
     Args:
         jobs: From `share`.

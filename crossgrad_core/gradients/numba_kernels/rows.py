@@ -94,7 +94,7 @@ def row_combine(jobs: Jobs, addresses: Ints, weights: Floats, out: int, width: i
 
 @strict_kernel
 def row_overlaps(a: int, b: int, count: int, width: int, out: Flags) -> None:
-    """Set out[i] where rows i of two tensors have a common non-zero element."""
+    """Set out[i] if the rows i of two tensors have a common non-zero element."""
     x, y = row(a, 0, count * width), row(b, 0, count * width)
     for i in range(count):
         for j in range(i * width, i * width + width):

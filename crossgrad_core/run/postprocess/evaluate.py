@@ -34,12 +34,12 @@ def evaluate(
 
     Args:
         folder: The run's folder.
-        how: The way of opening the run.
-        ply: A file whose Gaussians are drawn instead of the run's model.
-        on: Another capture of the place; its views are drawn instead of the held-out ones.
+        how: The options for opening the run.
+        ply: A file whose Gaussians are rendered instead of the run's model.
+        on: Another capture of the place; its views are rendered instead of the held-out views.
 
     Raises:
-        UserError: See `evaluated`, `evaluated_file` and `evaluated_on`.
+        UserError: For the reasons of `evaluated`, `evaluated_file` and `evaluated_on`.
     """
     if ply is not None:
         result, gaussians, place = evaluated_file(folder, ply, how, on)
@@ -63,10 +63,11 @@ def evaluated_on(
     Args:
         folder: The run's folder.
         on: The other scene, in the coordinates of the run's scene.
-        how: The way of opening the run.
+        how: The options for opening the run.
 
     Raises:
-        UserError: See `elsewhere`; or the folder is not a run, or the run has no checkpoint.
+        UserError: For the reasons of `elsewhere`; or the folder is not a run, or the run has no
+            checkpoint.
     """
     require_checkpoint(folder)
     with writing_if_possible(folder, "evaluating") as writes:
@@ -92,9 +93,9 @@ def evaluated_file(
     Args:
         folder: The run's folder.
         ply: The file, in the coordinates of the scene's input; any program may have written it.
-        how: The way of opening the run.
-        on: Another capture of the place, whose views are drawn instead, without exposures; see
-            `evaluated_on`.
+        how: The options for opening the run.
+        on: Another capture of the place, whose views are rendered instead, without exposures (see
+            `evaluated_on`).
 
     Returns:
         The metrics, the number of Gaussians, and the other capture if there is one.

@@ -31,7 +31,7 @@ def export(
     coordinates: str = INPUT,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Like `exported`, and print a description of the file."""
+    """Write the trained scene like `exported`, and print a description of the file."""
     path, content = exported(
         folder, file_format=file_format, out=out, camera=camera, coordinates=coordinates, how=how
     )
@@ -53,12 +53,12 @@ def exported(
 
     Args:
         folder: The run's folder.
-        file_format: Name of an exporter; None for the run's own.
-        out: The file; by default a file in the run's folder. Its name is never one that
-            summary.json describes with another content.
+        file_format: Name of an exporter; None for the exporter of the run.
+        out: The file; by default a file in the run's folder. The default name is never the name of
+            a file that summary.json describes with another content.
         camera: Name of the view to bake for; by default the average over the training views.
         coordinates: Coordinates of the file, as `check_coordinates` accepts them.
-        how: The way of opening the run.
+        how: The options for opening the run.
 
     Returns:
         The file, and a description of its content.

@@ -10,7 +10,7 @@ from crossgrad_core.training.state import TrainState
 
 
 class Opens(Protocol):
-    """A way of opening a run."""
+    """A function that opens a run."""
 
     def open(self, folder: Path) -> tuple[Setup, TrainState]:
         """Return the run's setup and its newest state."""
@@ -22,7 +22,7 @@ class How:
     """Options for opening a run.
 
     Attributes:
-        device: Device of the tensors; the run's own by default.
+        device: Device of the tensors; by default the device of the run.
         threads: CPU threads; all by default.
         accept_scene: Accept a scene whose photos, masks, points or held-out views have changed.
     """

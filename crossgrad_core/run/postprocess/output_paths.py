@@ -18,7 +18,7 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
-    """Lock the run's folder and yield True; if it can only be read, warn and yield False."""
+    """Lock the run's folder and yield True; if the folder is read-only, warn and yield False."""
     with ExitStack() as stack:
         try:
             stack.enter_context(locked(folder, doing))
@@ -49,12 +49,12 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
 
 
 def is_changed(setup: Setup) -> bool:
-    """Return True if the scene has changed; then files that summary.json describes are kept."""
+    """Return True if the scene has changed; then the files that summary.json describes are kept."""
     return any(note.startswith(ACCEPTED) for note in setup.scene.notes)
 
 
 def own_name(folder: Path, name: str, step: int) -> str:
-    """Return a file name for results of a step that replaces no file of another step.
+    """Return a file name for results of a step that does not replace a file of another step.
 
     The run may have continued, and been killed, after summary.json and its files were written.
     """

@@ -35,14 +35,14 @@ def render(
     how: Opens = AS_IT_IS,
     on: Path | None = None,
 ) -> None:
-    """Draw photo | render | error of the views of a run, or of another capture of its place.
+    """Render photo, render and error of the views of a run, or of another capture of its place.
 
     Args:
         folder: The run's folder.
-        split: The views to draw: test, train or all.
+        split: The views to render: test, train or all.
         out: Folder of the pictures; by default a folder inside the run's folder.
-        how: The way of opening the run.
-        on: The other capture, whose views are drawn instead; see `evaluated_on`.
+        how: The options for opening the run.
+        on: The other capture, whose views are rendered instead (see `evaluated_on`).
 
     Raises:
         UserError: The folder is not a run, the run has no checkpoint, the split is empty, `out`
@@ -85,19 +85,19 @@ def render_path(
     out: Path | None,
     how: Opens = AS_IT_IS,
 ) -> None:
-    """Draw the images of cameras along a path, as pictures and as a video in the same folder.
+    """Render the images of cameras along a path, as images and as a video in the same folder.
 
     Args:
         folder: The run's folder.
         path: See `camera_path`.
         frames: Number of frames of a zoom path, `FRAMES` by default.
         out: Folder of the pictures; by default a folder inside the run's folder.
-        how: The way of opening the run.
+        how: The options for opening the run.
 
     Raises:
-        UserError: See `camera_path`; or the folder is not a run, the run has no checkpoint, the run
-            is training and `out` is not given, `out` already contains a video or such frames, or
-            `frames` is given for a path from a file.
+        UserError: For the reasons of `camera_path`; or the folder is not a run, the run has no
+            checkpoint, the run is training and `out` is not given, `out` already contains a video
+            or such frames, or `frames` is given for a path from a file.
     """
     if frames is not None and path != ZOOM:
         raise UserError(

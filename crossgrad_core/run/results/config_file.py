@@ -35,7 +35,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Return the settings in a run's config.yaml.
 
     Raises:
-        UserError: There is no such file, so the folder is not a run; or the file is damaged or of
+        UserError: The file does not exist, so the folder is not a run; or the file is damaged or of
             another version.
     """
     path = folder / FILE

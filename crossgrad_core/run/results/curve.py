@@ -29,7 +29,7 @@ _LONGEST_IN_TWO_COLUMNS = 48  # characters of a legend entry
 
 
 class _Line(NamedTuple):
-    """One line of a chart: its label and its looks."""
+    """One line of a chart: its label and its style."""
 
     label: str
     column: str
@@ -47,8 +47,8 @@ def draw_curve(
         folder: The run's folder.
         rows: Rows of metrics.csv.
         title: Title of the chart.
-        views: Number of held-out views of each regime, and of all under "overall"; without them
-            there are no lines by regime.
+        views: Number of held-out views of each regime, and of all views under "overall"; None draws
+            no lines by regime.
 
     Returns:
         The file.

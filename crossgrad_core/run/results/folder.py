@@ -58,8 +58,8 @@ def create_run_folder(
     """Create the output folder of a new run.
 
     Args:
-        name: The name of the folder below `root`; if two runs start in the same second, the later
-            one gets the suffix -2.
+        name: The parts of the name of the folder below `root`; if two runs start in the same
+            second, the later run gets the suffix -2.
         out: The folder itself if the user named one; it must be new or empty.
         root: Folder of all runs.
         needed: Bytes that the run may write.

@@ -1,4 +1,4 @@
-"""Files of a run that its checkpoints also store, so that damage is repaired or noticed."""
+"""Files of a run that its checkpoints also store, so that damage is detected or repaired."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +27,7 @@ def kept_files(folder: Path) -> dict[str, Json]:
 
 
 def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, ...]:
-    """Restore metrics.csv as it was at a checkpoint; rows that were added later are dropped.
+    """Restore metrics.csv as it was at a checkpoint; rows that were added later are removed.
 
     Args:
         folder: The run's folder.

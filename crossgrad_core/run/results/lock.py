@@ -33,9 +33,9 @@ class Holder:
 
     Attributes:
         pid: Number of the process.
-        host: Name of its machine.
+        host: Name of the machine.
         since: Local time, to the second.
-        doing: Its work in the folder.
+        doing: What the process does in the folder.
     """
 
     pid: int
@@ -45,7 +45,7 @@ class Holder:
 
     @classmethod
     def me(cls, doing: str) -> "Holder":
-        """Return the description of this process, now."""
+        """Return the description of this process at this time."""
         now = datetime.now().astimezone()
         return cls(os.getpid(), platform.node(), now.strftime("%Y-%m-%d %H:%M:%S"), doing)
 
@@ -63,17 +63,19 @@ class RunInUseError(UserError):
 def locked(folder: Path, doing: str) -> Iterator[bool]:
     """Keep other processes from writing into a run's folder inside the block.
 
-    The lock belongs to an open file, so that it ends with its process, however the process ends.
+    The lock belongs to an open file, so that it ends with its process, even if the process is
+    killed.
 
     Args:
         folder: The run's folder.
-        doing: The work of this process there, for messages to refused processes.
+        doing: The work of this process in the folder, for messages to refused processes.
 
-    Yields:
-        True if the folder is locked, False if its file system has no locks (some network ones).
+    Yields: True if the folder is locked, False if its file system has no locks (some network file
+    systems).
 
     Raises:
-        RunInUseError: Another process holds the lock; the message names it and its start.
+        RunInUseError: Another process holds the lock; the message names the process and its start
+            time.
         UserError: The folder is not writable, or the lock is not a regular file.
     """
     path = folder / FILE
@@ -95,7 +97,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
 
 
 def writer_of(folder: Path) -> str | None:
-    """Describe the process that writes into the folder now; None if none does or is known."""
+    """Describe the process that currently writes into the folder; None without a known process."""
     try:
         with (folder / FILE).open("r+b") as file:
             return _named(_read(file)) if _take(file) == "by another" else None

@@ -19,15 +19,15 @@ NEWS_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Pace:
-    """Smoothed figures of the steps so far.
+    """Smoothed statistics of the steps so far.
 
     Attributes:
         total: Steps of the whole run.
         first: The step after which this session began (above 0 for a resumed run).
-        record: The last step; None before the first.
+        record: The last step; None before the first step.
         loss: Exponentially smoothed mean loss of the step's views.
-        seconds: Exponentially smoothed training seconds of a step; None after a single one.
-        psnr: Overall PSNR of the last evaluation; None before the first.
+        seconds: Exponentially smoothed training seconds of a step; None after the first step only.
+        psnr: Overall PSNR of the last evaluation; None before the first evaluation.
         planned: Number of steps of the first plan if the length has changed; None otherwise.
     """
 
@@ -40,7 +40,7 @@ class Pace:
     planned: int | None = None
 
     def after(self, record: StepRecord) -> "Pace":
-        """Return the figures after one more step."""
+        """Return the statistics after one more step."""
         loss = sum(record.losses) / len(record.losses)
         if self.record is None:
             return replace(self, first=record.step - 1, record=record, loss=loss)
@@ -159,7 +159,7 @@ def _now() -> datetime:
 
 
 class RunLog:
-    """The writer of log.txt; a plugin that the loop registers in addition to the selected ones.
+    """The writer of log.txt; the loop registers this plugin in addition to the selected plugins.
 
     Args:
         folder: The run's folder; an existing log is continued.
@@ -180,8 +180,8 @@ class RunLog:
     def write(self, text: str) -> None:
         """Append a text of one or more lines, each with the time of day.
 
-        A failure to write (a full disk) does not end the run. The lines are left out, and the next
-        line that can be written reports the gap.
+        A failure to write (a full disk) does not end the run. The lines are lost, and the next line
+        that can be written reports the gap.
         """
         stamp = self._clock().strftime("%H:%M:%S")
         gap = [f"(lines are missing here: {self._missing})"] if self._missing else []

@@ -1,4 +1,4 @@
-"""metrics.csv: one row per evaluation, written to the disk at once."""
+"""metrics.csv: one row per evaluation, which is written to the disk immediately."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -73,7 +73,7 @@ class MetricsCsv:
 
     Attributes:
         path: The file.
-        columns: Its columns.
+        columns: The columns of the table.
     """
 
     path: Path
@@ -114,7 +114,7 @@ class MetricsCsv:
         return table
 
     def append(self, row: Mapping[str, int | float | str | None]) -> None:
-        """Write a row and wait until it is on the disk; a failed write leaves nothing behind.
+        """Write a row and wait until it is on the disk; a failed write leaves no partial row.
 
         Raises:
             ValueError: The row has a column that the table lacks.
@@ -137,7 +137,7 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
     """Return the rows of a run's metrics.csv in order.
 
     Raises:
-        UserError: There is no such file, or it does not contain numbers.
+        UserError: The file does not exist, or it does not contain numbers.
     """
     path = folder / FILE
     if not path.is_file():
@@ -189,7 +189,7 @@ def _append(path: Path, content: bytes) -> None:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    """Return all complete lines; a line that a crash cut short has no end and is left out."""
+    """Return all complete lines; a truncated last line has no line end and is left out."""
     return read_rows(path, FILE, _TODO, whole=True)
 
 
@@ -219,8 +219,7 @@ def write_per_view(folder: Path, result: EvaluationResult, name: str = PER_VIEW)
 def read_per_view(folder: Path) -> tuple[ViewMetrics, ...]:
     """Return the metrics of every held-out view of a run, in the order of the scene.
 
-    Returns:
-        The views; empty if there is no such file, as before the first evaluation.
+    Returns: The views; empty if the file does not exist, as before the first evaluation.
 
     Raises:
         UserError: The file is damaged.

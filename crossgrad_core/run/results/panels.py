@@ -301,7 +301,7 @@ def _hatched(image: Pixels, mask: Pixels | None, period: int) -> Pixels:
 
 
 def _font(size: int, *, bold: bool = False) -> "FreeTypeFont":
-    """Load Matplotlib's DejaVu Sans: it is on every machine and covers most scripts."""
+    """Load Matplotlib's DejaVu Sans, because it exists on every machine and covers most scripts."""
     from matplotlib import get_data_path
     from PIL import ImageFont
 
@@ -331,7 +331,7 @@ def _label(draw: "ImageDraw", layout: Layout, metrics: ViewMetrics, step: int) -
 
 
 def _color_bar(canvas: "Image", draw: "ImageDraw", layout: Layout) -> None:
-    """Draw the colours of the error map to its right, with error values."""
+    """Draw the colours of the error map to the right of the map, with error values."""
     from PIL import Image
 
     font = _font(round(0.85 * layout.font))

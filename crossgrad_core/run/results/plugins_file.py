@@ -27,7 +27,8 @@ class Package(BaseModel):
 
     Attributes:
         versions: The versions that trained the run, in order.
-        components: Its components in the run, such as `operator pcgrad`; empty for crossgrad.
+        components: Components of the package in the run, such as `operator pcgrad`; empty for
+            crossgrad.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -42,7 +43,7 @@ _PACKAGES: Final = TypeAdapter(Packages)
 
 
 def packages_of(setup: Setup) -> Packages:
-    """Return the packages of all components of a run, including components inside others."""
+    """Return the packages of all components of a run, including nested components."""
     found = [installed_as(type(part)) for part in _parts(setup.plugins)]
     found.append(entries("readers").get(setup.selection.names["reader"]))
     packages = {OURS: Package(versions=(VERSION,))}
@@ -79,7 +80,7 @@ def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
 
 
 def with_present(known: Packages | None, present: Packages) -> Packages:
-    """Merge the known packages with the present ones; a new version is added at the end."""
+    """Merge the known packages with the present packages; a new version is added at the end."""
     known = known or {}
     packages = {**known}
     for name, package in present.items():
@@ -100,7 +101,7 @@ def history(packages: Packages) -> tuple[str, ...]:
 
 
 def without_outdated(notes: Iterable[str], packages: Packages) -> Iterator[str]:
-    """Drop notes that name one version of a package if several versions trained the run."""
+    """Remove notes that name a single version of a package if several versions trained the run."""
     outdated = tuple(
         f"from {name} {version}: "
         for name, package in packages.items()
@@ -140,7 +141,7 @@ def refuse_missing(
 
 
 def changes(packages: Packages | None) -> dict[str, str]:
-    """Return the packages whose version differs from the last one that trained: then -> now."""
+    """Return the packages whose version differs from the version that trained last: then -> now."""
     found = {}
     for name, package in (packages or {}).items():
         was = f"{name} {package.versions[-1]}"
@@ -177,7 +178,7 @@ def report_changed(packages: Packages | None) -> None:
 
 
 def _parts(value: object) -> Iterator[Component]:
-    """Yield the components in a value, including components in the options of others."""
+    """Yield the components in a value, including components in the options of other components."""
     if isinstance(value, Component):
         yield value
     inner: Iterable[object] = ()

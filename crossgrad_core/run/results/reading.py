@@ -1,6 +1,6 @@
 """Reading of a run's results for comparisons: configuration, metrics.csv, summary.json, views.
 
-Imports no torch, so that a table of many runs appears at once.
+The module does not import torch, so that a table of many runs appears at once.
 """
 
 from collections.abc import Mapping
@@ -100,5 +100,5 @@ def read_run(folder: Path) -> RunResults:
 
 
 def find_runs(root: Path) -> tuple[Path, ...]:
-    """Return the folders of runs at or below a folder, sorted; imports no torch."""
+    """Return the folders of runs at or below a folder, sorted, without importing torch."""
     return tuple(sorted(path.parent for path in root.rglob(CONFIG)))

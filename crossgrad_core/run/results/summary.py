@@ -35,14 +35,14 @@ class Summary:
         scene: Name of the scene.
         totals: Steps, views, backward passes, training seconds, primitives, memory.
         result: The last evaluation; None if there was none.
-        rows: All rows of metrics.csv, to find the best one.
+        rows: All rows of metrics.csv, among which the best is found.
         seconds: Wall-clock seconds by activity; training seconds also by phase.
         config: The resolved configuration as plain data, including the seed.
         environment: Machine and versions.
         ply: Description of the PLY; None if none was written.
         notes: Choices and omissions, with their reasons.
         decisions: The table of decided settings.
-        check: Results of the check of the scene against itself; None without a check.
+        check: Results of the consistency check of the scene; None without a check.
         error: The reason of the failure; None if the run did not fail.
     """
 
@@ -100,7 +100,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def summarised_step(folder: Path, status: Status | None = None) -> int | None:
-    """Return the step of summary.json and the files with it; None if the status differs."""
+    """Return the step of summary.json and its files; None if the run has another status."""
     try:
         summary = read_summary(folder)
     except UserError:

@@ -24,10 +24,10 @@ _LONGEST: Final = 16_383
 
 
 def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
-    """Write `00000.png` and so on; return the files in order.
+    """Write the images as `00000.png` and so on; return the files in order.
 
     Args:
-        images: Images [H, W, 3] float; need not be clamped.
+        images: Images [H, W, 3] float; the values need not be clamped.
         folder: The folder; created if needed.
 
     Raises:
@@ -47,7 +47,7 @@ def write_frames(images: Iterable[Tensor], folder: Path) -> list[Path]:
 
 
 def drop_frames(folder: Path, count: int) -> None:
-    """Remove the frames from number `count` on, which are left from a longer video."""
+    """Remove the frames from number `count` on, which belong to an earlier, longer video."""
     number = count
     while (frame := folder / f"{number:05d}.png").is_file():
         frame.unlink()

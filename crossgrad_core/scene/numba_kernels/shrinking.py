@@ -59,7 +59,7 @@ def _filter_row(
     weights: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
-    """Filter a row [W C] along itself, rounded to float32.
+    """Filter a row [W C] along its length, rounded to float32.
 
     Args:
         padded: The row, with (number of weights - 1) extra pixels at each end; this function fills

@@ -43,13 +43,13 @@ _AT_ONCE: Final = 8
 
 
 def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
-    """Return the value of white for all photos of 16 bits, and a note if it is not 65535.
+    """Return the white value of all 16-bit photos, and a note if it is not 65535.
 
-    All photos share one value, which depends on the brightest pixel of all photos. Photos stay dark
-    if they use a small part of their range and do not fill the range of a smaller bit depth.
+    All photos share one value, which depends on the brightest pixel of all photos. Photos are kept
+    dark if they use a small part of their range and do not fill the range of a smaller bit depth.
 
     Args:
-        deep: The photos. They are decoded until one is bright enough for 16 bits.
+        deep: The photos. Photos are decoded until one photo is bright enough for 16 bits.
 
     Raises:
         UserError: A photo is damaged.
@@ -78,9 +78,10 @@ class ChosenPhotos:
     """The photos of a scene.
 
     Attributes:
-        sources: View name -> how its photo is decoded; without the views that have no photo.
+        sources: View name -> how its photo is decoded; views without a photo are left out.
         pinholes: View name -> calibration of the photo as trained.
-        notes: Photos left out, undistorted, resized or masked, and files that are not used.
+        notes: Notes about photos that were left out, undistorted, resized or masked, and about
+            unused files.
     """
 
     sources: Mapping[str, PhotoSource]

@@ -47,7 +47,7 @@ class Pairs:
     """Names and their files.
 
     Attributes:
-        files: Name -> its file.
+        files: Name -> file with this name.
         ambiguous: Name -> the files that fit it equally well.
     """
 
@@ -58,14 +58,15 @@ class Pairs:
 class FileNames:
     """Files below one folder, found by the names that other programs use for them.
 
-    A name matches the file with the same path. Otherwise it matches the file with the same base
-    name and the most similar path. Suffix, case and Unicode form may differ. A file in another
-    folder matches only if the name's own folder does not exist: otherwise the file is missing.
+    A name matches the file with the same path. If there is no such file, a name matches the file
+    with the same base name and the most similar path. Suffix, case and Unicode form may differ. A
+    file in another folder matches only if the name's own folder does not exist; if it exists, the
+    file is missing.
 
     Args:
         names: Paths below the folder, with forward slashes.
-        called: Returns the name under which a path is compared.
-        aside: Returns True for a path that must not match a name with other folders.
+        called: Returns the name that is used to compare a path.
+        aside: Returns True for a path that must not match a name in other folders.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ def is_absolute(name: str) -> bool:
 
 
 def same_spelling(name: str, other: str) -> bool:
-    """Return True if two names differ in suffix, case and Unicode form at most."""
+    """Return True if two names differ at most in suffix, case and Unicode form."""
     return _folders(name) == _folders(other) and _stem(name) == _stem(other)
 
 

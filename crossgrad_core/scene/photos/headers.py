@@ -31,8 +31,8 @@ class PhotoHeader:
         height: Pixels.
         alpha: True if pixels may be transparent.
         grey: True if the photo has no colour.
-        reducible: True if it can be decoded at a reduced size in less memory.
-        deep: True if it is grey, RGB or RGBA with 16 bits per channel.
+        reducible: True if the photo can be decoded at a reduced size in less memory.
+        deep: True if the photo is grey, RGB or RGBA with 16 bits per channel.
     """
 
     width: int

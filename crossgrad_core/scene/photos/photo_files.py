@@ -29,7 +29,7 @@ _DECORATION: Final = re.compile(rf"^{_WORD}[ ._-]+|[ ._-]+{_WORD}$", re.IGNORECA
 
 
 class PhotoFolder:
-    """The photos below one folder, found by name.
+    """The photos below one folder, which are found by name.
 
     Args:
         path: The folder; it may be missing.
@@ -134,7 +134,7 @@ def find_mask(folder: Path, name: str) -> Path | None:
 
 
 def pair_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Find the mask of each photo that has one.
+    """Find the mask of each photo, if there is one.
 
     The names of `mask_names` are tried first. Then other folders, suffixes and letter cases are
     tried, and finally names with a word such as `mask` before or after the photo's name.

@@ -1,4 +1,4 @@
-"""Notes on the files of a scene: processing of its photos, and unused files."""
+"""Notes about the files of a scene: the processing of its photos, and unused files."""
 
 import os
 from collections import Counter, defaultdict
@@ -225,7 +225,7 @@ def _files(root: Path) -> Iterator[str]:
 
 
 def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
-    """Return why a file is not used; None for an unknown kind or a file with its own note."""
+    """Return why a file is not used; None for an unknown kind or a file with a separate note."""
     kind, path = kind_of(name), raw.root / name
     if kind is None or (kind is PHOTO and path.is_relative_to(raw.images)):
         return None

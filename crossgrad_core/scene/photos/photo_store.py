@@ -1,8 +1,8 @@
 """A disk cache of photos in their training size, shared by all runs.
 
-A file holds one photo. Its name is a hash of everything that determines the pixels, so an entry
-never needs an update. An entry is written completely or not at all. It carries a checksum, and an
-entry with any unexpected property counts as missing.
+A file holds one photo. The name of the file is a hash of everything that determines the pixels, so
+an entry never needs an update. An entry is written completely or not at all. An entry contains a
+checksum, and an entry with any unexpected property counts as missing.
 """
 
 import logging
@@ -73,8 +73,8 @@ def store_folder() -> Path:
 class PhotoStore:
     """A folder of decoded photos of bounded size; several threads and processes may share it.
 
-    Entries used since this store was opened are kept. The other entries are deleted if room is
-    needed, least recently used first. If this does not free enough room, or the disk is full, no
+    Entries used since this store was opened are kept. If space is needed, the other entries are
+    deleted, least recently used first. If this does not free enough room, or the disk is full, no
     more photos are written.
 
     Args:
@@ -193,8 +193,8 @@ def _packed(decoded: Decoded) -> list[bytes | memoryview]:
 def _read(path: Path, width: int, height: int, sound: int | None) -> Decoded | None:
     """Read the photo and mask of an entry; None if the entry is missing or invalid.
 
-    The checksum is skipped if the entry was last used at `sound` [ns], because computing it takes
-    as long as reading.
+    The checksum is not verified if the entry was last used at `sound` [ns], because this takes as
+    long as reading.
     """
     head, pixels, bits = len(_MAGIC) + _SUM, 3 * width * height, -(-width * height // 8)
     try:

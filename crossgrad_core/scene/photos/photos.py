@@ -174,10 +174,10 @@ Key = TypeVar("Key", bound=Storable)
 class PhotoCache(Generic[Key]):
     """A cache of decoded photos in bounded memory; it may be used from several threads.
 
-    Training draws all photos again and again. A least-recently-used cache would almost never hold
-    the next photo if the set is a little larger than the memory. Therefore old photos stay, and new
-    photos replace only the latest few photos that are not expected next. If the set is twice as
-    large as the memory, about half of the photos are found.
+    Training uses all photos again and again. A least-recently-used cache would almost never contain
+    the next photo if the set is slightly larger than the memory. Therefore old photos are kept, and
+    new photos replace only the latest few photos that are not expected next. If the set is twice as
+    large as the memory, about half of the requests find their photo in memory.
 
     Args:
         mib: Memory for decoded photos and masks, MiB. The latest photo is always kept.
@@ -200,7 +200,7 @@ class PhotoCache(Generic[Key]):
         return self._used
 
     def expect(self, sources: Iterable[Key]) -> None:
-        """Announce the photos that will be requested next: they are dropped last."""
+        """Announce the photos that will be requested next; these photos are dropped last."""
         self._expected = frozenset(sources)
 
     def holds(self, source: Key) -> bool:

@@ -27,7 +27,7 @@ class PhotosAhead:
     """Background threads that decode the photos of the next steps, and every other photo once.
 
     With enough cores the training clock never waits for a photo, and a damaged photo is found early
-    instead of when it is first drawn. The order of decoding never changes the result of a run.
+    instead of at its first use. The order of decoding never changes the result of a run.
     """
 
     def __init__(self) -> None:
@@ -45,11 +45,11 @@ class PhotosAhead:
         """Decode photos in the background while the block runs.
 
         Args:
-            views: All views. Each is decoded once, even if no step requests it.
+            views: All views. Each photo is decoded once, even if no step requests it.
             report: Called from another thread with the first error among these views; the remaining
                 views are then not decoded.
-            keep: True if all photos fit into memory. Otherwise the photos that are not expected are
-                written to the disk cache, or decoded only as a test.
+            keep: True if all photos fit into memory. Otherwise photos that are not expected are
+                written to the disk cache, or decoded only to test them.
         """
         self._unseen, self._report, self._keep = iter(views), report, keep
         self._at_work = True
@@ -67,7 +67,7 @@ class PhotosAhead:
 
     @property
     def useful(self) -> bool:
-        """True if announcing the next views helps: False once all photos are in memory."""
+        """True if it helps to announce the next views; False once all photos are in memory."""
         return self._at_work
 
     def expect(self, views: Sequence[View]) -> None:
@@ -86,7 +86,7 @@ class PhotosAhead:
             self._changed.notify_all()
 
     def taken_cpu(self) -> float:
-        """Return the CPU seconds of photos decoded since the last call."""
+        """Return the CPU seconds of photos decoded since the previous call."""
         with self._changed:
             taken, self._cpu = self._cpu, 0.0
         return taken
@@ -129,7 +129,7 @@ class PhotosAhead:
 
 
 def decode(view: View, *, keep: bool) -> None:
-    """Decode a view's photo into memory, or else into the disk cache, or else only as a test.
+    """Decode a view's photo into memory, else into the disk cache, else only to test it.
 
     Raises:
         UserError: The photo cannot be decoded.
@@ -148,7 +148,7 @@ def _get_quietly(photo: FilePhoto) -> None:
 
 
 def _ignore(error: Exception) -> None:
-    """Ignore an error: only the first error is reported."""
+    """Ignore an error, because only the first error is reported."""
 
 
 def _give_way() -> None:

@@ -73,7 +73,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
 
 
 class _Bounded(BufferedReader):
-    """A file from which no more bytes are read than it holds.
+    """A file that never returns more bytes than it contains.
 
     A chunk may claim any length, and a plain `read` would allocate that much memory at once.
 
@@ -105,7 +105,8 @@ def is_deep(image: "Image") -> bool:
 def take_lower_bytes(image: "Image") -> None:
     """Make Pillow decode the lower bytes of a 16-bit colour photo; by default it uses the upper.
 
-    Pillow has no 16-bit colour modes. It reads the other byte if the byte order is swapped.
+    Pillow has no 16-bit colour modes. The function reads the other byte if the byte order is
+    swapped.
     """
     other = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
     modes = [mode[:-1] + other[mode[-1]] for mode in _stored_modes(image)]
@@ -136,7 +137,7 @@ def _check_pixels(image: "Image", path: Path) -> None:
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
-    """Open an image like `Image.open`, but without Pillow's pixel limit: ours is checked later."""
+    """Open an image like `Image.open`, but without Pillow's pixel limit; ours is checked later."""
     from PIL import Image
 
     Image.init()
@@ -152,7 +153,7 @@ def _identified(file: BinaryIO, path: Path) -> "Image":
 
 
 def admit(head: bytes, path: Path) -> bool:
-    """Return True if a file is HEIC or HEIF; Pillow can then open it.
+    """Return True if a file is HEIC or HEIF; afterwards Pillow can open it.
 
     Args:
         head: The first bytes of the file.

@@ -62,10 +62,10 @@ def choose_reduction(path: Path, header: PhotoHeader, max_size: int | None) -> i
     """Choose the divisor of each side of a photo during decoding: 1, 2, 4 or 8.
 
     The divisor is 1 for all photos that can be decoded at once. For larger photos it is the largest
-    that keeps `max_size` pixels on the longest side, or else the smallest possible.
+    divisor that keeps `max_size` pixels on the longest side, or else the smallest possible divisor.
 
     Raises:
-        UserError: The photo is too large; the message says what to do.
+        UserError: The photo is too large; the message suggests a remedy.
     """
     pixels = header.width * header.height
     if pixels <= pillow.MOST_PIXELS:

@@ -47,8 +47,8 @@ class Sketches:
 
     Attributes:
         small: [V, 16, 16, 3] pixels, levels of 255.
-        sharpness: [V] differences between neighbours over differences between pixels farther apart;
-            NaN if the farther pixels hardly differ.
+        sharpness: [V] differences between neighbouring pixels divided by differences between more
+            distant pixels; NaN if the distant pixels hardly differ.
         light: [V] mean level of the pixels, 0 to 255.
     """
 
@@ -80,7 +80,7 @@ def findings_of(
     Args:
         scene: The scene.
         images: [H, W, 3] photos that were checked.
-        names: Their names.
+        names: Names of the photos.
     """
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.views])
     yield from _equal_poses(poses, [view.name for view in scene.views])
@@ -152,11 +152,11 @@ _BYTES_OF_A_PIXEL: Final = 4
 
 
 def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -> Scene:
-    """Check a scene and return it with notes on contradictions, and with the figures in `check`.
+    """Check a scene and return it with notes about contradictions and with the results in `check`.
 
     Args:
         scene: The scene.
-        path: Its folder, for messages.
+        path: The folder of the scene, for messages.
         cache_mib: Memory for decoded photos. If the scene needs more, only evenly spaced photos are
             checked.
         accept: Continue even if the scene as a whole is contradictory.

@@ -1,4 +1,4 @@
-"""Diagnosis of a contradictory scene: the trial change that repairs it names the cause."""
+"""Diagnosis of a contradictory scene: the trial change that repairs the scene names the cause."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -229,7 +229,7 @@ def searches() -> Iterator[Search]:
 
 
 def probes() -> Iterator[Trial]:
-    """Yield small changes of the numeric parameters: a correct scene scores best unchanged."""
+    """Yield small changes of the numeric parameters; a correct scene scores best unchanged."""
     for make in (_focal, _scaled):
         yield from (make(value) for value in (0.93, 1.07))
     for value in (-0.04, 0.04):

@@ -264,7 +264,7 @@ def observed(scene: Scene, views: Integers, pixels: Pixels) -> Evidence:
     Args:
         scene: The scene.
         views: Rows of the views.
-        pixels: Decodes their photos.
+        pixels: Decodes the photos of the views.
     """
     rank = np.random.default_rng(0).permutation(len(scene.points))
     rows = np.full((len(views), MOST_OBSERVED), -1)
@@ -283,7 +283,7 @@ def tested(scene: Scene, views: Integers, pixels: Pixels, most: int) -> Evidence
     Args:
         scene: The scene.
         views: Rows of the views.
-        pixels: Decodes their photos.
+        pixels: Decodes the photos of the views.
         most: Number of points of all views together.
     """
     number, total = max(most // len(views), _TESTED), len(scene.points)

@@ -1,4 +1,4 @@
-"""The verdict on a scene: do its photos agree with its points, which photos do not, and why."""
+"""The verdict on a scene: whether its photos agree with its points, which do not, and why."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +118,7 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
     Args:
         scene: The scene.
         views: Rows of the views.
-        pixels: Decodes their photos.
+        pixels: Decodes the photos of the views.
 
     Raises:
         UserError: A photo cannot be decoded.
@@ -144,7 +144,8 @@ class _Group:
         evidence: The points for the comparison.
         views: [V] rows of the views.
         agreement: Agreement of the unchanged photos.
-        recolored: True if the points' own colours are useless and photos replace them.
+        recolored: True if the points' own colours are useless, so that the photos' colours replace
+            them.
     """
 
     evidence: Evidence

@@ -1,4 +1,4 @@
-"""Contract checks of operators in the training step, where they reduce K gradients to one."""
+"""Contract checks of operators in the training step, which combine K gradients into one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -129,7 +129,7 @@ def _require_gradient(what: str, gradient: Tensor | None, shape: tuple[int, ...]
 
 
 def absent_views_have_no_weight(make: Make[Operator]) -> None:
-    """A view without a valid gradient (not seen, all zero or not finite) has no influence."""
+    """A view without a valid gradient (not visible, all zero or not finite) has no influence."""
     operator = make()
     for views in admitted(operator.views):
         answers = []

@@ -1,8 +1,8 @@
-"""Building blocks of contract checks.
+"""Building blocks for contract checks.
 
 A check is a plain function `check(make)`. `make()` returns a fresh component with default options.
 The check raises `ContractError` with a sentence for the author of the component. Checks need
-neither pytest nor hypothesis. With pytest, a few lines run them:
+neither pytest nor hypothesis. With pytest, a few lines run all checks:
 
     @pytest.mark.parametrize("check", OPERATOR_CHECKS)
     def test_contract(check):

@@ -1,7 +1,7 @@
-"""Measurement of a plugin's costs: its state, the time of its hooks, and its memory.
+"""Measurement of the costs of a plugin: its state, the time of its hooks, and its memory.
 
 The size of a state may depend on the numbers of views and primitives, and on a window of the last
-steps. A state that grows with every step makes each checkpoint larger than the checkpoint before.
+steps. If a state grows with every step, each checkpoint is larger than the checkpoint before it.
 """
 
 import gc

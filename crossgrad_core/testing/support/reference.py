@@ -2,7 +2,7 @@
 
 Inputs are ordinary Gaussians, off-centre cameras, and Gaussians at the extremes of training. A
 pixel may differ for two reasons: rounding decides whether a few Gaussians are drawn at the edge of
-their footprint, and float32 has a rounding error, measured on the reference.
+their footprint, and float32 has a rounding error, which is measured on the reference.
 """
 
 from collections.abc import Callable, Iterator, Mapping

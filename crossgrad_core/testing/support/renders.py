@@ -86,7 +86,7 @@ def view_record(
     Args:
         view: The view.
         gaussians: The rendered Gaussians.
-        screen: Their statistics in pixels of the render, gradients included.
+        screen: Statistics of the Gaussians in pixels of the render, gradients included.
         index: Position of the view in `scene.train_views`.
         scale: Side of the render divided by the side of the photo.
     """

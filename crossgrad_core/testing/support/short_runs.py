@@ -1,4 +1,4 @@
-"""Short runs on the sample scene, which are refused with reasons or trained."""
+"""Short runs on the sample scene, which are either refused with reasons or trained."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     """Return the reasons to refuse a run before training; empty if it is accepted.
 
     A combination is refused if a component objects (`crossgrad_validate_selection`), or if the
-    declarations of its components do not fit: numbers of views, tensors, statistics, devices.
+    declarations of its components do not match in numbers of views, tensors, statistics or devices.
     """
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")

@@ -36,8 +36,8 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
 
     A tensor without gradient (None or absent) keeps value, moments and step count. Gradients too
     small or too large for float32 arithmetic are limited by the constants in `coefficients`. Within
-    [1e-17, 1e18] the result equals `torch.optim.Adam` up to rounding. As there, a NaN in a gradient
-    makes its element NaN.
+    [1e-17, 1e18] the result equals `torch.optim.Adam` up to rounding. As in torch, a NaN in a
+    gradient makes its element NaN.
 
     Args:
         params: Floating-point tensors of any shape, by name.
@@ -45,9 +45,9 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
         state: Moments and step counts; missing entries start at zero.
         lrs: Learning rate of every tensor that has a gradient.
         rule: Decays of the moments, and eps.
-        scales: Tensor name -> factor for the gradient, not 0. None: 1 for all tensors.
-        from_zero: Names of uninitialised tensors with a gradient: they count as zero, and receive
-            the step.
+        scales: Tensor name -> factor for the gradient, not 0. None means 1 for all tensors.
+        from_zero: Names of uninitialised tensors with a gradient; they count as zero before the
+            step.
 
     Raises:
         ValueError: If an argument is out of range or a gradient does not fit its tensor.
@@ -77,7 +77,7 @@ def counted(
         param: The tensor.
         state: Moments and step counts; changed.
         lr: Learning rate.
-        rule: As in `adam_step`.
+        rule: The Adam rule, as in `adam_step`.
         scale: Factor for the gradient.
     """
     if name not in state.steps:
@@ -125,7 +125,7 @@ def _update_fused(updates: Sequence[Update]) -> None:
 def update_on_gpu(
     param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, step: Coefficients
 ) -> None:
-    """Apply the same step by torch's fused Adam, which keeps subnormal numbers.
+    """Apply the same step with torch's fused Adam, which keeps subnormal numbers.
 
     Steps on a GPU do not check for infinite gradients. An infinite gradient makes the parameter
     NaN, which the check of parameters finds.
@@ -167,7 +167,7 @@ def update_reference(
 
 
 def _without(values: Tensor, floor: float) -> Tensor:
-    """Return the values, with 0 where the absolute value is below `floor`; NaN stays."""
+    """Return the values, with 0 if the absolute value is below `floor`; NaN is kept."""
     return torch.where(values.abs() < floor, torch.zeros_like(values), values)
 
 

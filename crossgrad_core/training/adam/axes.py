@@ -1,8 +1,8 @@
 """Position steps in units of the Gaussians: along each axis, by a share of its length.
 
-Adam gives every position steps of the same length. Then a small Gaussian of a near wall jumps over
-its neighbours, while a large Gaussian of the ground below a drone hardly moves. Scenes with very
-different camera distances contain both (docs/schedules.md).
+Adam gives every position steps of the same length. With such steps, a small Gaussian on a near wall
+jumps over its neighbours, while a large Gaussian on the ground below a drone hardly moves. Scenes
+with very different camera distances contain both kinds (docs/schedules.md).
 """
 
 from math import inf, log, nan
@@ -34,7 +34,7 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
         scales: [N, 3] logarithms of the standard deviations along the axes.
         quats: [N, 4] rotations, wxyz of any length.
 
-    Source: ours.
+    Source: developed for crossgrad.
     """
     if not len(positions):
         return
@@ -61,7 +61,7 @@ def stretched(steps: Tensor, factors: Tensor, quats: Tensor) -> Tensor:
 def _usual(scales: Tensor) -> Tensor | float:
     """Return the median middle log scale of Gaussians that are evenly spread over memory.
 
-    Values that are not finite are left out, so that they do not affect other Gaussians.
+    Non-finite values are left out, so that they do not affect other Gaussians.
     """
     some = scales[:: -(-len(scales) // _SAMPLE)]
     if is_native([some]):  # NumPy has less overhead than torch.

@@ -26,10 +26,10 @@ class Coefficients:
         beta1: Decay of the first moment.
         beta2: Decay of the second moment.
         lr: Learning rate.
-        age: t, steps so far as bias correction counts them, this one included.
+        age: t, number of steps so far as bias correction counts them, including this step.
         eps: Added to the root of the corrected second moment.
         scale: Factor for the gradient.
-        from_zero: Whether the tensor is uninitialised: it counts as zero, and receives the step.
+        from_zero: True if the tensor is uninitialised; it then counts as zero before the step.
     """
 
     beta1: float
@@ -52,5 +52,5 @@ class Coefficients:
 
     @property
     def square_floor(self) -> float:
-        """Gradients below it would give a subnormal contribution to the second moment."""
+        """Gradients below this value would give a subnormal contribution to the second moment."""
         return sqrt(SMALLEST_NORMAL / (1 - self.beta2))

@@ -1,12 +1,12 @@
-"""Deferred Adam steps: rows that no view of a step drew take their step later, when needed.
+"""Deferred Adam steps: rows that no view of a step rendered take their step later, when needed.
 
 Such a row has a gradient of zero, but Adam still moves it by its decaying moments. The deferred
-steps are applied row by row when the row is next drawn, or to all rows when the tensor is read.
-They use the same float32 operations in the same order, so the bits are the same as without
-deferral.
+steps are applied row by row when the row is next rendered, or to all rows when the tensor is read.
+The deferred steps use the same float32 operations in the same order, so the bits are the same as
+without deferral.
 
 Steps run in the background on other threads while this thread continues with serial work. The
-tensor is not read before it is drawn or requested, and then the reader waits.
+tensor is not read before it is rendered or requested; a reader then waits for the step.
 """
 
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ class _Behind:
 
     Attributes:
         done: [N] number of steps that each row has taken.
-        before: Number of steps before the first step in `room`; every row has taken these.
+        before: Number of steps before the first step in `room`; every row has taken these steps.
         room: [LONGEST, 5] both betas, step size, scale of the root and eps of each later step.
         count: Number of steps in `room`.
     """
@@ -86,10 +86,10 @@ class Late:
         return frozenset(self._behind).union(self._under_way)
 
     def finish(self, name: str | None = None) -> None:
-        """Wait until no step runs any more; deferred steps stay deferred.
+        """Wait until no step is running; deferred steps are still deferred afterwards.
 
         Args:
-            name: The tensor; None: all.
+            name: The tensor; None means all tensors.
         """
         for each in [name] if name is not None else list(self._under_way):
             if (begun := self._under_way.get(each)) is not None:
@@ -108,13 +108,13 @@ class Late:
     ) -> None:
         """Take a step with the rows of `grad` (sparse) and defer the step of all other rows.
 
-        If `grad` contains many rows, all rows take the step and none is deferred. The step may
+        If `grad` contains many rows, all rows take the step and no row is deferred. The step may
         still run after the return; `finish` waits for it.
 
         Args:
             name: Name of the tensor; its count in `adam` includes this step.
             param: The tensor, float32 and contiguous, on the CPU.
-            grad: Its sparse gradient, which must not change any more.
+            grad: The sparse gradient, which must not change any more.
             adam: Moments and counts.
             step: The coefficients of the step.
         """
@@ -153,7 +153,8 @@ class Late:
             name: Name of the tensor.
             param: The tensor.
             adam: Moments and counts.
-            rows: [R] int32, each once; None means all rows, and no step stays deferred.
+            rows: [R] int32 without duplicates; None means all rows, after which no step is
+                deferred.
         """
         self.finish(name)
         behind = self._behind.get(name)
@@ -189,6 +190,6 @@ def _width(param: Tensor) -> int:
 
 
 def _changed(name: str, param: Tensor, adam: AdamState) -> None:
-    """Invalidate graphs that hold the old values, because NumPy wrote without autograd."""
+    """Invalidate graphs that contain the old values, because NumPy wrote without autograd."""
     for tensor in (param, adam.exp_avg[name], adam.exp_avg_sq[name]):
         torch.autograd.graph.increment_version(tensor)

@@ -1,4 +1,4 @@
-"""An operator in which every view has the same influence, however long its gradient is."""
+"""An operator in which every view has the same influence, for gradients of any length."""
 
 import numpy as np
 from numpy.typing import NDArray

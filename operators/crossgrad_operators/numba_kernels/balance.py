@@ -1,7 +1,7 @@
 """Equal projections and bargaining (IMTL-G, Nash-MTL), and equal singular values (Aligned-MTL).
 
-Each kernel computes with 16 or 32 digits. It also returns the blocks for which rounding of the
-Gramian may be visible in a result of 16 digits.
+Each kernel computes with 16 or 32 digits. Each kernel also marks the blocks for which rounding of
+the Gramian may be visible in a 16-digit result.
 """
 
 import math
@@ -71,8 +71,8 @@ def _of_present(
 def _graded(norms: Pairs, cosines: Pairs, exact: Exact) -> Pairs:
     """Return D C D [n, n], where D contains the norms divided by the largest norm.
 
-    The matrix has the rank of C. At large norm ratios, the eigenvalues of the matrix itself would
-    not show this rank.
+    The matrix has the rank of C. The eigenvalues of the matrix itself would not show this rank at
+    large norm ratios.
     """
     n = len(norms)
     longest, _ = longest_of(norms)
@@ -105,7 +105,7 @@ def _add_solution(
 ) -> None:
     """Add x_i (x_i.r) / l_i for the chosen eigenvectors x_i and eigenvalues l_i to `v`.
 
-    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`: then it is
+    An eigenvector is skipped if the terms of x_i.r cancel up to a share `least`, because it is then
     orthogonal to r except for rounding noise.
     """
     for i in chosen:
@@ -183,7 +183,7 @@ def imtl_g(
 def _same_shares(
     norms: Pairs, cosines: Pairs, places: Indices, unit: float, weights: Floats, exact: Exact
 ) -> bool:
-    """Fill in the weights of more than two views, and return whether they are ill-conditioned."""
+    """Fill in the weights of more than two views, and return True if they are ill-conditioned."""
     n = places.size
     longest, _ = longest_of(norms)
     scaled, v, x = np.empty((n, 2)), np.zeros((n, 2)), np.empty((n, 2))
@@ -223,12 +223,14 @@ def _newton_step(cosines: Floats, beta: Floats, matrix: Floats, step: Floats) ->
 
 @strict_kernel
 def bargain(cosines: Floats, beta: Floats) -> bool:
-    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps. Return False if it diverges.
+    """Solve C beta = 1 / beta for beta > 0 by damped Newton steps.
+
+    Return False if the iteration diverges.
 
     The objective 1/2 beta^T C beta - sum log beta is self-concordant, so steps of
     1 / (1 + decrement) converge from any start. In units of beta the Hessian is 1 + B C B, so no
     damped step removes a whole beta. If a sum of directions with non-negative weights is zero, beta
-    grows without end.
+    grows without limit.
 
     Args:
         cosines: [n, n].
@@ -277,7 +279,7 @@ def _polish(cosines: Pairs, beta: Floats) -> None:
 
 @strict_part
 def _bargained(cosines: Pairs, beta: Floats, exact: Exact) -> bool:
-    """Fill in beta [n]. Return False if it grows without end."""
+    """Fill in beta [n]. Return False if beta grows without limit."""
     n = beta.size
     beta[:] = 1.0
     if n == 2:

@@ -31,7 +31,10 @@ from crossgrad_operators.numba_kernels.polyhedron import (
 
 @strict_device
 def _pair(cosine: float, base: Pairs, z: Pairs) -> None:
-    """Fill in coefficients z [2] of the projection of b [2]. At most one is larger than in b."""
+    """Fill in coefficients z [2] of the projection of b [2].
+
+    At most one coefficient is larger than in b.
+    """
     one, other = base[0, 0], base[1, 0]
     first, second = one + cosine * other, cosine * one + other
     z[0, 0], z[1, 0] = one, other
@@ -64,7 +67,7 @@ def _weight(z: Pair, norm: Pair, other: Pair, exact: Exact) -> float:
 
 @strict_kernel
 def upgrad(gramians: Floats, rounding_residuals: Floats, present: Flags, exact: Exact) -> Solved:
-    """Return rows [B, K, K]: each gradient, over K, projected onto the conflict-free cone."""
+    """Return rows [B, K, K]: each gradient, divided by K, projected onto the conflict-free cone."""
     blocks, views, _ = gramians.shape
     result, ill_conditioned = np.zeros((blocks, views, views)), np.zeros(blocks, np.bool_)
     problem = polyhedron(views, exact)

@@ -84,7 +84,7 @@ def form(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def cancels(v: Pairs, cosines: Pairs, exact: Exact) -> bool:
-    """Return whether the sum of v_k times the k-th direction is only rounding noise."""
+    """Return True if the sum of v_k times the k-th direction is only rounding noise."""
     longest = np.abs(v[:, 0]).max()
     return form(v, cosines, exact)[0] <= CANCELLED * longest * longest
 

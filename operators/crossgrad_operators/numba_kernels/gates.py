@@ -20,7 +20,7 @@ MET = 1e-9
 def confident(
     moments: Floats, gramians: Floats, present: Flags, beta: float, score: float, warmup: int
 ) -> Flags:
-    """Return the pairs [B, K, K] that have probably been conflicting, and update `moments`.
+    """Return the pairs [B, K, K] that have probably been in conflict, and update `moments`.
 
     Args:
         moments: [B, 3, K, K] raw exponential averages of the cosine and its square, and the number
@@ -75,7 +75,7 @@ def _scale(logs: Floats, active: Flags) -> None:
 
 @strict_device
 def _group_lengths(gramian: Floats, group: Indices, lengths: Floats) -> None:
-    """Fill in lengths [S] of the sums over each group, or zeros for mere rounding noise."""
+    """Fill in lengths [S] of the sums over each group; 0 for sums that are only rounding noise."""
     views = group.size
     longest = np.zeros(lengths.size)
     lengths[:] = 0.0

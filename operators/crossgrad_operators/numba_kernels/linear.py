@@ -72,8 +72,8 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
     """Solve (1 + M) x = r for positive semi-definite M by Cholesky.
 
     The pivots of 1 + M are at least 1. If a computed pivot is smaller because of rounding, M is so
-    large that the 1 does not matter. Then x is still finite and, since the factor is regular, not
-    an ascent direction.
+    large that the summand 1 does not matter. In this case x is still finite and, because the factor
+    is regular, not an ascent direction.
 
     Args:
         matrix: [n, n] M.
@@ -106,8 +106,8 @@ def solve_shifted(matrix: Floats, right: Floats, out: Floats) -> None:
 def smallest_pivot(cosines: Floats, count: int) -> float:
     """Return the last pivot, at least 0, of a Cholesky factorization that pivots by size.
 
-    It is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely more than
-    `count` times as large.
+    The pivot is an upper bound of the smallest eigenvalue of the first `count` rows, and rarely
+    more than `count` times as large.
     """
     rest = cosines[:count, :count].copy()
     pivot = 1.0
@@ -175,7 +175,7 @@ def _rotate(matrix: Pairs, vectors: Pairs, p: int, q: int, exact: Exact) -> None
 
 @strict_kernel
 def eigen(matrix: Pairs, vectors: Pairs, exact: Exact) -> Floats:
-    """Return the eigenvalues [n] of a positive semi-definite matrix, also left on its diagonal.
+    """Return the eigenvalues [n] of a positive semi-definite matrix; they are also on its diagonal.
 
     The method is Jacobi's with the stopping rule |a_ij| <= eps sqrt(a_ii a_jj). Small eigenvalues
     of a matrix D C D with a well-conditioned C are then relatively accurate for any diagonal D

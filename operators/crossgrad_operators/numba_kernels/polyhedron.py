@@ -4,12 +4,12 @@ The nearest point to sum b_k e_k is sum (b_k + y_k) e_k with y >= 0, where a mul
 positive only if x.e_k = h_k. MGDA, CAGrad, UPGrad and DualProj all need such points. If the e_k are
 linearly dependent, the multipliers are not unique, but the point is unique.
 
-The matrix of cosines is known up to rounding, which leaves its smallest eigenvalues unknown. A
-ridge on its diagonal therefore makes it definite. The ridge bounds the multipliers, and makes them
-continuous functions of the cosines. If the effect of the ridge matters, the step is repeated from
-its own result (proximal point iteration). At the end, a component along an eigenvector of
-eigenvalue l is missing only the share (ridge / (l + ridge))^ROUNDS. Directions that are far from
-dependent need no second round.
+The matrix of cosines is known up to rounding, which leaves its smallest eigenvalues unknown.
+Therefore a ridge is added to the diagonal of the matrix, which makes the matrix definite. The ridge
+bounds the multipliers and makes them continuous functions of the cosines. If the effect of the
+ridge matters, the step is repeated from its own result (proximal point iteration). At the end, the
+component along an eigenvector of eigenvalue l lacks only the share (ridge / (l + ridge))^ROUNDS.
+Directions that are far from linearly dependent need no second round.
 """
 
 from typing import NamedTuple
@@ -50,13 +50,13 @@ class Rounding(NamedTuple):
 
     Attributes:
         exact: True for 32 digits, None for 16.
-        ridge: Value added to the diagonal of the cosines. It is larger than the rounding error of a
-            zero eigenvalue (ten times K units, for long sums), and too small to be visible in
-            gradients with half the digits.
+        ridge: Value added to the diagonal of the cosines. The ridge is larger than the rounding
+            error of a zero eigenvalue (ten times K units, for long sums), and too small to be
+            visible in gradients with half the digits.
         slack: A constraint is violated if its violation exceeds this share of its terms.
         shown: The ridge is corrected if it exceeds this share of a pivot.
-        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. It is also the difference
-            between gradients with half the digits that were meant to be opposite.
+        noise: Rounding error of |sum x_k e_k|^2, as a share of sum x_k^2. The noise is also the
+            difference between gradients with half the digits that were meant to be opposite.
     """
 
     exact: Exact
@@ -79,12 +79,13 @@ class Polyhedron(NamedTuple):
         barred: [K] True if rounding prevents a constraint from becoming active.
         chosen: [K] indices of the active constraints, at the front.
         point: [K] b + y.
-        gradient: [K] C (b + y) - h + ridge (y - centre). It is the slack if y = centre.
+        gradient: [K] C (b + y) - h + ridge (y - centre). The gradient is the slack if y = centre.
         factor: [K, K] Cholesky factor L of the active cosines with their ridge, and L^T above the
             diagonal.
         step: [K] change of the multipliers.
         room: [K] working memory of `substitute`.
-        ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may err.
+        ill_conditioned: [1] True if directions are nearly dependent, so that 16 digits may not be
+            enough.
         rounding: Bounds that follow from the number of digits.
     """
 
@@ -271,7 +272,7 @@ def approach(problem: Polyhedron) -> int:
 
 @strict_device
 def is_settled(problem: Polyhedron) -> bool:
-    """Return whether the ridge is not visible, because active directions are far from dependent.
+    """Return True if the ridge is not visible, because active directions are far from dependent.
 
     The function also sets `ill_conditioned` if the directions require more digits.
     """
@@ -312,7 +313,7 @@ def square(problem: Polyhedron, x: Pairs) -> Pair:
 def share_left(problem: Polyhedron, x: Pairs) -> float:
     """Return a factor for coefficients x: 0 if their sum is only rounding noise.
 
-    Above the noise, the factor grows continuously. It reaches 1 at twice the squared noise.
+    Above the noise, the factor grows continuously. The factor reaches 1 at twice the squared noise.
     """
     noise = problem.rounding.noise * products(x, x, 0, problem.active.size, None)[0]
     if noise == 0.0:

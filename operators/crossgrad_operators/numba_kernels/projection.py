@@ -1,6 +1,6 @@
-"""Pairwise projections: each gradient is changed against each other gradient in turn.
+"""Pairwise projections: each gradient is changed by its conflicts with each other gradient in turn.
 
-A vector v is a sum of unit gradients. Its coefficients are numbers of 16 or 32 digits.
+A vector v is a sum of unit gradients. The coefficients of the sum are numbers of 16 or 32 digits.
 """
 
 import numpy as np
@@ -61,13 +61,13 @@ def _remaining(v: Pairs, cosines: Pairs, exact: Exact) -> Pair:
 
 @strict_device
 def _is_opposite(cosine: Pair, exact: Exact) -> bool:
-    """Return whether 1 + cos is rounding noise."""
+    """Return True if 1 + cos is rounding noise."""
     return plus(ONE, cosine, exact)[0] <= OPPOSITE
 
 
 @strict_device
 def _conflicts(along: Pair, size: Pair, least: Pair, exact: Exact) -> bool:
-    """Return whether the cosine along / size is below -least."""
+    """Return True if the cosine along / size is below -least."""
     return along[0] < 0.0 and plus(along, product(least, size, exact), exact)[0] < 0.0
 
 
@@ -81,7 +81,7 @@ def projected(
     rule: tuple[float, float],
     exact: Exact,
 ) -> Floats:
-    """Return rows v_i [B, K, K]: g_i without (a share of) its components against the others.
+    """Return rows v_i [B, K, K]: g_i without (a share of) its components against other gradients.
 
     For i, for j in order[i]: if cos(v, g_j) < -threshold, v -= strength (v.g_j / |g_j|^2) g_j, with
     the original g_j. At full strength, a v exactly opposite to g_j becomes exactly zero. A v also
@@ -129,7 +129,7 @@ def projected(
 
 @strict_device
 def _blur(v: Pairs, size: float, phi: float, t: float) -> float:
-    """Return the growth of the cosines' errors on the way to a target, or to the result."""
+    """Return the growth of the cosines' errors up to a target or up to the result."""
     share = np.abs(v[:, 0]).max() / size
     steep = 1.0 + abs(t) / np.sqrt((1.0 - t) * (1.0 + t))
     across = max(np.sqrt((1.0 - phi) * (1.0 + phi)), 1e-6)
@@ -170,7 +170,7 @@ def aligned_to_targets(
 
     Args:
         gramians: [B, K, K].
-        rounding_residuals: As in `projected`.
+        rounding_residuals: The rounding residuals, as in `projected`.
         present: [B, K].
         order: [K, K].
         targets: [B, K, K], changed in place.

@@ -1,6 +1,6 @@
 """Minima over convex combinations of the gradients (MGDA, CAGrad).
 
-Weights w on the simplex are stored as x_k = w_k |g_k| / s, where s is the smallest norm. At any
+Weights w on the simplex are stored as x_k = w_k |g_k| / s, where s is the smallest norm. For any
 ratio of norms, the combination is then sum x_k e_k, which needs only the cosines. The constraint is
 sum_k r_k x_k = 1 with r_k = s / |g_k|. Up to a factor, both methods need the nearest point of a
 polyhedron {x: x.e_k >= level r_k}:
@@ -102,7 +102,7 @@ def _mgda_pair(cosine: float, r: Pairs, x: Pairs) -> None:
 
 @strict_section
 def _shortest(problem: Polyhedron, x: Pairs) -> float:
-    """Fill in x, and return its share that is not rounding noise. The heights are r."""
+    """Fill in x, and return the share of x that is not rounding noise. The heights are r."""
     exact, r = problem.rounding.exact, problem.heights
     if len(x) == 2 and exact is None and r[0, 0] > 0.0 and r[1, 0] > 0.0:
         _mgda_pair(problem.cosines[0, 1, 0], r, x)
@@ -190,7 +190,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
 
 @strict_device
 def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
-    """Return whether only the ridge bounds the multipliers, so that their sum is rounding noise."""
+    """Return True if only the ridge bounds the multipliers, so that their sum is rounding noise."""
     total = 0.0
     for k in range(len(search.r)):
         moved = problem.y[k, 0] - problem.centre[k, 0]
@@ -200,7 +200,7 @@ def _is_beyond_reach(problem: Polyhedron, search: Search) -> bool:
 
 @strict_device
 def _repeats(problem: Polyhedron, before: Flags) -> bool:
-    """Return whether the active constraints equal the last stored ones, and store them."""
+    """Return True if the active constraints equal the last stored ones, and store them."""
     same = True
     for k in range(before.size):
         same &= before[k] == problem.active[k]
@@ -212,8 +212,8 @@ def _repeats(problem: Polyhedron, before: Flags) -> bool:
 def _find_level(problem: Polyhedron, search: Search, level: Pair, ridge: float) -> Pair:
     """Return the level at which the nearest point is at distance rho, and fill in multipliers.
 
-    The distance is a convex, increasing function of the level. Its pieces are solved one after the
-    other. If a solution leaves the interval that contains the level, the interval is halved.
+    The distance is a convex, increasing function of the level. Its pieces are solved one after
+    another. If a solution leaves the interval that contains the level, the interval is halved.
     """
     exact, before = problem.rounding.exact, np.zeros(problem.active.size, np.bool_)
     low, high = _limits(search)
@@ -258,7 +258,7 @@ def _defined(problem: Polyhedron, search: Search) -> float:
     """Return the share of CAGrad's direction that is defined, and keep the multipliers.
 
     The direction is undefined if 0 is a convex combination of the gradients, so that no level above
-    0 can be reached, and if level 0 is within the distance. Then a whole set of directions is
+    0 can be reached, and if level 0 is within the distance. In this case many directions are
     equally good.
     """
     largest, rho = 0.0, search.rho[0][0]

@@ -26,7 +26,7 @@ class Case:
         head: [K, H] float64.
         pattern: [K, Q] float64.
         copies: R.
-        dtype: Type of the gradients. Head and pattern are rounded to it.
+        dtype: Type of the gradients. Head and pattern are rounded to this type.
         absent: Views that do not touch the block.
     """
 

@@ -134,8 +134,9 @@ def complementary(matrix: Matrix, offset: Sequence[Number]) -> Vector | None:
     """Return x >= 0 with s = M x + offset >= 0 and x.s = 0, the optimality conditions of a QP.
 
     The algorithm of Lawson and Hanson is used, and each result is checked. The most violated
-    constraint becomes active. If its column depends on the active columns, an active constraint
-    leaves first, so M may be singular. None is returned if there is no solution.
+    constraint becomes active. If the column of this constraint depends on the active columns, an
+    active constraint is removed first, so M may be singular. None is returned if there is no
+    solution.
     """
     mp = require_mpmath().mp
     x = [mp.mpf(0)] * len(matrix)

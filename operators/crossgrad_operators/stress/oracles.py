@@ -1,7 +1,7 @@
 """Reference implementations (oracles) of all methods in 50 digits, from their formulas.
 
 An oracle receives the exact Gramian of the views with a gradient, and returns their weights.
-Thresholds that are part of our definition of a method are part of its oracle: exact opposition up
+Thresholds that belong to our definition of a method also belong to its oracle: exact opposition up
 to 1 + cos = 1e-12, and the eigenvalue floor of Aligned-MTL.
 """
 
@@ -39,7 +39,8 @@ class Question:
         labels: [n] group labels.
         ratios: [n] camera distances divided by the reference distance.
         rng: A generator in the same state as the operator's generator.
-        memory: Values that the oracle stored in the last step. The oracle may change them.
+        memory: Values that the oracle stored in the last step. The oracle may change the stored
+            values.
     """
 
     gramian: Matrix
@@ -75,12 +76,12 @@ def cosines(gramian: Matrix) -> Matrix:
 
 
 def is_noise(cosine: Matrix, x: Sequence[Number]) -> bool:
-    """Return whether sum x_k e_k is only rounding noise of exactly opposite directions."""
+    """Return True if sum x_k e_k is only rounding noise of exactly opposite directions."""
     return cancels(form(cosine, x), max(abs(v) for v in x))
 
 
 def cancels(square: Number, largest: Number) -> bool:
-    """Return whether a sum counts as zero, from its square and its longest summand's length."""
+    """Return True if a sum counts as zero, from its square and its longest summand's length."""
     return bool(square <= 2 * number(OPPOSITE) * largest**2)
 
 
@@ -134,7 +135,7 @@ def partners_of(question: Question, *, shuffled: bool) -> list[list[int]]:
 
 
 class _Combination:
-    """A sum of v_k g_k that grows by one term at a time, and its products with all gradients.
+    """A sum of terms v_k g_k that grows term by term, and its products with all gradients.
 
     Args:
         gramian: [n][n].
@@ -229,7 +230,7 @@ def confgate(question: Question) -> Vector:
 
 
 def _believed(question: Question, pair: tuple[int, int], cosine: Number) -> bool:
-    """Return whether a pair has probably been conflicting, including this step's cosine."""
+    """Return True if a pair has probably been in conflict, including this step's cosine."""
     mp, options = require_mpmath().mp, question.options
     beta = number(options["beta"])
     tau = {"v2": 0.9, "low": 0.6}[options["variant"]] if options["tau"] is None else options["tau"]

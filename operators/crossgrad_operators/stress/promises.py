@@ -3,7 +3,7 @@
 Inside the set the relative error is at most `PROMISED` u kappa. u is the unit roundoff of the
 gradients' type, and kappa = max |w_k| |g_k| / |u|. Outside the set the result is finite, and its
 length is at most a stated factor times the longest gradient. A test checks that docs/operators.md
-contains the same words.
+contains the same texts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -67,7 +67,7 @@ class Facts:
 
     @property
     def kappa(self) -> float:
-        """The condition max |w_k| |g_k| / |u|, at least 1, or 0 if the exact result is zero."""
+        """The condition number max |w_k| |g_k| / |u|, at least 1; 0 if the exact result is zero."""
         if not self.weights.any():
             return 0.0
         return max(self.largest / self.length, 1.0) if self.length else float("inf")
@@ -102,9 +102,9 @@ class Facts:
 
     @property
     def partial(self) -> float:
-        """|w_1 g_1 + w_2 g_2| + ... + |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
+        """The sum of |w_1 g_1 + w_2 g_2|, ..., |u| and all |w_k g_k|, over max(|u|, max |w_k g_k|).
 
-        It bounds the rounding errors of all products and additions, in units of u kappa.
+        The value bounds the rounding errors of all products and additions, in units of u kappa.
         """
         # Scale by the largest term, because its square may overflow in float64.
         unit = self.largest or 1.0
@@ -133,24 +133,24 @@ def views_bound(facts: Facts) -> float:
 
 
 def everywhere(_facts: Facts) -> bool:
-    """Return True: the set contains every Gramian."""
+    """Return True, because the set contains every Gramian."""
     return True
 
 
 def determined(facts: Facts) -> bool:
-    """Return whether the result is zero, or kappa u is at most 0.1."""
+    """Return True if the result is zero, or if kappa u is at most 0.1."""
     return facts.kappa * facts.unit <= DETERMINED
 
 
 def clear(facts: Facts) -> bool:
-    """Return whether `determined` holds, and directions are dependent exactly or not nearly."""
+    """Return True if `determined` holds, and directions are dependent exactly or not nearly."""
     return determined(facts) and not _any_between(
         [*facts.sines, *facts.dependence], DEPENDENT, INDEPENDENT
     )
 
 
 def independent(facts: Facts) -> bool:
-    """Return whether `determined` holds, and more than two directions are not nearly dependent."""
+    """Return True if `determined` holds, and more than two directions are not nearly dependent."""
     several = len(facts.norms) > 2  # noqa: PLR2004
     return determined(facts) and not (
         several and _any_between(facts.dependence, DEPENDENT, REGULAR)
@@ -158,12 +158,12 @@ def independent(facts: Facts) -> bool:
 
 
 def comparable(facts: Facts) -> bool:
-    """Return whether `clear` holds, and norm ratios are at most 1e8 if zero is in the hull."""
+    """Return True if `clear` holds, and norm ratios are at most 1e8 if zero is in the hull."""
     return clear(facts) and (facts.ratio <= COMPARABLE or facts.distance >= APART)
 
 
 def hull_apart(facts: Facts) -> bool:
-    """Return whether zero is not near the hull of the directions."""
+    """Return True if zero is not near the hull of the directions."""
     return facts.distance >= APART
 
 
@@ -181,7 +181,7 @@ class Promise:
         factor: K -> bound of |u| / (longest gradient) outside the set.
         inside: Facts -> True if the Gramian belongs to the set.
         bound: Facts -> bound of the error inside the set, in units of u kappa.
-        continuous: Facts -> True if the method is continuous in the gradients there.
+        continuous: Facts -> True if the method is continuous in the gradients at these values.
     """
 
     words: str

@@ -1,4 +1,4 @@
-"""Runs one operator on one case and judges the result."""
+"""Run one operator on one case and judge the result."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ def judged(
     reference: Reference,
     views_of: Callable[[int, int], Views] = sample_views,
 ) -> tuple[Finding, list[float]]:
-    """Return the worst finding over an operator's steps, and their seconds (none if it failed).
+    """Return the worst finding over an operator's steps, and their seconds (none after a failure).
 
     Args:
         operator: The operator.

@@ -1,8 +1,8 @@
 """Oracles in 50 digits that solve small optimization problems.
 
 The operators use active sets in float64, on cosines that a ridge makes definite. The oracles use
-exact active sets. Every answer is checked against the optimality conditions, which have only one
-solution, so the answer is the minimum. If the gradients are linearly dependent, the weights are not
+exact active sets. Every result is checked against the optimality conditions; they have only one
+solution, so the result is the minimum. If the gradients are linearly dependent, the weights are not
 unique, and the weights of independent gradients are returned.
 """
 
@@ -163,7 +163,7 @@ def _rough_bargain(cosine: Matrix) -> Vector:
 
 
 def _is_hopeless(cosine: Matrix, beta: Vector) -> bool:
-    """Return whether the convex combination beta / sum beta proves that the result is zero.
+    """Return True if the convex combination beta / sum beta proves that the result is zero.
 
     x is this combination and u the sum of the bargain, with |u|^2 = K. Then sum x_k / beta_k =
     sum x_k e_k.u is at most |sum x_k e_k| sqrt K, and so is the inverse of the largest beta.
@@ -194,7 +194,7 @@ def aligned(question: Question) -> Vector:
 
 
 def _vanishes(cosine: Matrix, x: Vector) -> bool:
-    """Return whether a combination is zero. Two directions may also count as opposite."""
+    """Return True if a combination is zero. Two directions may also count as opposite."""
     largest = max(abs(v) for v in x)
     exactly = form(cosine, x) <= number(VANISHED) * largest**2
     return exactly or (len(x) == 2 and is_noise(cosine, x))  # noqa: PLR2004
@@ -242,8 +242,8 @@ def mgda(question: Question) -> Vector:
 def shortest(cosine: Matrix, r: Sequence[Number]) -> Vector:
     """Return coefficients x >= 0 with r.x = 1 of the shortest sum x_k e_k.
 
-    Up to a factor, they minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a solution even if
-    0 is a convex combination.
+    Up to a factor, these coefficients minimize |sum x_k e_k|^2 + (r.x - 1)^2. This problem has a
+    solution even if 0 is a convex combination.
     """
     size = range(len(r))
     matrix = [[cosine[i][j] + r[i] * r[j] for j in size] for i in size]

@@ -82,7 +82,7 @@ def permutation(operator: Operator) -> float | None:
 
 
 def one_view(operator: Operator) -> float | None:
-    """Return the change of a single view at the reference distance, which should stay as it is."""
+    """Return the change of a single view at the reference distance; the view should not change."""
     if not operator.views.admits(1):
         return None
     case = _rows(1)
@@ -142,7 +142,7 @@ LAWS: tuple[Law, ...] = (homogeneity, permutation, one_view, size, block_indepen
 
 
 def run_law(name: str, operator: Operator, law: Law) -> Cell:
-    """Return the finding of one law for one operator."""
+    """Return the finding about one law for one operator."""
     return Cell(name, law.__name__.replace("_", " "), _judged(operator, law))
 
 
@@ -180,7 +180,7 @@ class Subject:
     Attributes:
         name: Name of the operator.
         operator: The operator.
-        reference: Its 50-digit oracle or its rule for elements, if it has one.
+        reference: The operator's 50-digit oracle or its rule for elements, if there is one.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""`crossgrad plugins check`: the report on a package's plugins."""
+"""`crossgrad plugins check`: the report about a package's plugins."""
 
 from collections.abc import Sequence
 from textwrap import fill
@@ -60,7 +60,7 @@ def entries_of(package: str) -> list[Entry]:
     """Return the plugins of a package by slot and name.
 
     Raises:
-        UserError: See `check_package`.
+        UserError: For the reasons of `check_package`.
     """
     offered = [entry for slot in OFFERED for entry in offers(slot)]
     found = [entry for entry in offered if package in _names_of(entry)]

@@ -1,4 +1,4 @@
-"""The description of a plugin: docstring, options, bounds, origin. Imports the plugin."""
+"""The description of a plugin: docstring, options, bounds, origin. The plugin is imported."""
 
 import inspect
 import json
@@ -72,7 +72,7 @@ def _described_command(entry: Entry) -> str:
 
 
 def _prose(docstring: str) -> str:
-    """Wrap a docstring; leave out sections for readers of the code."""
+    """Wrap a docstring without the sections for readers of the code."""
     blocks = [block for block in docstring.split("\n\n") if not block.startswith(_SECTIONS)]
     return "\n\n".join(_filled(block) for block in blocks)
 
@@ -118,7 +118,7 @@ def _option(name: str, field: FieldInfo) -> str:
 
 
 def _value(default: object) -> str:
-    """Format a value as it is written after `--set KEY=`."""
+    """Format a value as users write it after `--set KEY=`."""
     return default if isinstance(default, str) else json.dumps(default, default=str)
 
 

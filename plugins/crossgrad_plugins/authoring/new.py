@@ -82,7 +82,7 @@ def write_package(name: str, slot: str, folder: Path) -> tuple[Path, ...]:
     Args:
         name: Name of the plugin and of the package.
         slot: The slot, one of `OFFERED`.
-        folder: Output folder; created here.
+        folder: Output folder; it is created here.
 
     Returns:
         The files.

@@ -82,7 +82,7 @@ class Matrix(pytest.Collector):
 
 
 class Combination(pytest.Item):
-    """A test of one combination: trained, or skipped with the reasons for its refusal."""
+    """A test of one combination; a refused combination is skipped with the reasons."""
 
     def __init__(
         self,

@@ -52,12 +52,12 @@ _MOST_SHOWN: Final = 3
 
 
 def differing_code(arms: Mapping[str, Runs]) -> list[str]:
-    """Return a note if arms, or the two runs of a pair, come from different code; else no note.
+    """Return a note if arms, or the two runs of a pair, come from different code; otherwise None.
 
     A run without a recorded commit or version is ignored.
 
     Args:
-        arms: Arm -> scene and seed -> the run that represents them.
+        arms: Arm -> scene and seed -> the run that represents both.
     """
     used = {arm: _all_code(runs) for arm, runs in arms.items()}
     groups: dict[str, list[str]] = {}
@@ -139,7 +139,7 @@ def page_of(
         figures: All figures that could be drawn, in order.
         pictured: The views that are shown with pictures.
         views: Scene -> all held-out views, the worst first.
-        notes: Which results are not compared or shown, and why.
+        notes: Results that are not compared or shown, with the reason.
         version: Version of crossgrad.
     """
     from jinja2 import Environment, StrictUndefined
@@ -258,7 +258,7 @@ def compare(
         places: Folders of runs, or folders with runs below.
         options: How to compare.
         out: Output folder; by default `compare` next to the runs.
-        skip_broken: Leave out runs with damaged files.
+        skip_broken: True to leave out runs with damaged files.
 
     Raises:
         UserError: No run can be compared, the runs are not comparable, or the folder is in use.

@@ -43,11 +43,11 @@ class Arm:
 def arms_of(runs: Sequence[Run], failed: Sequence[Run] = ()) -> tuple[Arm, ...]:
     """Group runs into arms; return the arms in the order of their names.
 
-    An arm holds the runs that agree in every setting that varies within a scene. A setting that
-    differs only between scenes, such as a degree that the data of a scene cannot support, does
-    not separate arms. If every run has a label of a sweep, the runs of one label form an arm. If
-    a label covers several configurations on one scene, as after two sweeps, the settings of the
-    runs separate them.
+    An arm contains the runs that agree in every setting that varies within a scene. A setting that
+    differs only between scenes, such as a degree that the data of a scene cannot support, does not
+    separate arms. If every run has a label of a sweep, the runs of one label form an arm. If a
+    label covers several configurations on one scene, for instance after two sweeps, the settings of
+    the runs separate them.
 
     Args:
         runs: The finished runs; at least one.
@@ -104,14 +104,14 @@ def _by_settings(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
 
 
 def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
-    """Rename arms as the user asks.
+    """Rename arms as the user requests.
 
     Args:
         arms: The arms.
         names: `OLD:NEW` texts.
 
     Raises:
-        UserError: A text names no existing arm, or two arms would have one name.
+        UserError: A text names no existing arm, or two arms would have the same name.
     """
     new = {arm.name: arm.name for arm in arms}
     for text in names:
@@ -139,8 +139,9 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
 def _varying(runs: Iterable[Run]) -> tuple[str, ...]:
     """Return the settings with several values within a scene, the most important settings first.
 
-    A setting that only some runs have does not count. Either it is an option of a component that
-    the other runs do not use, so that the component itself differs, or it is from another version.
+    A setting that only some runs have is ignored. Such a setting is either an option of a component
+    that the other runs do not use, so that the component itself differs, or belongs to another
+    version.
     """
     seen: dict[tuple[str, str], set[str]] = {}
     for run in runs:
@@ -158,7 +159,7 @@ def _values(settings: Settings, keys: Sequence[str]) -> tuple[str, ...]:
 def _names(
     groups: Mapping[tuple[str, ...], Sequence[Run]], keys: Sequence[str]
 ) -> dict[tuple[str, ...], str]:
-    """Name each group by the fewest settings, taken in order, that tell all groups apart."""
+    """Name each group by the fewest settings, taken in order, that distinguish all groups."""
     if len(groups) == 1:
         return {key: _of_one(runs[0]) for key, runs in groups.items()}
     chosen: list[int] = []
@@ -183,7 +184,7 @@ def _part(key: str, value: str) -> str:
 
 
 def _of_one(run: Run) -> str:
-    """Return the name of the only arm: its backbone, sampler, operator and views per step."""
+    """Return the name of a single arm: its backbone, sampler, operator and views per step."""
     named = [run.settings.get(key, "") for key in ("backbone", "sampler", "operator")]
     return ", ".join([*filter(None, named), f"views={run.settings.get('views_per_step', '?')}"])
 
@@ -243,7 +244,7 @@ class Cells:
         The run has the length that is most frequent on its scene; of two equally frequent lengths,
         the longer one is used. An arm uses another length if it has more than twice as many runs of
         that length there. An arm without a run of the most frequent length uses its own lengths;
-        for each scene and seed, the longest run.
+        the longest run represents each scene and seed.
         """
         chosen = self._chosen()
         return {
@@ -257,7 +258,7 @@ class Cells:
 
     @property
     def unlike(self) -> dict[str, str]:
-        """Name of a run -> why it is not used, although its arm has no other run in its place."""
+        """Name of a run -> why it is not used, although no other run of its arm replaces it."""
         chosen = self._chosen()
         return {
             run.name: f"has {run.length_text}, other runs of {arm} on {scene} {text_of(length)}"

@@ -1,4 +1,4 @@
-"""Checks of runs that are compared: their scenes, metrics and machines must agree."""
+"""Checks of runs before a comparison: their scenes, metrics and machines must agree."""
 
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -37,11 +37,11 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     """Refuse runs of one scene that differ in split, photos, sizes or resize filter.
 
     Returns:
-        Notes on two limits: runs whose photos cannot be compared, and scenes whose regimes
-        differ, so that only overall figures are compared.
+        Notes about two limits: runs whose photos cannot be compared, and scenes whose regimes
+            differ, so that only overall metrics are compared.
 
     Raises:
-        UserError: The figures of these runs are not comparable; the message gives the reason.
+        UserError: The metrics of these runs are not comparable; the message states the reason.
     """
     for scene in dict.fromkeys(run.scene for run in runs):
         own = [run for run in runs if run.scene == scene]
@@ -150,7 +150,7 @@ def _mark(file: object) -> object:
 
 
 def _sizes(run: Run) -> str:
-    """Return photo sizes and resize filter from a run's notes; empty if it has no such note."""
+    """Return photo sizes and resize filter from a run's notes; empty without such a note."""
     for note in run.summary.get("notes") or ():
         if found := _SIZES.match(str(note)):
             return f"{found['sizes']}, {found['how']}"
@@ -169,16 +169,16 @@ def _difference(first: frozenset[str], second: frozenset[str]) -> str:
 def quantities_of(
     runs: Sequence[Run], name: str, margin: float | None
 ) -> tuple[tuple[Quantity, ...], list[str]]:
-    """Return the figures that can be compared, the main one first, and notes on the rest.
+    """Return the metrics that can be compared, the main metric first, and notes about all others.
 
     Args:
         runs: The runs.
-        name: Name of the main figure.
-        margin: Margin of the main figure; None for the default margin.
+        name: Name of the main metric.
+        margin: Margin of the main metric; None for the default margin.
 
     Raises:
-        UserError: No run has the main figure, or the runs differ in its definition or in the
-            rules by which renders are compared.
+        UserError: No run has the main metric, or the runs differ in its definition or in the rules
+            by which renders are compared.
     """
     offered = dict.fromkeys(key for run in runs for key in _overall(run) if key != "views")
     measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
@@ -233,7 +233,7 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
 
 
 def _definitions(runs: Sequence[Run], key: str) -> dict[str, str]:
-    """Return definition -> the first run that states it; runs that state none are ignored."""
+    """Return definition -> the first run that states it; runs without a definition are ignored."""
     found: dict[str, str] = {}
     for run in runs:
         text = (run.summary.get("definitions") or {}).get(key)
@@ -247,14 +247,14 @@ def _overall(run: Run) -> dict[str, Any]:
 
 
 def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cost, ...], list[str]]:
-    """Return the costs that can be compared, and notes on the costs that cannot.
+    """Return the costs that can be compared, and notes about the costs that cannot.
 
     Args:
         runs: The runs.
-        clock: Which seconds to compare. `auto` uses every clock whose seconds are comparable.
+        clock: The seconds to compare. `auto` uses every clock whose seconds are comparable.
 
     Raises:
-        UserError: The requested seconds are not comparable; the message gives the reason.
+        UserError: The requested seconds are not comparable; the message states the reason.
     """
     reasons = {SECONDS: _why_no_wall(runs), CPU_SECONDS: _why_no_cpu(runs)}
     wanted = {ClockChoice.WALL: SECONDS, ClockChoice.CPU: CPU_SECONDS}.get(clock)
@@ -307,7 +307,7 @@ def _other_machine(runs: Sequence[Run], fields: dict[str, str]) -> str:
 
 
 def _other_speed(runs: Sequence[Run], name: str) -> str:
-    """Return how the calibrated speed of the machine differs between runs; empty if it does not."""
+    """Return how the calibrated speed of the machine differs between runs; empty if it is equal."""
     known = [(run.number("environment", "calibration", name), run) for run in runs]
     rates = [(rate, run) for rate, run in known if rate is not None]
     if len(rates) < len(runs):
@@ -337,9 +337,9 @@ def _busy(runs: Sequence[Run]) -> str:
 
 
 def _threads(runs: Sequence[Run]) -> str:
-    """Return why threads make CPU seconds incomparable; empty if they do not.
+    """Return the reason why threads make CPU seconds incomparable; empty without such a reason.
 
-    Threads that wait spin: they use CPU seconds without doing work.
+    Waiting threads spin: they use CPU seconds without doing any work.
     """
     for run in runs:
         threads = run.number("environment", "torch_threads")

@@ -35,13 +35,14 @@ class Comparison:
 
     Attributes:
         arms: The arms in the order of their names.
-        baseline: The arm that all other arms are compared with; None for all with all.
-        quantities: The figures that are compared, the main figure first.
+        baseline: The arm that all other arms are compared with; None compares all arms with each
+            other.
+        quantities: The metrics that are compared, the main metric first.
         costs: The costs that can be compared.
         cells: All runs by arm, scene, seed and length.
         unlike: Scenes whose runs assign different regimes to the same held-out views.
         target: The quality to reach; None for the final quality of the weakest arm, by scene.
-        checked: Notes of the checks on what is not compared, and why.
+        checked: Notes of the checks about results that are not compared, with the reasons.
         unused: Folder of an unfinished or unreadable run -> why it is left out.
     """
 
@@ -109,7 +110,7 @@ class Comparison:
 
     @cached_property
     def others(self) -> tuple[Contrast, ...]:
-        """The contrasts of the main pairs of arms, for all figures except the main one."""
+        """The contrasts of the main pairs of arms, for all metrics except the main metric."""
         return pairwise.judged(
             self._at_end(couple, quantity)
             for quantity in self.quantities[1:]
@@ -212,7 +213,8 @@ def compared(found: RunRecord, options: Options) -> Comparison:
     """Check runs and compare them.
 
     Raises:
-        UserError: No run has finished, or the runs are not comparable; the message says why.
+        UserError: No run has finished, or the runs are not comparable; the message states the
+            reason.
     """
     if not found.runs:
         raise UserError(

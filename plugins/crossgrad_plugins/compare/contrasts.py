@@ -45,9 +45,9 @@ class Contrast:
         first: Name of the first arm.
         second: Name of the second arm.
         where: The point or the views of the comparison, such as `at the end` or a regime.
-        quantity: The figure that is compared.
+        quantity: The metric that is compared.
         pairs: The pairs of runs.
-        estimate: The first minus the second; None without a pair.
+        estimate: The value of the first arm minus the value of the second arm; None without a pair.
         verdict: The verdict, which takes the other contrasts of its table into account.
         inside: True if runs were read before their ends, while their schedules continued.
     """
@@ -74,12 +74,12 @@ class Contrast:
 
     @property
     def is_small(self) -> bool:
-        """True if the 90 % interval is inside the margin, whatever the verdict is."""
+        """True if the 90 % interval is inside the margin, for any verdict."""
         return self.estimate is not None and self.estimate.is_small
 
     @property
     def differs(self) -> bool:
-        """True if the 95 % interval excludes zero, whatever else is compared."""
+        """True if the 95 % interval excludes zero, without regard to other comparisons."""
         return self.estimate is not None and self.estimate.differs
 
     @property
@@ -112,7 +112,7 @@ def contrast(
 
 
 def judged(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
-    """Return the contrasts of one table with verdicts, without the contrasts that have no pair."""
+    """Return the contrasts of one table with verdicts; contrasts without a pair are left out."""
     family = [each for each in contrasts if each.estimate is not None]
     found = verdicts([each.estimate for each in family if each.estimate is not None])
     return tuple(replace(c, verdict=verdict) for c, verdict in zip(family, found, strict=True))

@@ -21,8 +21,8 @@ class Point:
         scene: The scene.
         length: Budget of the runs as text.
         spent: Cost -> mean amount that the runs spent.
-        mean: Mean of the final figure.
-        spread: Standard deviation of the final figure over seeds; NaN for one run.
+        mean: Mean of the final metric.
+        spread: Standard deviation of the final metric over seeds; NaN for one run.
         seeds: Number of runs.
     """
 

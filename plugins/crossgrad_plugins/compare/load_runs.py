@@ -72,10 +72,10 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
 
     Args:
         places: Folders of runs, or folders with runs below.
-        skip_broken: Leave out a run with a damaged file instead of raising an error.
+        skip_broken: True to leave out a run with a damaged file instead of raising an error.
 
     Raises:
-        UserError: A place holds no run, or a file of a run is damaged.
+        UserError: A folder contains no run, or a file of a run is damaged.
     """
     found = RunRecord()
     folders = list(dict.fromkeys(folder for place in places for folder in _folders(place)))
@@ -103,10 +103,10 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
 
 
 def check_places(places: Sequence[Path]) -> None:
-    """Refuse places that are not folders, before the output folder is checked.
+    """Refuse paths that are not folders, before the output folder is checked.
 
     Raises:
-        UserError: A place is a file, or does not exist.
+        UserError: A path is a file, or does not exist.
     """
     for place in places:
         if not place.is_dir():
@@ -132,7 +132,7 @@ def _no_run(place: Path) -> UserError:
 
 
 def _headless(place: Path) -> Iterator[Path]:
-    """Yield folders in or below a place that hold results of a run but not its config.yaml."""
+    """Yield folders in or below a folder that contain results of a run but not its config.yaml."""
     for path in sorted(place.rglob("summary.json")):
         folder = path.parent
         if (folder / "metrics.csv").exists() and not (folder / "config.yaml").exists():
@@ -168,11 +168,11 @@ def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | No
 
 
 def _check_whole(results: "RunResults") -> None:
-    """Refuse a finished run with a truncated or missing file, because its figures would be wrong.
+    """Refuse a finished run with a truncated or missing file, because its metrics would be wrong.
 
     Raises:
-        UserError: metrics.csv ends before the run did or has a number that is too large, held-out
-            views have no figures, or scene.json cannot be read.
+        UserError: metrics.csv ends before the end of the run or contains a number that is too
+            large, held-out views have no metrics, or scene.json cannot be read.
     """
     views = (results.scene_marks or {}).get("views") or {}  # Raises if scene.json is malformed.
     if not all(isinstance(view, Mapping) for view in views.values()):
@@ -282,13 +282,13 @@ def _labels(folder: Path) -> dict[str, tuple[str, ...]]:
 
 
 def without_length(label: str) -> str:
-    """Remove the length, and the name of the only arm of a grid, from a label."""
+    """Remove the length, and the name of a grid's single arm, from a label."""
     parts = [part for part in label.split(", ") if not part.startswith(_LENGTHS)]
     named = parts[1:] if parts[:1] == [_ONLY] else parts
     return ", ".join(named or parts)
 
 
 def _short_names(folders: Sequence[Path]) -> dict[Path, str]:
-    """Return each folder's path relative to the last folder that all of them share."""
+    """Return each folder's path relative to the innermost folder that contains all of them."""
     shared = os.path.commonpath([folder.parent for folder in folders])
     return {folder: folder.relative_to(shared).as_posix() for folder in folders}

@@ -71,7 +71,7 @@ def opposed_text(contrast: Contrast) -> str:
 
 
 def where_text(contrast: Contrast) -> str:
-    """Return the place of a contrast; a star marks runs that were read before their ends."""
+    """Return the place of a contrast; a star marks runs that were compared before their ends."""
     title = _TITLES.get(contrast.where)
     text = contrast.where if title is None else f"equal {title}"
     return f"{text} *" if contrast.inside else text
@@ -84,7 +84,7 @@ def verdict_text(contrast: Contrast) -> str:
 
 
 def support(contrast: Contrast) -> str:
-    """Return the evidence for the statement: interval, pairs, scenes."""
+    """Return the evidence for the statement: interval, pairs and scenes."""
     found = contrast.estimate
     if found is None:
         return ""
@@ -208,7 +208,7 @@ def _against(contrasts: Sequence[Contrast]) -> str:
 
 
 def _named(texts: Iterable[str], separator: str = ", ") -> str:
-    """Return the first texts, and how many more there are."""
+    """Return the first texts, and the number of further texts."""
     every = list(texts)
     more = len(every) - _MOST_NAMED
     shown = separator.join(every[:_MOST_NAMED])

@@ -55,7 +55,7 @@ def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
 
 
 def is_comparison(folder: Path) -> bool:
-    """Return True if compare wrote this folder."""
+    """Return True if `crossgrad compare` wrote this folder."""
     page = folder / PAGE
     if not page.is_file():
         return False

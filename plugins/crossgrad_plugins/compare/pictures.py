@@ -28,8 +28,8 @@ class Picture:
 
     Attributes:
         arm: The arm that rendered the picture; `photo` for the photo.
-        figure: The main figure of the view as text; empty for the photo.
-        render: The picture as data for the `src` of an image.
+        figure: The main metric of the view as text; empty for the photo.
+        render: The picture as data for the `src` attribute of an image.
         error: The error picture, in the same form; empty for the photo.
     """
 
@@ -44,11 +44,11 @@ class WorstView:
     """A held-out view.
 
     Attributes:
-        scene: Name of its scene.
+        scene: Name of the scene.
         name: Name of the view.
         regime: Regime of the view.
-        mean: The main figure, averaged over arms and seeds.
-        by_arm: Arm -> the main figure, averaged over seeds.
+        mean: The main metric, averaged over arms and seeds.
+        by_arm: Arm -> the main metric, averaged over seeds.
         pictures: The photo and the renders of the arms with one seed; empty without pictures.
     """
 
@@ -86,10 +86,10 @@ def _view(scene: str, name: str, regime: str, values: Mapping[str, Sequence[floa
 def with_pictures(
     comparison: Comparison, views: Mapping[str, Sequence[WorstView]]
 ) -> tuple[list[WorstView], list[str]]:
-    """Return the worst views of each scene with pictures, and notes on unreadable pictures.
+    """Return the worst views of each scene with pictures, and notes about unreadable pictures.
 
-    A view is included only if all shown runs kept its pictures. Pictures are made smaller until all
-    of them fit into the page.
+    A view is included only if all shown runs stored its pictures. Pictures are made smaller until
+    all of them fit into the page.
     """
     shown: list[tuple[WorstView, list[tuple[str, Run]]]] = []
     share = min(MOST_OF_A_SCENE, max(1, MOST_VIEWS // max(1, len(views))))

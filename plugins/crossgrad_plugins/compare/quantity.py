@@ -1,4 +1,4 @@
-"""The figure that is compared, its unit and margin, and the cost that it is compared at."""
+"""The metric that is compared, its unit and margin, and the cost at which it is compared."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,7 +9,7 @@ _WHOLE: Final = 10.0
 
 
 class _Kind(NamedTuple):
-    """A kind of figure, recognised by the start of its name; `margin` counts as no difference."""
+    """A kind of metric, recognised by the start of its name; `margin` counts as no difference."""
 
     unit: str
     decimals: int
@@ -26,12 +26,12 @@ _OTHER: Final = _Kind("", 4, 0.005)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure of held-out views.
+    """A metric of held-out views.
 
     Attributes:
         name: Name in the results, such as `psnr`.
         label: Name in texts and figures.
-        unit: Unit of the figure; empty if it has no unit.
+        unit: Unit of the metric; empty if it has no unit.
         decimals: Number of decimals shown.
         margin: Largest difference that counts as no difference.
         falls: True if lower values are better.
@@ -46,10 +46,10 @@ class Quantity:
 
     @classmethod
     def of(cls, name: str, margin: float | None = None, *, falls: bool = False) -> "Quantity":
-        """Return the figure with the given name, with its default margin unless another is given.
+        """Return the metric with the given name, with its default margin unless another is given.
 
         Args:
-            name: Name of the figure.
+            name: Name of the metric.
             margin: Largest difference that counts as no difference; None for the default.
             falls: True if lower values are better; always true for LPIPS.
         """

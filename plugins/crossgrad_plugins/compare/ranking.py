@@ -12,11 +12,11 @@ from crossgrad_plugins.compare.quantity import Quantity
 
 @dataclass(frozen=True)
 class Standing:
-    """An arm's figure at the end of its runs on one scene.
+    """The metric of an arm at the end of its runs on one scene.
 
     Attributes:
-        seeds: Number of runs that have the figure.
-        mean: Mean of the figure.
+        seeds: Number of runs that have the metric.
+        mean: Mean of the metric.
         spread: Standard deviation over seeds; NaN for one run.
     """
 
@@ -28,7 +28,7 @@ class Standing:
 def standings(
     runs: Mapping[str, Runs], quantity: Quantity, regime: str | None = None
 ) -> dict[str, dict[str, Standing]]:
-    """Return arm -> scene -> its figure; a scene is absent if no run has the figure there."""
+    """Return arm -> scene -> its metric; a scene is absent if no run has the metric there."""
     found: dict[str, dict[str, Standing]] = {}
     for arm, by in runs.items():
         own: dict[str, list[float]] = {}
@@ -48,8 +48,8 @@ def _standing(values: Sequence[float]) -> Standing:
 def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
     """Return arm -> its mean difference from the mean of all arms, averaged over its scenes.
 
-    The difference is taken per scene, so an arm gains nothing by skipping a hard scene. NaN
-    without a figure.
+    The difference is taken per scene, so an arm gains nothing by omitting a hard scene. The result
+    is NaN without a metric.
     """
     scenes = dict.fromkeys(scene for by in standing.values() for scene in by)
     level = {
@@ -63,7 +63,7 @@ def scores(standing: Mapping[str, Mapping[str, Standing]]) -> dict[str, float]:
 
 
 def ranked(standing: Mapping[str, Mapping[str, Standing]], quantity: Quantity) -> tuple[str, ...]:
-    """Return the arms from the best to the worst; arms without a figure come last."""
+    """Return the arms from the best to the worst; arms without a metric are last."""
     score = scores(standing)
     sign = 1.0 if quantity.falls else -1.0
     return tuple(sorted(score, key=lambda arm: (np.isnan(score[arm]), sign * score[arm])))

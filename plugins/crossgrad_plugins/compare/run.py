@@ -37,11 +37,11 @@ class Run:
     """A run that has ended.
 
     Attributes:
-        name: Its folder as it is shown.
-        results: Its results.
-        summary: Content of its summary.json.
-        config: Its configuration in the format of this version.
-        label: Label of its configuration in a sweep; None without a sweep.
+        name: The folder of the run, as it is shown.
+        results: The results of the run.
+        summary: Content of the run's summary.json.
+        config: The configuration in the format of this version.
+        label: Label of the configuration in a sweep; None without a sweep.
     """
 
     name: str
@@ -52,32 +52,32 @@ class Run:
 
     @property
     def scene(self) -> str:
-        """Name of its scene."""
+        """The name of the run's scene."""
         return str(self.summary.get("scene") or "scene")
 
     @property
     def seed(self) -> int:
-        """Its seed."""
+        """The seed of the run."""
         return int(self.config.get("seed") or 0)
 
     @property
     def status(self) -> str:
-        """Its status: finished, stopped or failed."""
+        """The status of the run: finished, stopped or failed."""
         return str(self.summary.get("status"))
 
     @property
     def environment(self) -> Mapping[str, Any]:
-        """Its machine and code, from summary.json."""
+        """The machine and the code of the run, from summary.json."""
         return self.summary.get("environment") or {}
 
     @cached_property
     def settings(self) -> Settings:
-        """Its configuration as flat settings, without settings that do not separate arms."""
+        """The configuration as flat settings, without settings that do not separate arms."""
         return settings_of(self.config)
 
     @cached_property
     def length(self) -> tuple[str, float]:
-        """The unit and the amount of its budget."""
+        """The unit and the amount of the run's budget."""
         if seconds := self.config.get("planned_seconds"):
             return ("s CPU" if self.config.get("clock") == "cpu" else "s"), float(seconds)
         views = self.config.get("max_views")
@@ -87,11 +87,11 @@ class Run:
 
     @property
     def length_text(self) -> str:
-        """Its budget as text, such as `70 s`."""
+        """The budget of the run as text, such as `70 s`."""
         return text_of(self.length)
 
     def final(self, name: str, regime: str | None = None) -> float | None:
-        """Return the final figure, overall or of a regime; None if it is missing or not finite."""
+        """Return the final metric, overall or of a regime; None if it is missing or not finite."""
         value = self.results.figure(name, regime)
         return value if value is not None and isfinite(value) else None
 
@@ -108,7 +108,7 @@ class Run:
         return float(value) if isinstance(value, int | float) and isfinite(value) else None
 
     def number(self, *names: str) -> float | None:
-        """Return a number of summary.json by its path of keys; None if there is no such number."""
+        """Return a number of summary.json by its path of keys; None if it does not exist."""
         value: Any = self.summary
         for name in names:
             value = value.get(name) if isinstance(value, Mapping) else None
@@ -124,9 +124,9 @@ def text_of(length: tuple[str, float]) -> str:
 def settings_of(config: Mapping[str, Any]) -> Settings:
     """Return setting -> value, for the settings that can separate arms.
 
-    A setting that is null is not set, and its value is `-`. A component becomes `backbone`, and its
-    options become `backbone.sh_degree`. A chain of operators becomes `operator` with the names
-    joined by `+`, and its options become `operator.1.c`.
+    A setting that is null counts as not set, and its value is `-`. A component becomes `backbone`,
+    and its options become `backbone.sh_degree`. A chain of operators becomes `operator` with the
+    names joined by `+`, and its options become `operator.1.c`.
     """
     return {
         name: _text(value)

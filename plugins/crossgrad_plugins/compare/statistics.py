@@ -28,7 +28,7 @@ UNCORRECTED: Final = 5
 def iqm(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the interquartile mean along the last axis.
 
-    A value on the border of the middle half counts with the share that is inside. For two values
+    A value at the border of the middle half counts with the share that is inside. For two values
     the result is their mean; for three, the middle value has a weight of 2/3.
     (`scipy.stats.trim_mean` only removes whole values.)
 
@@ -99,10 +99,10 @@ class Bootstrap:
         return self._tail(1.0 - _share(self.draws, border), border - float(np.median(self.draws)))
 
     def _tail(self, share: float, distance: float) -> float:
-        """Return the p-value for a share of the draws, consistent with the expanded intervals.
+        """Return the p-value for a share of the draws, consistent with the widened intervals.
 
-        If a border is beyond all draws, its distance from their median in standard deviations is
-        used instead. Otherwise the number of draws would limit the p-value.
+        If a border is beyond all draws, its distance from the median of the draws in standard
+        deviations is used instead. Otherwise the number of draws would limit the p-value.
         """
         from scipy.special import ndtri, stdtr
 
@@ -169,9 +169,9 @@ class Estimate:
         p_equivalent: p-value of a difference of at least the margin (two one-sided tests).
         p_above: p-value of a difference of at least the margin upwards (a one-sided test).
         needed: Number of pairs that would make the 90 % interval as narrow as the margin, if it
-            narrows as usual; None if this cannot be estimated.
+            narrows as expected; None if this cannot be estimated.
         by_scene: The estimate of each scene; empty if all pairs are from one scene. The
-            interquartile mean can hide a scene that differs from the rest.
+            interquartile mean can hide a scene that differs from the other scenes.
     """
 
     pairs: int
@@ -261,7 +261,7 @@ def student(values: NDArray[np.float64]) -> Law:
 
 
 def pairs_needed(deviation: float, margin: float) -> int | None:
-    """Return the number of pairs that makes the 90 % interval of a mean fit into the margins.
+    """Return the number of pairs with which the 90 % interval of a mean fits into the margins.
 
     Args:
         deviation: Standard deviation of the pairs' differences.
@@ -330,7 +330,7 @@ def corrected(values: Sequence[float]) -> list[float]:
 def holm(values: Sequence[float]) -> list[float]:
     """Return p-values adjusted by Holm's method (Scandinavian Journal of Statistics 6, 1979).
 
-    NaN is the p-value of a test that was not made: it stays NaN and is not counted.
+    NaN is the p-value of a test that was not made: it is returned unchanged and not counted.
     """
     known = sorted((value, index) for index, value in enumerate(values) if not isnan(value))
     adjusted, largest = list(values), 0.0
@@ -343,8 +343,8 @@ def holm(values: Sequence[float]) -> list[float]:
 def opposed(found: Estimate, verdict: Verdict, margin: float) -> tuple[SceneEstimate, ...]:
     """Return the scenes whose own 95 % intervals contradict the verdict on all scenes.
 
-    A scene contradicts a difference if it differs in the other direction, and equivalence if it is
-    beyond the margin.
+    A scene contradicts a difference if it differs in the other direction; it contradicts
+    equivalence if it is beyond the margin.
     """
     if verdict is Verdict.INCONCLUSIVE:
         return ()

@@ -28,7 +28,8 @@ class Reached:
         scene: The scene.
         target: The quality.
         arm: The arm.
-        amounts: Seed -> amount spent until then; infinite if the run failed or never got there.
+        amounts: Seed -> amount spent until the quality was reached; infinite if the run failed or
+            never reached it.
     """
 
     cost: Cost
@@ -56,7 +57,7 @@ def targets_of(
     """Return scene -> the quality to reach: the given one, or the median end of the weakest arm.
 
     With an even number of runs, the worse of the two middle runs counts. More than half of the runs
-    reach its final quality, so the median of their costs is finite.
+    reach this quality, so the median of their costs is finite.
     """
     finals: dict[str, dict[str, list[float]]] = {}
     for arm, by in runs.items():
@@ -100,7 +101,7 @@ def reached(
 def ratios(rows: Sequence[Reached]) -> dict[str, list[float]]:
     """Return arm -> its cost on each problem, divided by the smallest cost of all arms.
 
-    A problem is a scene with a seed that every arm was run on. A run that never reaches the quality
+    A problem is a scene and a seed with a run of every arm. A run that never reaches the quality
     has an infinite ratio and stays in the denominator. The same applies to all runs of a problem
     that no arm solves.
     """
@@ -124,7 +125,7 @@ def _ratio(amount: float, least: float) -> float:
 
 
 def value_at(run: Run, quantity: Quantity, cost: Cost, amount: float) -> float | None:
-    """Return the figure at a cost, interpolated between two evaluations.
+    """Return the metric at a cost, interpolated between two evaluations.
 
     Returns:
         The value; None before the first evaluation, and after the end.
@@ -149,7 +150,7 @@ def is_inside(run: Run, quantity: Quantity, cost: Cost, amount: float) -> bool:
 
 
 def cost_to(run: Run, quantity: Quantity, cost: Cost, target: float) -> float:
-    """Return the cost at which a figure first reached the target; infinite if it never did."""
+    """Return the cost at which a metric first reached the target; infinite if it never did."""
     x, y = run.series(quantity.name, cost)
     reached = y <= target if quantity.falls else y >= target
     if not reached.any():

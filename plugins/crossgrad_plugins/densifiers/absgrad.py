@@ -23,11 +23,11 @@ class AbsGradDensityControl(AxisSplit):
     """Adaptive density control with absolute gradients, so opposite pixel gradients do not cancel.
 
     In addition to the norm g of the projected mean's gradient, it sums the pixels' absolute
-    gradients, separately for x and y. Their norm ga is averaged over the renders in which the
-    Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS). `gsplat` clones and
-    splits by ga alone. `quantile` clones and splits if g is above its threshold, or if ga is among
-    the equally many largest values; it uses the 1-norm instead of the 2-norm (Mip-Splatting's
-    code).
+    gradients, separately for x and y. The norm ga of these two sums is averaged over the renders in
+    which the Gaussian was visible. Criteria: `abs` clones by g and splits by ga (AbsGS). `gsplat`
+    clones and splits by ga alone. `quantile` clones and splits if g is above its threshold, or if
+    ga is among the equally many largest values; it uses the 1-norm instead of the 2-norm
+    (Mip-Splatting's code).
     """
 
     needs = frozenset({"abs_gradient"})
@@ -72,8 +72,8 @@ class AbsGradDensityControl(AxisSplit):
     def _by_quantile(self, gradient: Tensor, absolute: Tensor) -> Tensor:
         """Return [P] bool: g >= threshold, or ga >= its (1 - rho) quantile.
 
-        rho is the share of primitives with g >= threshold. If rho is 0, nothing grows. A primitive
-        that was never seen (ga = 0) does not grow either.
+        rho is the share of primitives with g >= threshold. If rho is 0, no primitive grows. A
+        primitive that was never visible (ga = 0) does not grow either.
         """
         moves = gradient >= self.grad_threshold
         if not bool(moves.any()):

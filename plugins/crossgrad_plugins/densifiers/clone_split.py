@@ -43,9 +43,10 @@ class Growth:
 
     Attributes:
         clone: [P] bool, primitives that are duplicated in place.
-        split: [P] bool, primitives that are replaced by two smaller ones; none of them is also
-            cloned.
-        strength: [P], priority of each primitive; the strongest grow first if the budget is short.
+        split: [P] bool, primitives that are replaced by two smaller ones; no primitive is both
+            split and cloned.
+        strength: [P], priority of each primitive; the strongest primitives grow first if the budget
+            is short.
     """
 
     clone: Tensor
@@ -96,11 +97,11 @@ class Plan:
 
 
 class CloneSplit(Densifier):
-    """Grows primitives by a screen statistic; prunes faint and huge Gaussians.
+    """A densifier that grows primitives by a screen statistic, and prunes faint and huge Gaussians.
 
-    A subclass defines the statistics to gather and the primitives that grow; the rest is as in
-    3DGS. The published pruning rule by screen radius never fires in the original code, so it is
-    left out.
+    A subclass defines the statistics to collect and the primitives that grow; all other steps
+    follow 3DGS. The published pruning rule by screen radius never fires in the original code, so it
+    is left out.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})
@@ -127,7 +128,7 @@ class CloneSplit(Densifier):
         """
 
     def divided(self, context: DensifyContext, growth: Growth) -> Growth:
-        """Return which growing primitives are cloned or split; by default `growth` itself."""
+        """Return which growing primitives are cloned or split; by default, `growth` unchanged."""
         return growth
 
     def grown_values(
@@ -244,9 +245,9 @@ class AxisSplit(CloneSplit):
     """Clones and splits as in 3DGS, or splits every growing Gaussian along its longest axis.
 
     A clone has the same position and gradients as its parent. Both move together until noise
-    separates them, and together they are more opaque than the parent was. Children at random
-    positions leave holes. Children side by side on the axis look like the parent, and differ from
-    the first step on.
+    separates them, and together they are more opaque than the former parent. Children at random
+    positions leave holes in the image. Children side by side on the axis look like the parent, and
+    they differ from the first step on.
     """
 
     division: Literal["drawn", "axis"] = Field(
@@ -256,14 +257,14 @@ class AxisSplit(CloneSplit):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.division != "axis" or self.by_size:
             return {}
         return {"split_scale": "with division axis nothing depends on the size; leave it out"}
 
     @property
     def by_size(self) -> bool:
-        """Whether `split_scale` also selects the statistic that decides about growth."""
+        """True if `split_scale` also selects the statistic that decides about growth."""
         return False
 
     @override
@@ -301,8 +302,8 @@ def child_on_axis(
     Args:
         context: The step.
         parents: Rows of the parents.
-        place: [S] offset of the child's centre from the parent's, in standard deviations on the
-            axis.
+        place: [S] offset of the child's centre from the parent's centre, in standard deviations on
+            the axis.
         length: [S] logarithm of the ratio of the child's length on the axis to the parent's.
         opacity: [S] logarithm of the ratio of the child's opacity to the parent's.
 

@@ -58,9 +58,9 @@ GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
 def split_positions(scores: Tensor) -> Tensor:
     """Return [S] share p of the axis for the left child, in [1/12, 11/12].
 
-    The function searches the minimum of the polynomial of degree 4 through the scores, on a grid
-    and at the nodes. Of equal values the most central one is used, so equal scores split in the
-    middle.
+    The function searches for the minimum of the polynomial of degree 4 through the scores, on a
+    grid and at the nodes. Among equal values the most central one is used, so that equal scores
+    split in the middle.
 
     Args:
         scores: [S, 5] of the planes at p = 1/6 .. 5/6, finite.
@@ -74,7 +74,7 @@ def split_positions(scores: Tensor) -> Tensor:
 
 
 def _interpolation() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions [Q], central ones first, and the Lagrange weights [5, Q] there."""
+    """Return positions [Q], central positions first, and the Lagrange weights [5, Q] there."""
     places = np.concatenate([NODES, GRID])
     places = places[np.argsort(np.abs(places - 0.5), kind="stable")]
     weights = np.ones((len(NODES), len(places)))
@@ -88,9 +88,9 @@ class DirectionalConsistency(CloneSplit):
     """Clones by the mean gradient, and splits by (1 - R) ga if gradient directions disagree.
 
     R is the length of the mean direction of the pixels' gradients. ga is the norm of their absolute
-    values. Both are computed per view; (1 - R) ga is averaged over the renders in which the
-    Gaussian was visible. The children of a split are side by side on the longest axis. The cut is
-    at the position where both sides are most consistent.
+    values. Both are computed per view; the product (1 - R) ga is averaged over the renders in which
+    the Gaussian was visible. The children of a split are side by side on the longest axis. The cut
+    is at the position at which both sides are most consistent.
     """
 
     needs = frozenset({"directions"})
@@ -147,7 +147,8 @@ def _child(
     """Return new values for the left or right children of parents [S], cut at `position` [S].
 
     The longest axis is six standard deviations long. The left child gets the share p of the axis
-    and of the opacity. Its centre is 3 (1 - p) standard deviations left of the parent's centre.
+    and of the opacity. The centre of the child is 3 (1 - p) standard deviations left of the
+    parent's centre.
     """
     share = 1.0 - position if right else position
     place = 3.0 * (1.0 - share) * (1.0 if right else -1.0)

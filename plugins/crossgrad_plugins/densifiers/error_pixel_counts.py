@@ -44,7 +44,7 @@ class MultiViewScore:
     rank: Tensor
 
     def above(self, threshold: float) -> Tensor:
-        """Return [P, R] bool: whether the whole number of erroneous pixels is above a threshold."""
+        """Return [P, R] bool: True if the whole number of erroneous pixels is above a threshold."""
         return self.marked.floor() > threshold
 
     def strength(self, grows: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class MultiViewScore:
 
     @property
     def pruning_score(self) -> Tensor:
-        """The error [P], scaled to [0, 1] from smallest to largest; 0 if all are equal."""
+        """The error [P], scaled to [0, 1] from smallest to largest; 0 if all errors are equal."""
         error = self.error.sum(dim=1)
         if len(error) == 0:
             return error
@@ -129,8 +129,8 @@ class CountsMarkedPixels(Densifier, ABC):
     def importance_of(self, state: PluginState) -> MultiViewScore:
         """Return the score of the counts of a state.
 
-        A mean is taken over the views that were rendered for the counts. In the running variant it
-        is taken over the renders that showed the primitive.
+        A mean is taken over the views that were rendered for the counts. In the running variant the
+        mean is taken over the renders that showed the primitive.
         """
         marked, error, visits = (state.per_primitive[name] for name in (MARKED, ERROR, VISITS))
         drawn = state.values.get(DRAWN)
@@ -142,7 +142,7 @@ class CountsMarkedPixels(Densifier, ABC):
         """Return the counting options that have no effect, with the reason.
 
         Args:
-            renders: Whether the running variant renders views, too.
+            renders: True if the running variant also renders views.
         """
         if self.count == "render":
             return {"share": "count render has views of its own; leave it out"}
@@ -185,7 +185,7 @@ def erroneous(view: RenderedView, threshold: float) -> Tensor:
     """Return [H, W] bool: pixels whose error, scaled to the view's range, is above a threshold.
 
     The error is the absolute difference from the photo, averaged over channels. Masked pixels are
-    never erroneous. If all pixels have the same error, none is erroneous.
+    never erroneous. If all pixels have the same error, no pixel is erroneous.
     """
     photo = unit_range(view.photo, view.image.dtype)
     red, green, blue = (view.image - photo).abs().unbind(-1)

@@ -42,8 +42,8 @@ def position_noise(
     """Return the rows of `means` that noise moves, and their shifts.
 
     shift = Sigma n sig(-100 (o - 0.005)) strength, with n three standard normal numbers. No number
-    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. This holds for
-    every opaque Gaussian, so the noise costs little after the first steps of training.
+    is drawn for a Gaussian that would move by less than 1e-7 of its largest scale. This is the case
+    for every opaque Gaussian, so the noise costs little after the first steps of training.
 
     Args:
         parameters: Parameters with `scales` (log) [N, 3], `quats` [N, 4] and `opacities` (logit)
@@ -106,20 +106,21 @@ def shared_scale(opacity: Tensor, copies: Tensor) -> Tensor:
     """Return the factor of the scales of n copies, so that together they are as wide as one.
 
     o' is the shared opacity. The published factor is o / D with the alternating sums D =
-    sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). For many opaque copies these sums
+    sum_{i=1..n} sum_{q<i} C(i-1, q) (-1)^q o'^(q+1) / sqrt(q+1). For many opaque copies, these sums
     lose all precision by cancellation. But 1 / sqrt(q+1) is the integral of a Gaussian to the power
     q+1, and the sums have a closed form under the integral:
 
         D = 1/sqrt(2 pi) int 1 - (1 - o' exp(-x^2/2))^n dx.
 
-    This integrand is positive and smooth. The trapezoidal rule is exact up to rounding.
+    This integrand is positive and smooth. The trapezoidal rule is accurate to rounding for it.
 
     Args:
         opacity: [R] float64 in [0, 1], before it is shared.
         copies: [R] 1 <= n <= 51.
 
     Returns:
-        [R] in (0, 1]. If the opacity is 0 or below the smallest normal number, the limit 1.
+        [R] in (0, 1]. If the opacity is 0 or below the smallest normal number, the result is the
+        limit 1.
     """
     nodes = _STEP * torch.arange(_STEPS + 1, dtype=opacity.dtype, device=opacity.device)
     weights = torch.full_like(nodes, 2.0 * _STEP / sqrt(2.0 * pi))
@@ -138,7 +139,7 @@ class Pool:
         source: [M] int64, index of the old primitive of each primitive.
         opacity: [M] float64.
         scale: [M] float64, factor of the scales.
-        touched: [M] bool, whether the primitive shares its source with others.
+        touched: [M] bool, True if the primitive shares its source with other primitives.
     """
 
     source: Tensor
@@ -175,11 +176,11 @@ LAST_EDIT_SHARE = 25 / 30
 
 
 class MarkovChainMonteCarlo(Densifier):
-    """Moves transparent Gaussians onto opaque Gaussians and adds 5 % per pass up to a cap.
+    """Moves transparent Gaussians onto opaque ones, and adds 5 % per pass up to a cap.
 
-    It needs no screen statistics. Gaussians are samples of a distribution that training explores by
-    noise on the positions. Two regularisers make useless Gaussians transparent and small. It does
-    not clone, split, prune or reset opacities.
+    The densifier needs no screen statistics. Gaussians are samples of a distribution that training
+    explores by noise on the positions. Two regularisers make useless Gaussians transparent and
+    small. The densifier does not clone, split, prune or reset opacities.
     """
 
     tensors = frozenset({"means", "scales", "quats", "opacities"})

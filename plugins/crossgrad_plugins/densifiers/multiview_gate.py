@@ -1,4 +1,4 @@
-"""A gate around another densifier: primitives grow only by the errors of several views (FastGS)."""
+"""A gate around another densifier: errors of several views decide which primitives may grow."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -48,7 +48,7 @@ def densifier_of(value: object) -> Densifier:
 
 
 class MultiViewGate(CountsMarkedPixels):
-    """Lets another densifier grow only primitives that several views show to be erroneous.
+    """A densifier that lets another densifier grow only primitives with errors in several views.
 
     A primitive may grow if its Gaussians are blended in more than `importance` erroneous pixels of
     a view on average. The other densifier decides how it grows and which primitives are pruned:
@@ -74,17 +74,17 @@ class MultiViewGate(CountsMarkedPixels):
     @property
     @override
     def resets(self) -> bool:  # type: ignore[override]
-        """Whether the other densifier resets opacities."""
+        """True if the other densifier resets opacities."""
         return self.of.resets
 
     @property
     @override
     def observes(self) -> bool:  # type: ignore[override]
-        """Whether the gate or the other densifier gathers statistics of views."""
+        """True if the gate or the other densifier gathers statistics of views."""
         return self.count == "running" or self.of.observes
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         idle = self.idle_counting(renders=False)
         inner = set_for_nothing(self.of, replace(selection, densifier=self.of))
         if inner:

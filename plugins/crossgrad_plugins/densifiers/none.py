@@ -1,4 +1,4 @@
-"""No density control: the set of primitives stays as it is."""
+"""No density control: the set of primitives does not change."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ from crossgrad_core.plugin import NO_EDIT, Densifier, DensifyContext, Edit, Plug
 
 
 class NoDensification(Densifier):
-    """Never edits; needs no statistics."""
+    """A densifier that never edits and needs no statistics."""
 
     edits: ClassVar[bool] = False
     resets: ClassVar[bool] = False

@@ -16,7 +16,7 @@ class PixelDensityControl(AxisSplit):
     |g|) / sum(m). m is the number of pixels in which the Gaussian was blended, and g the NDC
     gradient of its projected mean. f = min(1, (z / depth_threshold)^2) with the depth z of the
     centre reduces the growth of floaters in front of a camera. Only this statistic is scaled; the
-    training gradients are not. Source: Pixel-GS.
+    gradients for training are not scaled. Source: Pixel-GS.
     """
 
     needs = frozenset({"pixels"})

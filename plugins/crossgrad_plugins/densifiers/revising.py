@@ -31,7 +31,7 @@ ErrorKind = Literal["ssim", "l1"]
 
 
 def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
-    """Return at most `most` of `number` views, a random one from each of `most` equal ranges."""
+    """Return at most `most` of `number` views: a random view from each of `most` equal ranges."""
     if number <= most:
         return list(range(number))
     edges = np.linspace(0, number, most + 1).astype(np.int64)
@@ -39,7 +39,7 @@ def spread_views(number: int, most: int, rng: np.random.Generator) -> list[int]:
 
 
 def largest_shares(context: DensifyContext, views: Iterable[int], kind: ErrorKind) -> Tensor:
-    """Return [P] the largest share of each primitive in the error of any of the views, in pixels.
+    """Return [P], the largest share of each primitive in the error of any view, in pixels.
 
     The views are rendered with the current parameters and the exposure. This costs two renders and
     one backward pass per view.
@@ -71,7 +71,7 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
 
     Args:
         image: [H, W, 3], the render of the view.
-        decoded: [H, W, 3] uint8 photo and [H, W] bool mask (None: every pixel counts), on the
+        decoded: [H, W, 3] uint8 photo and [H, W] bool mask (None if every pixel counts), on the
             image's device.
         kind: 1 - SSIM (in [0, 2]) or the absolute difference.
     """
@@ -84,8 +84,8 @@ def pixel_error(image: Tensor, decoded: tuple[Tensor, Tensor | None], kind: Erro
 def _shares(context: DensifyContext, gaussians: Gaussians, camera: Camera, error: Tensor) -> Tensor:
     """Return [N] sums over pixels of the Gaussian's blending weight times the pixel's error.
 
-    A pixel is the sum of weight times colour. So the result is the gradient of the sum over pixels
-    of image times error, by the colour of one channel.
+    A pixel is the sum of weight times colour. The result is therefore the gradient, by the colour
+    of one channel, of the sum over pixels of image times error.
     """
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     plain = replace(gaussians, colors=colors, sh_dc=None, sh_rest=None, sh_degree=0)
@@ -109,7 +109,7 @@ class RevisingDensification(CloneSplit):
 
     The share is measured when an edit is due. The measurement uses the current parameters and views
     that are spread over the training views. Clones and children share their opacity. Instead of
-    opacity resets, every edit lowers all opacities a little.
+    opacity resets, every edit decreases all opacities a little.
     """
 
     observes: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""The command `crossgrad diagnose`: a model, its probes, the report."""
+"""The command `crossgrad diagnose`: a model, its probes and the report."""
 
 import sys
 from collections.abc import Mapping
@@ -54,9 +54,10 @@ class Options:
     """How a scene is diagnosed.
 
     Attributes:
-        grouping: The grouping; None for the run's grouping, or else the paper's.
+        grouping: The grouping; None for the run's grouping, or else the grouping of the paper.
         per_group: Probed views per group.
-        probes: Probes during the vanilla run, evenly spaced; the last one at its end.
+        probes: Number of probes during the vanilla run, evenly spaced; the last probe is at its
+            end.
         seconds: Training seconds of the vanilla run.
         seed: Seed of the vanilla run and of the probes.
         signature: File for the labels of grouping `conflict-signature`, or None.
@@ -85,9 +86,9 @@ def diagnose(
         run: Folder of a run to probe, or None.
         settings: Settings of the vanilla run in the format of `RunConfig` (data, device ...). For
             a run, only `device` and `threads` can be set.
-        options: How to probe.
+        options: The options of the probes.
         out: Output folder of the report.
-        accept_scene: For a run, accept its scene although parts of the scene have changed.
+        accept_scene: For a run: accept its scene even if parts of the scene have changed.
 
     Returns:
         The exit code: 0, or 1 if training failed; the probes before the failure are reported.
@@ -152,11 +153,11 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
 
     Args:
         config: Scene, data options, device and threads; components are replaced.
-        options: How to probe.
+        options: The options of the probes.
 
     Returns:
-        The report. If training failed after the first probe, it holds the probes before the
-        failure, and `failure` describes the failure.
+        The report. If training failed after the first probe, the report contains the probes before
+        the failure, and `failure` describes the failure.
 
     Raises:
         UserError: The scene cannot be read, has too few training photos, or the grouping cannot
@@ -195,7 +196,7 @@ def diagnose_run(setup: Setup, state: TrainState, folder: Path, options: Options
     """Probe a run at its current step.
 
     Raises:
-        UserError: Its scene has too few training photos, or the grouping cannot group it.
+        UserError: The run's scene has too few training photos, or the grouping cannot group it.
     """
     plan = _plan(setup.scene, options, setup.groups)
     watch = Watch(plan, 1, state.step, options.seed)

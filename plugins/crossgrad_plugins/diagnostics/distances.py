@@ -23,7 +23,8 @@ class DistanceConflict:
             empty quarter.
         correlation: Rank correlation (Spearman) of conflict with |log r_i - log r_j|, ranks among
             all pairs; NaN if either is constant.
-        p_value: Share of relabelled cameras (Mantel's permutations) with as large a correlation.
+        p_value: Share of permutations of the cameras (Mantel's test) with at least as large a
+            correlation.
     """
 
     rates: NDArray[np.float64]
@@ -38,7 +39,7 @@ def conflict_by_distance(
     *,
     permutations: int = 499,
 ) -> DistanceConflict:
-    """Measure the paper's Observation 1 within one scene, for one block.
+    """Measure Observation 1 of the paper within one scene, for one block.
 
     Every pair of views with a dot product other than zero counts. Pairs share cameras, so their
     correlation is tested by permuting cameras, not pairs.

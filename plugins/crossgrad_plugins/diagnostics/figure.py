@@ -102,7 +102,7 @@ def _intervals(axes: "Axes", rows: Sequence[Row], column: str, label: str) -> No
 
 
 def _drawable(high: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Replace infinite upper ends by a value a little above the largest finite one."""
+    """Replace infinite upper ends by a value slightly above the largest finite end."""
     finite = high[np.isfinite(high)]
     top = 1.2 * float(finite.max()) if len(finite) else float(np.nanmax(np.append(low, 1.0)))
     return np.where(np.isinf(high), top, high)
@@ -183,7 +183,7 @@ def _draw_gains(axes: "Axes", exposure: SceneExposure) -> None:
 
 
 def _draw_rule(axes: "Axes", exposure: SceneExposure) -> None:
-    """Draw the figures that the exposure rule compares, each with its threshold."""
+    """Draw the values that the exposure rule compares, each with its threshold."""
     values = (exposure.spread, exposure.before, exposure.after)
     limits = (LEAST_SPREAD, np.nan, (1.0 - LEAST_REDUCTION) * exposure.before)
     axes.bar(range(3), values, 0.6, color=(_EXPOSURE_COLORS[0], "0.6", _EXPOSURE_COLORS[2]))

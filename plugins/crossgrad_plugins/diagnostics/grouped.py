@@ -46,7 +46,7 @@ class Groups:
 
     @cached_property
     def unseen(self) -> tuple[float, float]:
-        """1 - n/N of either group, the share of its cameras not probed; 1 if N is unknown."""
+        """1 - n/N of each group, the share of its cameras not probed; 1 if N is unknown."""
         if self.cameras is None:
             return 1.0, 1.0
         near, far = (
@@ -56,7 +56,7 @@ class Groups:
 
     @cached_property
     def divisors(self) -> tuple[float, float]:
-        """(N-1)/N of either group, from sample to population variance; 1 if N is unknown."""
+        """(N-1)/N of each group, from sample to population variance; 1 if N is unknown."""
         if self.cameras is None:
             return 1.0, 1.0
         near, far = self.cameras
@@ -67,7 +67,7 @@ class Groups:
 class GroupedGramian:
     """The Gramian of one block, near views first, split into means and deviations.
 
-    All figures are relative to `scale`, the mean squared norm, so that no figure can overflow.
+    All values are relative to `scale`, the mean squared norm, so that no value can overflow.
 
     Attributes:
         scale: Mean of the Gramian's diagonal.
@@ -175,8 +175,8 @@ def variance_split(gramian: NDArray[np.float64], groups: Groups) -> VarianceSpli
     """Estimate sigma_w^2 and sigma_b^2 from the Gramian [V, V] of one block.
 
     The plain ||difference of means||^2 overestimates sigma_b^2 by the noise of the means, so this
-    noise is subtracted. With one view per group, only noise would remain. Both figures are linear
-    in the Gramian: the figures of a sum over probes of the same views are the sums.
+    noise is subtracted. With one view per group, only noise would remain. Both values are linear in
+    the Gramian: for a sum over probes of the same views, the values are added.
 
     Source: the paper, Proposition 2; unbiased estimators of the variance of a mean, with the finite
     population's correction if the views were drawn without replacement.

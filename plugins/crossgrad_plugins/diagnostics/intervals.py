@@ -52,7 +52,7 @@ class Pivot:
     Attributes:
         observed: The estimate of the sample.
         resampled: [R] estimates of the resamples.
-        lower_share: Share of the interval's error that is put on its lower end.
+        lower_share: Share of the interval's error that is assigned to its lower end.
     """
 
     observed: float
@@ -71,7 +71,8 @@ class StudentisedGap:
     """The resamples of one block and the variance of its noise.
 
     Attributes:
-        draws: The resamples, row 0 the sample itself; shifts are scaled as along the true gap.
+        draws: The resamples, with the sample itself in row 0; shifts are scaled as along the true
+            gap.
         estimate: Unbiased estimate of the gap theta = ||near mean - far mean||^2.
         plain_gap: Squared distance of the sample means.
         floor: Variance of the estimate at theta = 0.
@@ -155,7 +156,7 @@ def _along_the_true_gap(draws: Resamples, gap: float, floor: float) -> float:
     The sample gap d is the true gap plus noise, and the noise is largest in the directions in which
     gradients vary most. With the covariance Sigma of the difference of the means, noise adds
     tr(Sigma^2), half of the `floor`, to d' Sigma d, and tr(Sigma) to |d|^2. Half of both is
-    subtracted, and less if the whole gap could be noise, because the remainder is itself uncertain
+    subtracted, or less if the whole gap could be noise, because the remainder is itself uncertain
     with a dozen views.
 
     If few directions dominate, 95 % intervals of sigma_b^2 contain the true value in up to 99.5 %
@@ -224,11 +225,11 @@ def split_intervals(
     studentised on the logarithmic scale.
 
     sigma_b^2 is quadratic in the distance theta of the group means, so its noise depends on theta.
-    Its interval holds every theta that the estimate does not reject with the standard error of
-    *that* theta; the bootstrap is moved to theta for the critical values. The ratio's interval is
-    made in the same way from theta - ratio sigma_w^2. The larger the part of sigma_w^2 in its
-    noise, the larger the share of its error on the upper end. The ends are never negative, although
-    the estimate may be.
+    The interval holds every theta that the estimate does not reject with the standard error of
+    *that* theta; the bootstrap is moved to theta for the critical values. The interval of the ratio
+    is computed in the same way from theta - ratio sigma_w^2. The larger the part of sigma_w^2 in
+    this noise, the larger the share of the error that is assigned to the upper end. The ends are
+    never negative, although the estimate may be.
 
     All intervals are unknown (NaN) with fewer than four views in a group, or without variance. The
     intervals of sigma_b^2 and of the ratio are also unknown if the estimate is so far below 0 that
@@ -255,7 +256,7 @@ def split_intervals(
 
 
 def _points(within: float, between: float) -> SplitIntervals:
-    """Return intervals without extent: the figures are exact, because every camera was probed."""
+    """Return intervals of zero width: the values are exact, because every camera was probed."""
     figures = (within, between, between / within)
     return SplitIntervals(*(Interval(figure, figure) for figure in figures))
 
@@ -273,7 +274,7 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
     """Return the interval of the values >= 0 that are not rejected; unknown (NaN) if all are.
 
     Args:
-        pivot: Value -> studentised estimate if that value is the true one.
+        pivot: Value -> studentised estimate if that value is the true value.
         start: Positive value of about the size of the upper end.
         level: Confidence level of the interval.
     """
@@ -287,7 +288,7 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
 
 
 def _crossing(above: Callable[[float], bool], start: float) -> float:
-    """Return the value at which `above` turns false on [0, inf); infinite if it never does."""
+    """Return the value at which `above` becomes false on [0, inf); infinite if it never does."""
     if not above(0.0):
         return 0.0
     low, high = 0.0, start

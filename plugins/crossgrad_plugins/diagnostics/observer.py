@@ -15,12 +15,12 @@ _PROBES = 8
 
 
 class Diagnostics(Observer):
-    """Measures the gradients of chosen views at an interval, at frozen parameters.
+    """An observer that measures the gradients of chosen views at an interval, at frozen parameters.
 
-    Writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's folder. The
-    views are drawn by the observer's own generator, so the result of training does not change. A
-    probe costs a forward and a backward pass of each probed view. This time does not count as
-    training time; the column `probe_seconds` contains it.
+    The observer writes diagnostics.csv, cameras.csv, groupings.csv and diagnostics.png to the run's
+    folder. The views are drawn by the observer's own generator, so the result of training does not
+    change. A probe costs a forward and a backward pass of each probed view. This time does not
+    count as training time; the column `probe_seconds` contains it.
     """
 
     every: int | None = Field(
@@ -38,7 +38,7 @@ class Diagnostics(Observer):
 
     @hookimpl
     def crossgrad_run_start(self, run: RunInfo) -> None:
-        """Remember the run and its output folder."""
+        """Store the run and its output folder."""
         self._run, self._watch = run, None
 
     @hookimpl

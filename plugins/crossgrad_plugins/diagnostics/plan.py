@@ -1,4 +1,4 @@
-"""The views of a probe: as many near as far views, the same in every probe."""
+"""The views of a probe: equally many near and far views, the same in every probe."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ def require_views(scene: Scene) -> None:
     """Refuse a scene that is too small for two groups.
 
     Raises:
-        UserError: It has too few training photos.
+        UserError: The scene has too few training photos.
     """
     least = 2 * SMALLEST_GROUP
     if len(scene.train) < least:
@@ -66,10 +66,10 @@ def require_views(scene: Scene) -> None:
 def labelled(
     scene: Scene, grouping: str, seed: int, options: Mapping[str, Json] | None = None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Label the training views with a grouping and its options; return the labels and its notes.
+    """Label the training views with a grouping and its options; return labels and notes.
 
     Raises:
-        UserError: There is no such grouping, or it cannot group this scene.
+        UserError: The grouping does not exist, or it cannot group this scene.
     """
     component = build(Grouping, grouping, options or {})
     rule = component.fit(scene, np.random.default_rng(seed))
@@ -84,8 +84,8 @@ def plan_probe(
     Args:
         scene: The scene.
         grouping: Name of the grouping.
-        labels: Its label of every training view; of three or more groups, only the nearest and
-            the farthest one are probed.
+        labels: The grouping's label of every training view; of three or more groups, only the
+            nearest and the farthest are probed.
         per_group: Views per group.
         seed: Seed of the probe's own generator.
 

@@ -36,7 +36,7 @@ class Report:
         cameras: Rows of `camera_rows`.
         groupings: Rows of `grouping_rows`, for the last probe.
         notes: Notes for the reader.
-        failure: The reason if training failed; None if it did not.
+        failure: The reason if training failed; None otherwise.
         exposure: The exposure of the photos; None if it was not measured.
     """
 

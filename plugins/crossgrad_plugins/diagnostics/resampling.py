@@ -1,4 +1,4 @@
-"""Resampled figures of a grouped Gramian: cameras are redrawn and never paired with copies."""
+"""Resampled values of a grouped Gramian: cameras are redrawn and never paired with copies."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -77,7 +77,7 @@ class GroupResamples:
 
 @dataclass(frozen=True, eq=False)
 class Resamples:
-    """All figures that the intervals need; row 0 is the sample itself, in units of the scale.
+    """All values that the intervals need; row 0 is the sample itself, in units of the scale.
 
     If theta is the true ||near mean - far mean||^2, a resample's estimate of it is theta +
     2 sqrt(theta) `shift` + `noise`, minus the mean of the noise.

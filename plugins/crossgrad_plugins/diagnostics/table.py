@@ -29,7 +29,8 @@ class Conflict:
 
     Attributes:
         per_block: [B] share of the counted pairs whose dot product is negative; NaN without pairs.
-        per_pair: Share of a pair's counted blocks that conflict, averaged over pairs; NaN without.
+        per_pair: Share of a pair's counted blocks that conflict, averaged over pairs; NaN without
+            pairs.
         pairs: [B] counted pairs.
         disjoint: [B] pairs of non-zero gradients that do not overlap.
         zero: [B] pairs with a zero gradient.
@@ -76,7 +77,7 @@ def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Return the mean of the values that are not NaN; NaN if all are."""
+    """Return the mean of the values that are not NaN; NaN if all values are NaN."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else float("nan")
 
@@ -91,7 +92,7 @@ class Exponent:
 
     Attributes:
         value: The fitted exponent; NaN if it is undefined.
-        interval: Its confidence interval.
+        interval: Confidence interval of the exponent.
         views: Number of views with a non-zero gradient and distance.
     """
 
@@ -134,7 +135,7 @@ def noise_scale(gramian: NDArray[np.float64], groups: Groups) -> float:
     """Estimate tr(Sigma) / ||mean gradient||^2 of one block, both parts without bias.
 
     Well below the noise scale, K views per step are worth about as much as K steps; well above it,
-    further views are wasted. The mean and the variance are of the mixture of the groups with
+    further views are wasted. The mean and the variance refer to the mixture of the groups with
     their shares. The result is infinite if the mean gradient cannot be distinguished from zero, and
     NaN without variance.
 
@@ -182,7 +183,7 @@ class _Part:
     Attributes:
         name: Name of the part.
         kind: Kind of the part.
-        members: Indices of its blocks in the measurement.
+        members: Indices of the part's blocks in the measurement.
     """
 
     name: str
@@ -305,7 +306,7 @@ def per_pair_conflict(measurement: Measurement, near: NDArray[np.bool_]) -> floa
 
 
 def touched(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of blocks with variance; other blocks (inactive SH bands) have no figures."""
+    """Return the rows of blocks with variance; other blocks (inactive SH bands) have no values."""
     return [row for row in rows if float(row["sigma_w2"]) != 0.0]
 
 

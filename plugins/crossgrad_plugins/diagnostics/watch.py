@@ -37,8 +37,8 @@ GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
     """Return name -> [N] distances of the training views.
 
-    `radial`: from the mean camera, as in the paper. `depth`: median depth of the SfM points over
-    the focal length, relative to the median view; only if every view sees points.
+    `radial`: distance from the mean camera, as in the paper. `depth`: median depth of the SfM
+    points divided by the focal length, relative to the median view; only if every view sees points.
     """
     views = scene.train_views
     found = {"radial": radial_distances(scene, views)}
@@ -156,7 +156,7 @@ class Watch:
         every: Steps between probes.
         total: The last step of the run.
         seed: Seed of the probes' own generator.
-        rows: The table so far.
+        rows: The rows of the table so far.
         last: The last measurement.
     """
 

@@ -35,8 +35,8 @@ class SplatCloud:
         quats: [N, 4] float32 rotations wxyz, not necessarily normalised.
         logit_opacities: [N] float32.
         sh_dc: [N, 3] float32, band 0.
-        sh_rest: [N, 15, 3] float32, bands 1 to 3; zero where a band is not in use.
-        render_mode: How viewers should draw them.
+        sh_rest: [N, 15, 3] float32, bands 1 to 3; zero for bands that are not in use.
+        render_mode: The mode in which viewers should draw the Gaussians.
     """
 
     means: NDArray[np.float64]

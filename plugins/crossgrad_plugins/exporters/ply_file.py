@@ -1,4 +1,4 @@
-"""Standard 3DGS PLY files (Inria property order), as the usual viewers read them.
+"""Standard 3DGS PLY files (property order of Inria), as common viewers read them.
 
 Source: 3DGS. The properties are `x y z nx ny nz f_dc f_rest opacity scale rot`, float32
 little-endian. `f_rest` is channel-major: 15 red coefficients, 15 green, 15 blue.
@@ -55,7 +55,7 @@ def write_ply(
     similarity: Similarity = _IDENTITY,
     comments: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Write a cloud of the local frame in input coordinates; the file appears only when complete.
+    """Write a cloud of the local frame in input coordinates; only a complete file appears.
 
     Large input coordinates (UTM, ECEF) can be too coarse in float32. If rounding would move
     Gaussians by more than 1e-6 local units, positions are written relative to a rounded offset. The
@@ -106,7 +106,8 @@ def position_offset(similarity: Similarity) -> NDArray[np.float64]:
     """Return [3] the offset to subtract from input coordinates before rounding to float32.
 
     The offset is zero unless rounding would move a Gaussian by more than `POSITION_TOLERANCE`.
-    Otherwise it is the centre of the scene, rounded to a power of ten of at most one local unit.
+    Otherwise the offset is the centre of the scene, rounded to a power of ten of at most one local
+    unit.
     """
     largest = np.float32(np.abs(similarity.offset).max())
     error = 0.5 * float(np.spacing(largest)) * similarity.scale  # local units
@@ -124,8 +125,8 @@ def read_ply(path: Path) -> SplatCloud:
         The cloud in the frame of the file, with `crossgrad_offset` added.
 
     Raises:
-        UserError: The file is not a PLY file, has no Gaussians, is truncated, has non-finite
-            numbers, or has other coordinates than a scene's input.
+        UserError: The file is not a PLY file, has no Gaussians, is truncated, contains non-finite
+            numbers, or has other coordinates than the scene's input.
     """
     vertices = read_vertices(path)
     _check_coordinates(vertices.comments, path)
@@ -158,7 +159,7 @@ def read_ply(path: Path) -> SplatCloud:
 
 
 def sh_degree_of(path: Path) -> int:
-    """Return the SH degree of a PLY file of Gaussians, from its header alone.
+    """Return the SH degree of a PLY file of Gaussians from its header alone.
 
     Raises:
         UserError: The file is not a PLY file, has no Gaussians, or has an unusual number of

@@ -21,8 +21,8 @@ _DARKEST = 2.0**-20
 class Affine(ExposurePerPhoto):
     """Each photo shows A x + b for the render's sRGB value x; the mean of all maps is the identity.
 
-    The twelve numbers per photo can also model effects other than exposure. They suit many photos
-    with much overlap.
+    The twelve numbers per photo can also model effects other than exposure. Twelve numbers are
+    suitable for many photos with much overlap.
 
     Source: the exposure compensation of 3D Gaussian Splatting (2024).
     """

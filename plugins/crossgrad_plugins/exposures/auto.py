@@ -18,8 +18,9 @@ class Auto(Exposure):
     """Uses `gain` if the brightness of SfM tracks requires it, else `none`.
 
     The gains are fitted to the brightness of the training photos at SfM points. `gain` is used if
-    their standard deviation is at least 0.2 stops and at least four times its standard error, and
-    if they reduce the deviation of points that join different photos by at least 15 %.
+    the standard deviation of the gains is at least 0.2 stops and at least four times its standard
+    error, and if the gains reduce the deviation of points that join different photos by at least 15
+    %.
     """
 
     @override

@@ -12,7 +12,7 @@ from crossgrad_plugins.exposures.per_photo import ExposurePerPhoto
 
 
 class Gain(ExposurePerPhoto):
-    """Each photo shows 2^stops times the light of the scene; the stops of all have a mean of 0.
+    """Each photo shows 2^stops times the light of the scene; the mean of all stops is 0.
 
     The render is decoded from sRGB, multiplied, and encoded again. Shutter, aperture and
     sensitivity of a camera with automatic exposure have the same effect.

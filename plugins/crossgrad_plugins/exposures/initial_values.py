@@ -137,7 +137,7 @@ class Neighbours:
     """Photos by their camera's position and viewing direction.
 
     The squared distance of two cameras is the squared distance of their centres, in units of the
-    median distance from the middle, plus that of their unit viewing directions.
+    median distance from the middle, plus the squared distance of their unit viewing directions.
     """
 
     def __init__(self, views: Sequence[View]) -> None:
@@ -162,7 +162,8 @@ class Neighbours:
 
         Returns:
             The error of the prediction by neighbours, and the error of the mean over the other
-            photos of the regime. A photo alone in its regime uses the mean of all other photos.
+            photos of the regime. For a photo alone in its regime, the mean of all other photos is
+            used.
         """
         rows, weights = self._others
         near = (weights[..., None] * values[rows]).sum(axis=1)

@@ -17,8 +17,9 @@ from crossgrad_plugins.exposures.initial_values import Start, neighbours_of, out
 class ExposurePerPhoto(Exposure):
     """An exposure with one parameter that has a value for every training photo.
 
-    Values start from the gains of SfM tracks or EXIF, and use their own learning rates. Their mean
-    over the training photos stays neutral, so that the scene keeps its own brightness and colours.
+    Values start from the gains of SfM tracks or EXIF, and have their own learning rates. The mean
+    of the parameters over the training photos is kept neutral, so that the brightness and colours
+    of the scene do not drift.
 
     Attributes:
         parameter: Name of the parameter.
@@ -83,8 +84,8 @@ class ExposurePerPhoto(Exposure):
     ) -> Mapping[str, Tensor]:
         """Predict by EXIF if the view and training photos have it; else by neighbours or regime.
 
-        Neighbours are the training photos nearest in pose. They are used if they predict each other
-        better than the mean over a regime does.
+        Neighbours are the training photos nearest in pose. The neighbours are used if they predict
+        each other better than the mean over a regime does.
         """
         told = exposure_values(scene)
         own = values[self.parameter]

@@ -1,7 +1,7 @@
 """The curve of sRGB, and gains in linear light in plain torch: the reference of the kernels.
 
-Source: IEC 61966-2-1. Renders also have values outside [0, 1]: the first and the last part of the
-curve are extended.
+Source: IEC 61966-2-1. Renders also contain values outside [0, 1], so the first and the last part of
+the curve are extended.
 """
 
 from typing import Final

@@ -1,4 +1,4 @@
-"""Places on the ellipsoid of WGS 84, geocentric coordinates, and the local east, north, up."""
+"""Positions on the ellipsoid of WGS 84, geocentric coordinates, and local east, north and up."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _PASSES: Final = 10
 
 @dataclass(frozen=True)
 class Place:
-    """A place on Earth: degrees north and east, and metres above the ellipsoid."""
+    """A position on Earth: degrees north and east, and metres above the ellipsoid."""
 
     latitude: float
     longitude: float
@@ -59,7 +59,7 @@ def geocentric(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def place_at(point: NDArray[np.float64]) -> Place | None:
-    """Return the place of geocentric coordinates [3]; None if far from the Earth's surface."""
+    """Return the position of geocentric coordinates [3]; None if far from the Earth's surface."""
     x, y, z = (float(value) for value in point)
     around = math.hypot(x, y)
     if not abs(math.hypot(around, z) - _AXIS) < _HIGHEST:

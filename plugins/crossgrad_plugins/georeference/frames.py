@@ -37,7 +37,7 @@ class Frame3D:
     Attributes:
         rotation: [3, 3].
         shift: [3].
-        scale: Above zero.
+        scale: The scale, above zero.
     """
 
     rotation: NDArray[np.float64]
@@ -49,7 +49,7 @@ class Frame3D:
         return np.asarray(self.scale * (points @ self.rotation.T) + self.shift)
 
     def after(self, first: "Frame3D") -> "Frame3D":
-        """Return both similarities as one: `first`, then this one."""
+        """Return both similarities as one similarity: first `first`, then this one."""
         return Frame3D(
             self.rotation @ first.rotation,
             self.points(first.shift[None])[0],
@@ -108,7 +108,7 @@ class Fit:
         frame: The similarity.
         errors: [N, 3] measured minus fitted, in the frame of the measured points.
         kept: [N] bool, True for the points used in the fit.
-        tilt: Standard error of the turn about the longest extent of the points, radians.
+        tilt: Standard error of the rotation about the longest extent of the points, radians.
     """
 
     frame: Frame3D

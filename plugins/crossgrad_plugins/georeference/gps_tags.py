@@ -27,7 +27,7 @@ def gps_of(image: "Image") -> Numbers:
 
 
 def is_place(latitude: float, longitude: float) -> bool:
-    """Return True if degrees are a possible place of a photo on Earth.
+    """Return True if the degrees are a possible position of a photo on Earth.
 
     A receiver without a fix writes 0, 0, which is in the sea off Ghana.
     """

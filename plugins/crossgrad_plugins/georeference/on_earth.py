@@ -79,13 +79,13 @@ class OnEarth:
 
     Attributes:
         origin: The origin of east, north, up.
-        to_enu: From the coordinates of the scene's input to metres east, north and up from the
+        to_enu: Maps the coordinates of the scene's input to metres east, north and up from the
             origin.
         source: The source of the georeference.
         residuals: Name from `RESIDUALS` -> metres; empty if there was nothing to compare.
         system: The coordinate system of the input, if the input is in map coordinates. Map
-            coordinates are not a similarity of east, north, up: centres are converted by the
-            system, and `to_enu` is the best fit at the origin.
+            coordinates are not a similarity of east, north, up: the coordinate system converts the
+            centres, and `to_enu` is the best fit at the origin.
     """
 
     origin: Place
@@ -96,7 +96,7 @@ class OnEarth:
 
     @property
     def note(self) -> str:
-        """See `crossgrad_core.plugin.Georeference`."""
+        """One sentence for the user; see `crossgrad_core.plugin.Georeference`."""
         parts = [f"{name.replace('_', ' ')} {m:.2f} m" for name, m in self.residuals.items()]
         told = f"; residuals: {', '.join(parts)}" if parts else ""
         return (
@@ -146,8 +146,8 @@ class OnEarth:
     ) -> Placed:
         """Return Gaussians at `points` [N, 3], rotated and scaled by a similarity from the input.
 
-        They get their own frame, which is rotated against the local frame and has the same size, so
-        that an exporter only moves and scales them.
+        The Gaussians get a separate frame, which is rotated against the local frame and has the
+        same size, so that an exporter only moves and scales them.
         """
         offset = frame.points(similarity.offset[None])[0]
         own = Similarity(offset, similarity.scale / frame.scale)

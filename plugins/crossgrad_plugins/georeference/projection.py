@@ -32,7 +32,7 @@ class Projection:
 
     Attributes:
         code: The code, such as `epsg:32633`.
-        forward: From geocentric coordinates; for a map, x is east and y is north.
+        forward: Converts geocentric coordinates; for a map, x is east and y is north.
         accuracy: Accuracy in metres relative to WGS 84; None if PROJ does not report it.
     """
 
@@ -78,7 +78,7 @@ class Projection:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Messages on the accuracy of coordinates in this system."""
+        """Messages about the accuracy of coordinates in this system."""
         if self.accuracy is None:
             return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)
         if self.accuracy > _KNOWN_WELL:
@@ -98,12 +98,12 @@ class Projection:
         """Fit the similarity from east, north, up to this system around a place.
 
         Args:
-            to_enu: From geocentric coordinates.
+            to_enu: Converts geocentric coordinates.
             place: [3] in east, north, up.
             where: Origin of the request, for error messages.
 
         Raises:
-            UserError: Around the place the system stretches unevenly, mirrors, or is undefined.
+            UserError: Around this position the system stretches unevenly, mirrors, or is undefined.
         """
         ends = place + _NEAR * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         here, *sides = self.points(to_enu.inverse.points(ends))

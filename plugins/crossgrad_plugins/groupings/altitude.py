@@ -31,7 +31,8 @@ from crossgrad_plugins.groupings.split import (
 class Altitude(Grouping):
     """near: cameras up to a height; far: cameras above it.
 
-    Source: the paper, altitude thresholds; the choice of the axis and of the threshold is ours.
+    Source: the paper, altitude thresholds; the choice of the axis and of the threshold was made for
+    crossgrad.
     """
 
     up: Literal["auto", "cameras", "pca"] | tuple[float, float, float] = Field(

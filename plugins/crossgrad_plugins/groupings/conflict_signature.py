@@ -41,7 +41,8 @@ class ConflictSignature(Regrouping):
     not probed has the label of the nearest probed camera. Until step `at`, when gradients become
     available, the views are grouped as by `radial`.
 
-    Source: the paper names this grouping without a definition; the definition is ours.
+    Source: the paper names this grouping without a definition; the definition was made for
+    crossgrad.
     """
 
     needs_probe: ClassVar[bool] = True
@@ -110,7 +111,8 @@ def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
 def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return [V] side 0 or 1, by the sign of the second eigenvector of the normalised Laplacian.
 
-    All cameras are on side 0 if there is no second direction: one camera, or identical cameras.
+    All cameras are on side 0 if there is no second direction, as with one camera or identical
+    cameras.
 
     Source: Shi and Malik 2000, with similarity (1 + cosine) / 2.
     """

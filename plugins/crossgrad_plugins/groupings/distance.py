@@ -35,7 +35,7 @@ from crossgrad_plugins.groupings.split import (
 class Radial(Grouping):
     """near: distance from the mean training camera up to its median; far: larger distances.
 
-    Source: the paper, median radial split; Otsu's threshold is ours.
+    Source: the paper, median radial split; Otsu's threshold was added for crossgrad.
     """
 
     cut: Cut = Field("median", description=CUT)
@@ -55,7 +55,7 @@ class Percentile(Grouping):
     """near: cameras up to the q-th percentile of the distance from the mean camera; far: the rest.
 
     Balanced pairs then estimate (near mean + far mean) / 2 instead of the mean over cameras. If q
-    is not 50, this is a different objective, not only a different variance.
+    is not 50, the estimate belongs to a different objective, and not only its variance differs.
 
     Source: the paper, partition threshold study (30 and 70).
     """
@@ -95,9 +95,9 @@ class Terciles(Grouping):
 
 
 class Anchors(Grouping):
-    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: the rest.
+    """near: the nearest 30 % of the training cameras; far: the farthest 30 %; middle: all others.
 
-    The middle may be empty in a scene with very few cameras; near and far may not.
+    The group middle may be empty in a scene with very few cameras; near and far may not be empty.
 
     Source: the paper, operator variants.
     """

@@ -33,12 +33,13 @@ from crossgrad_plugins.groupings.split import (
 class Footprint(Grouping):
     """near: views that show a local unit with at least the median number of pixels; far: the rest.
 
-    The measure of a view is the median of f/z over the SfM points that the view observed. If it
-    observed fewer than three, all SfM points in its image are used. If there are none either, the
-    view gets the measure of the nearest training camera that has one. The measure includes the
-    focal length and does not assume cameras around a centre.
+    The measure of a view is the median of f/z over the SfM points that the view observed. If the
+    view observed fewer than three points, all SfM points in its image are used. If there are no
+    points in the image either, the view gets the measure of the nearest training camera with a
+    measure. The measure includes the focal length and does not assume cameras around a centre.
 
-    Source: the paper, projected footprint; Otsu's threshold and the fallbacks are ours.
+    Source: the paper, projected footprint; Otsu's threshold and the fallbacks were added for
+    crossgrad.
     """
 
     cut: Cut = Field("median", description=CUT)

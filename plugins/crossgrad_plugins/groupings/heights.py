@@ -70,8 +70,8 @@ def _given(up: tuple[float, float, float]) -> NDArray[np.float64]:
 def _flattest(scene: Scene) -> NDArray[np.float64]:
     """Return the axis of least variance of the training cameras' centres.
 
-    The axis points so that the cameras are above the SfM points. Without SfM points, it points so
-    that the cameras look down.
+    The axis points so that the cameras are above the SfM points. Without SfM points, the axis
+    points so that the cameras look down.
     """
     spread = scene.robust_centers - scene.middle
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]

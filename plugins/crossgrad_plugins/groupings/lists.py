@@ -24,7 +24,7 @@ class Lists(Grouping):
     """Labels by the images' top folder, or from a file of the user.
 
     Without a file, the label of `aerial/0001.jpg` is `aerial`. A file is CSV with two columns, view
-    name and label. A name that ends with a slash is a folder, and its label holds for all views in
+    name and label. A name that ends with a slash is a folder, and its label applies to all views in
     it.
     """
 

@@ -1,4 +1,4 @@
-"""Labels from a threshold, the threshold itself, and the check that every group has views."""
+"""Labels from a threshold, the threshold itself, and a check that every group has views."""
 
 from collections.abc import Callable, Sequence
 from typing import Final, Literal, TypeAlias
@@ -31,7 +31,7 @@ def rule_of_distances(
             views.
 
     Raises:
-        UserError: There are no training views, or all are on one side.
+        UserError: There are no training views, or all views are on one side.
     """
     require_training_views(scene, grouping)
     train = radial_distances(scene, scene.train_views)
@@ -60,7 +60,7 @@ def require_training_views(scene: Scene, grouping: str) -> None:
     """Raise an error if a scene has no training views.
 
     Raises:
-        UserError: There are no views to fit the rule on.
+        UserError: There are no views to which the rule could be fitted.
     """
     if not scene.train:
         raise UserError(
@@ -111,7 +111,7 @@ def smaller_mean_first(sides: NDArray[np.int64], distances: NDArray[np.float64])
 def otsu_threshold(values: NDArray[np.float64]) -> float:
     """Return the threshold between values [N >= 1] with the least variance within both sides.
 
-    The result is exact: every cut between two different sorted values is tried, without a
+    The result is exact: every threshold between two different sorted values is tried, without a
     histogram. If all values are equal, the result is that value.
 
     Source: Otsu 1979 (largest variance between classes).
@@ -123,8 +123,8 @@ def otsu_threshold(values: NDArray[np.float64]) -> float:
 def otsu_separability(samples: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return [...] share of the variance of values [..., N >= 2] between the two sides.
 
-    The sides are those of Otsu's threshold. The share is 1 for two values, and 3/4 for very many
-    evenly spread values. It is 0 if all values are equal.
+    The sides are separated by Otsu's threshold. The share is 1 for two values, and 3/4 for very
+    many evenly spread values. The share is 0 if all values are equal.
 
     Source: Otsu 1979 (eta, equation 14).
     """

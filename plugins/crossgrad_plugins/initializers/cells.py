@@ -63,7 +63,7 @@ class Cells:
     def colors(self, view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Return [C, 3] mean colours of the nearest cells on the photo, and [C] validity flags.
 
-        A flag is True if that cell has pixels. Pixels that do not count are left out.
+        A flag is True if that cell has pixels. Masked pixels are left out.
         """
         photo = view.photo
         image, mask = photo.image().cpu().numpy(), photo.mask()
@@ -86,7 +86,7 @@ class Cells:
         return np.asarray(np.add.reduceat(lines, across, axis=1))
 
     def covered(self, points: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [C] whether Gaussians cover the centre of each cell.
+        """Return [C], True if Gaussians cover the centre of a cell.
 
         Args:
             points: [P, 3] centres of the Gaussians.
@@ -104,7 +104,7 @@ class Cells:
     def _under_small(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [C] whether the discs in a cell fill enough of its area."""
+        """Return [C], True if the discs in a cell fill enough of its area."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         across, down = np.floor(np.clip(pixels / self.size, -1e6, 1e6)).astype(np.int64).T
         across, down = across + self.margin, down + self.margin
@@ -116,7 +116,7 @@ class Cells:
     def _under_large(
         self, pixels: NDArray[np.float64], radii: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [C] whether a cell's centre is in the square of the area of one of the discs."""
+        """Return [C], True if a cell's centre is in a square with the area of one of the discs."""
         rows, columns = (count + 2 * self.margin for count in self.inner)
         half = (np.sqrt(np.pi) / 2.0 * radii / self.size)[:, None]
         middle = np.clip(pixels / self.size, -1e6, 1e6) + self.margin - 0.5

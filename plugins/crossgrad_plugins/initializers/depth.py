@@ -35,7 +35,7 @@ class Sky:
         up: [3] the scene's upward axis, unit, local frame.
         centers: [V, 3] centres of the cameras.
         points: [P, 3] SfM points, or a sample of them.
-        most: Share of the points that are not stray.
+        most: Share of the points that are not outliers.
     """
 
     up: NDArray[np.float64]
@@ -44,7 +44,7 @@ class Sky:
     most: float
 
     def depth(self, camera: Camera) -> float:
-        """Return the distance of the sky: behind all of the scene that the camera could see."""
+        """Return the distance of the sky, which is behind all points that the camera could see."""
         center = camera.center.numpy()
         far = float(np.linalg.norm(self.centers - center, axis=1).max())
         if len(self.points):
@@ -68,8 +68,9 @@ class Sky:
 class Depth:
     """Depth of a photo, estimated from the points that it observed.
 
-    The inverse depth of a plane in space is a plane over the pixels. So the ground continues beyond
-    its last point, up to the horizon. Rays that go up and do not meet the plane end in the sky.
+    The inverse depth of a plane in space is a plane over the pixels. The ground therefore continues
+    beyond its last point, up to the horizon. Rays that go up and do not meet the plane end in the
+    sky.
 
     Attributes:
         pixels: [S, 2] pixels of the points, in units of the longer side from the photo's centre.
@@ -128,7 +129,7 @@ class Depth:
         return cKDTree(self.pixels)
 
     def rises(self, around: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N] whether rays through pixels [N, 2], as in `from_the_middle`, go up."""
+        """Return [N], True if the ray through a pixel [N, 2], as in `from_the_middle`, goes up."""
         return _on(self.rise, around) > 0.0
 
     def at(self, around: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -36,7 +36,7 @@ class _Filling:
         points: [P, 3] points of the scene and added points.
         sizes: [P] standard deviation of the area that each point covers, local units.
         colors: Colours of the added points, view by view.
-        inside: Number of points added on photos.
+        inside: Number of points that were added on photos.
         left_aside: Number of photos with too few points.
     """
 
@@ -65,9 +65,9 @@ class Filled(Initializer):
     """Fills cells of photos that have no points, and a margin beyond all photos.
 
     The depth is a plane through the points that a photo observed, adjusted to the nearest points.
-    Cells beyond a photo's edge have the colour at the edge, and are filled where no training photo
-    looks. So held-out photos and viewers show a continued ground there instead of a black hole.
-    Ours.
+    Cells beyond a photo's edge have the colour at the edge, and are filled if no training photo
+    shows them. Held-out photos and viewers then show a continued ground there instead of a black
+    hole. Ours.
     """
 
     cells: int = Field(12, ge=2, le=200, description="along the longer side of a photo")
@@ -146,10 +146,10 @@ class Filled(Initializer):
         margin: int,
         seen: "_Pictures | None",
     ) -> None:
-        """Fill a photo, or, with a margin, the cells beyond its edges that `seen` does not show.
+        """Fill a photo or, with a margin, the cells beyond its edges that `seen` does not show.
 
-        Rays that go up could place points in the air. On the photo such points become sky. Beyond
-        its edges they are left out.
+        Rays that go up could place points in the air. On the photo such points are moved to the
+        sky. Beyond the edges of the photo they are left out.
         """
         camera = view.camera
         cells = Cells(camera, max(camera.width, camera.height) / self.cells, margin)
@@ -220,9 +220,9 @@ class _Air:
         return cls(np.array(centers).reshape(-1, 3), np.array(reach))
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N] whether points [N, 3] are in this space.
+        """Return [N], True if a point [N, 3] is in this space.
 
-        Points within rounding of its border are not.
+        Points within the rounding error of the border are not in this space.
         """
         held = np.zeros(len(points), dtype=np.bool_)
         for center, reach in zip(self.centers, self.reach, strict=True):
@@ -266,7 +266,7 @@ class _Pictures:
         )
 
     def show(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return [N] whether a view shows each point [N, 3].
+        """Return [N], True if a view shows a point [N, 3].
 
         A point is shown if it is inside the image and not far behind the depth of the view.
         """
@@ -283,7 +283,7 @@ class _Pictures:
     def look_down_on(
         self, points: NDArray[np.float64], up: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Return [N] whether a view shows, from above, the ground on which each point stands.
+        """Return [N], True if a view shows, from above, the ground below a point.
 
         Args:
             points: [N, 3].

@@ -1,4 +1,4 @@
-"""Points for scenes without any: features of photos, matched and triangulated."""
+"""Points for scenes without points: features of photos are matched and triangulated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class Met:
 class Triangulated(Initializer):
     """Triangulates SIFT features of neighbouring training photos, if a scene has no points.
 
-    Poses are not changed. For a scene that has points, this initializer adds none.
+    Poses are not changed. This initializer adds no points to a scene that has points.
     """
 
     alone: ClassVar[bool] = True
@@ -198,10 +198,10 @@ def _best(pairs: Sequence[tuple[int, int]], met: Sequence[Met]) -> list[tuple[in
 
 
 def meet(first: Features, second: Features, pixels: float) -> Met:
-    """Return the features that two photos share, and their triangulated points.
+    """Return the features that two photos have in common, and their triangulated points.
 
-    Both descriptors are each other's nearest by a clear margin. The point is in front of both
-    cameras. In both photos its projection is at most `pixels` from its feature.
+    Both descriptors are the nearest of each other by a clear margin. The point is in front of both
+    cameras. The projection of the point is at most `pixels` from the feature in both photos.
     """
     one, other = _matched(first.descriptors, second.descriptors)
     at = first.pixels[one], second.pixels[other]

@@ -19,7 +19,7 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Return (1 - w) * L1 + w * (1 - SSIM) over the kept pixels; see `reference.l1_ssim_loss`.
+    """Return (1 - w) * L1 + w * (1 - SSIM) over the unmasked pixels; see `reference.l1_ssim_loss`.
 
     In float32, one pass computes value and gradient: a fused kernel on the CPU, torch's operators
     on other devices. This gradient is first order only. Other types, and calls with weights, use
@@ -28,15 +28,15 @@ def photometric_loss(
     Args:
         image: [H, W, 3] floating point, the render.
         target: [H, W, 3] floating point or uint8, the photo, on the same device.
-        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        mask: [H, W] bool, True where the pixel counts; None counts all pixels.
         ssim_weight: w in [0, 1].
-        weights: [H, W] floating point, not negative; None weighs all pixels alike.
+        weights: [H, W] floating point, not negative; None gives all pixels the same weight.
 
     Returns:
         Scalar of the image's type.
 
     Raises:
-        ValueError: If the shapes do not fit.
+        ValueError: The shapes do not fit.
     """
     _check(image, target, mask)
     if weights is not None:

@@ -57,9 +57,10 @@ class ColorCorrectedSSIM(Metric):
 
 
 def color_corrected(compared: Compared) -> Tensor | None:
-    """Return [H, W, 3] uint8, the render after the affine colour map that fits it to its photo.
+    """Return [H, W, 3] uint8: the render after the affine colour map that fits it to its photo.
 
-    The map is fitted where the mask is True and applied everywhere. None if no pixel counts.
+    The map is fitted at unmasked pixels and applied everywhere. The result is None if no pixel
+    counts.
     """
     render, photo = (_kept(image, compared.mask) for image in (compared.render, compared.photo))
     if not len(render):

@@ -63,7 +63,7 @@ class Perceptual(Metric):
     @field_validator("trunk", "heads")
     @classmethod
     def _from_anywhere(cls, path: Path | None) -> Path | None:
-        """Make a path absolute, so that config.yaml works from any folder."""
+        """Make a path absolute, so that config.yaml can be used from any folder."""
         return None if path is None else path.expanduser().absolute()
 
     @hookimpl

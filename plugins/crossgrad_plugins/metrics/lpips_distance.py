@@ -79,9 +79,9 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
 
     Args:
         net: The network.
-        trunk: File with its pretrained weights.
+        trunk: File with the pretrained weights of the network.
         heads: File with the linear heads; None for the heads of an installed package.
-        setting: The user's setting for them, such as `metrics.lpips`.
+        setting: The user's setting for the weights, such as `metrics.lpips`.
 
     Raises:
         UserError: A file is missing, has no weights, or has the weights of another network.
@@ -167,7 +167,7 @@ def _unreadable(path: Path, found: str, todo: str) -> UserError:
 def _check(
     path: Path, found: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], todo: str
 ) -> None:
-    """Raise an error for weights of another network, or for values that are not finite."""
+    """Raise an error for weights of another network or for non-finite values."""
     for name, shape in shapes.items():
         tensor = found.get(name)
         if tensor is None or tuple(tensor.shape) != shape:

@@ -1,8 +1,8 @@
-"""The networks whose features LPIPS compares, without the parts that it does not need.
+"""The networks whose features LPIPS compares, without the layers that LPIPS does not use.
 
-Layers and their numbers are as in torchvision's `alexnet` and `vgg16` (`features`), so that its
-weight files can be loaded. Sources: Krizhevsky 2014 (arXiv 1404.5997); Simonyan and Zisserman 2015
-(1409.1556).
+Layers and their numbers are as in torchvision's `alexnet` and `vgg16` (`features`), so that
+torchvision's weight files can be loaded. Sources: Krizhevsky 2014 (arXiv 1404.5997); Simonyan and
+Zisserman 2015 (1409.1556).
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ class Convolution:
         shape: (channels out, channels in, height, width) of its weights.
         stride: Pixels.
         padding: Pixels.
-        pools: Whether max pooling precedes the convolution.
-        compared: Whether LPIPS compares its output.
+        pools: True if max pooling precedes the convolution.
+        compared: True if LPIPS compares the output of the convolution.
     """
 
     layer: int
@@ -36,14 +36,14 @@ class Trunk:
     """A network without its classifier.
 
     Attributes:
-        name: The usual name of the network.
-        model: Its name in torchvision.
-        heads: Name of the file of its linear heads.
+        name: The common name of the network.
+        model: The name of the network in torchvision.
+        heads: Name of the file with the linear heads.
         published: Name of the weight file that LPIPS was fitted on; the last part of the name is
             the beginning of the file's SHA-256.
         window: Side of the max-pooling windows, pixels; their stride is 2.
         smallest: Smallest side of an image, pixels.
-        layers: Its convolutions in order.
+        layers: The convolutions in order.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Structural similarity, computed as in the 3DGS family and as in scikit-image.
 
 Both metrics first clamp the images to [0, 1] and round them to 8 bits, like a render that is
-written to a file and read back. With a mask, only kept pixels count; a masked-out pixel is 0 in
+written to a file and read back. With a mask, only unmasked pixels count; a masked pixel is 0 in
 both images.
 """
 
@@ -58,7 +58,8 @@ class SSIMOfSkimage(Metric):
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Return the SSIM as in the loss: 11 x 11 Gaussian window, sigma 1.5, zero-padded.
 
-    Arguments as for `psnr`. The result is the mean over kept pixels; None if no pixel is kept.
+    The arguments are the same as those of `psnr`. The result is the mean over the unmasked pixels;
+    None if no pixel counts.
     """
     from crossgrad_plugins.losses.photometric.numba_kernels.fused import loss_terms
 
@@ -76,7 +77,8 @@ def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> f
     As in scikit-image, the mean excludes a border of 5 pixels, where windows extend beyond the
     image.
 
-    Arguments as for `psnr`. None if no pixel is left; `SSIM_SKIMAGE_TOO_SMALL` is the reason.
+    The arguments are the same as those of `psnr`. The result is None if no pixel is left;
+    `SSIM_SKIMAGE_TOO_SMALL` is the reason.
     """
     height, width = image.shape[:2]
     inside = torch.zeros(height, width, dtype=torch.bool)
@@ -91,7 +93,7 @@ def ssim_skimage(image: Tensor, target: Tensor, mask: Tensor | None = None) -> f
 def _skimage_map(image: Tensor, target: Tensor, mask: Tensor | None) -> NDArray[np.float64]:
     """Return the SSIM per pixel and channel, [H, W, 3]; a border of RADIUS pixels is undefined.
 
-    A value depends only on pixels within RADIUS, so strips have the same bits as the whole image.
+    A value depends only on pixels within RADIUS, so strips give the same bits as the whole image.
     """
     from skimage.metrics import structural_similarity
 

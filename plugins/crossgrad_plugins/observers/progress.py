@@ -38,7 +38,7 @@ class Progress(Observer):
 
     Attributes:
         level: The amount of output.
-        interval: Seconds between plain lines; a line also comes at every tenth of the run.
+        interval: Seconds between plain lines; a line is also written at every tenth of the run.
     """
 
     level: Literal["quiet", "normal", "verbose"] = Field(

@@ -1,4 +1,4 @@
-"""Decisions on exposure, degree of spherical harmonics, and the scale filter."""
+"""Decisions about exposure, degree of spherical harmonics, and the scale filter."""
 
 from math import isnan
 from typing import Final

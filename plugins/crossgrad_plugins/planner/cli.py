@@ -1,4 +1,4 @@
-"""`crossgrad plan`: decisions on a run, from the evidence of its scene."""
+"""`crossgrad plan`: decisions about a run, from the evidence of its scene."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The evidence for decisions: figures of the scene, and of a probe if one is allowed."""
+"""The evidence for decisions: statistics of the scene and, if allowed, of a probe."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The evidence about a planned run; each figure is computed at first use.
+    """The evidence about a planned run; each value is computed at first use.
 
     Attributes:
         config: The configuration, which contains only settings of the user.
@@ -87,7 +87,7 @@ class Evidence:
 
     @property
     def degree(self) -> int | None:
-        """The highest degree of its spherical harmonics; None without such an option."""
+        """The highest degree of the backbone's spherical harmonics; None without such an option."""
         degree = self.backbone.model_dump().get("sh_degree")
         return degree if isinstance(degree, int) else None
 

@@ -1,4 +1,4 @@
-"""Findings of the planner: the evidence on one part of a run, and the settings that follow."""
+"""Findings of the planner: the evidence about one part of a run, and the settings that follow."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -26,12 +26,12 @@ class Finding:
         part: The part of the run.
         choice: The choice for the part.
         basis: The origin of the choice.
-        evidence: The evidence as text, with its figure.
+        evidence: The evidence as text, with its value.
         rule: The threshold.
         source: The source of the rule.
         saved: The cost that the choice saves compared with a run that has the part.
         force: The option that sets another choice.
-        figures: The figures of the evidence.
+        figures: The values of the evidence.
         settings: The settings that change; empty if the choice is the default.
         because: The reason for the change, in a few words.
     """
@@ -60,9 +60,9 @@ class Finding:
 
         Args:
             evidence: The evidence as text.
-            decided: True if the evidence decides; if not, the default is kept.
+            decided: True if the evidence decides; otherwise the default is kept.
             saved: The cost that the choice saves.
-            figures: The figures of the evidence.
+            figures: The values of the evidence.
         """
         basis: Basis = "decided" if decided else "default"
         return replace(
@@ -93,14 +93,14 @@ class Finding:
 
     @property
     def decisions(self) -> list[Decision]:
-        """One row for each setting that changes; the terminal reports the first one."""
+        """One row for each setting that changes; the terminal reports the first row."""
         return [
             Decision(name, value, self.because, self.evidence, "" if row else self.force)
             for row, (name, value) in enumerate(self.settings.items())
         ]
 
     def as_data(self) -> dict[str, Json]:
-        """Return plain data for JSON; figures that are not finite become null."""
+        """Return plain data for JSON; non-finite values become null."""
         finite: dict[str, Json] = {
             name: figure if isfinite(figure) else None for name, figure in self.figures.items()
         }

@@ -1,4 +1,4 @@
-"""Decisions on camera modes, pairs of views, views per step, and the operator."""
+"""Decisions about camera modes, pairs of views, views per step, and the operator."""
 
 from dataclasses import replace
 from math import isfinite, isnan
@@ -164,7 +164,7 @@ def views_per_step(evidence: Evidence) -> Finding:
 
 
 def operator(evidence: Evidence) -> Finding:
-    """Decide whether gradients are kept per view, and how they are combined."""
+    """Decide whether gradients are stored separately per view, and how they are combined."""
     part = "operator"
     usual = "+".join(link.name for link in evidence.config.operators)
     if evidence.is_given("operator"):

@@ -14,7 +14,7 @@ FEWEST_VIEWS: Final = 1_000
 
 
 def most_views(evidence: Evidence) -> int:
-    """Return the number of views beyond which more views gain little."""
+    """Return the number of views beyond which further views improve the result little."""
     return max(FEWEST_VIEWS, PASSES * len(evidence.scene.train_views))
 
 

@@ -36,14 +36,15 @@ _Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """The split of the views in two by one quantity, at Otsu's threshold.
+    """The split of the views into two groups by one quantity, at Otsu's threshold.
 
     Attributes:
         quantity: Name of the quantity.
-        separability: Share of its variance between both sides.
+        separability: Share of the quantity's variance that is between both sides.
         usual: The separability of the best of `ONE_OF` evenly spread samples.
         share: Share of the views on the smaller side.
-        ratio: Far over near: the median distances of both sides; 1 if there is one side.
+        ratio: Far over near: the ratio of the median distances of both sides; 1 if there is one
+            side.
     """
 
     quantity: str
@@ -70,7 +71,7 @@ class Modes:
 
     Attributes:
         quantity: The kind of distance.
-        logs: [V] logarithms of the distances, of the views that have a distance.
+        logs: [V] logarithms of the distances, for the views that have a distance.
         heights: [V] heights of the same cameras, local units.
     """
 
@@ -87,8 +88,8 @@ class Modes:
     def cut(self) -> Cut:
         """The split of the views by distance or by height.
 
-        If both make two modes, the split with the better separability; if neither does, the split
-        by distance.
+        If both make two modes, the split with the better separability is used; if neither does, the
+        split by distance.
         """
         cuts = (self._by(self.quantity, self.logs), self._by(HEIGHT, self.heights))
         modes = [each for each in cuts if each.two]
@@ -109,7 +110,7 @@ class Modes:
 
     @property
     def enough(self) -> bool:
-        """True if there are enough views to distinguish two modes from one."""
+        """True if there are enough views to distinguish two modes from one mode."""
         return len(self.logs) >= FEWEST
 
     @property
@@ -132,8 +133,8 @@ class Modes:
 def modes_of(scene: Scene) -> Modes:
     """Return the modes of the training views.
 
-    The distance of a view is the median depth of its SfM points over its focal length. If fewer
-    than half of the views show points, it is the distance from the mean camera.
+    The distance of a view is the median depth of its SfM points divided by its focal length. If
+    fewer than half of the views show points, the distance from the mean camera is used instead.
     """
     views = scene.train_views
     if not views:

@@ -84,7 +84,7 @@ def plan_of(config: RunConfig, scene: Scene, probe_seconds: float | None = None)
 
 
 def planned(config: RunConfig, scene: Scene) -> list[Decision]:
-    """Return the decisions on settings by the scene: the planner of `--plan auto`.
+    """Return the decisions about settings that follow from the scene; used by `--plan auto`.
 
     Raises:
         UserError: A photo cannot be decoded.

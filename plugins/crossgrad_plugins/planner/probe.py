@@ -26,13 +26,13 @@ class Probe:
 
     Attributes:
         rho: sigma_b^2 / sigma_w^2, between and within near and far views.
-        rho_low: Lower end of its 95 % interval.
-        rho_high: Upper end of its 95 % interval.
+        rho_low: Lower end of the 95 % interval of rho.
+        rho_high: Upper end of the 95 % interval of rho.
         noise_scale: Number of views that a step could use.
         conflict: Share of the near-far pairs whose gradients conflict.
-        conflict_low: Lower end of its 95 % interval; the views of the smaller group count as the
-            independent ones.
-        problem: Reason why there are no figures; empty if there are figures.
+        conflict_low: Lower end of the 95 % interval of conflict; the number of views of the smaller
+            group counts as the number of independent samples.
+        problem: Reason why there are no values; empty if there are values.
     """
 
     rho: float = nan
@@ -45,7 +45,7 @@ class Probe:
 
 
 def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Probe:
-    """Train a vanilla run for some seconds, and return its figures.
+    """Train a vanilla run for some seconds, and return its measurements.
 
     Args:
         config: The configuration, with a scene; components are replaced.

@@ -34,8 +34,8 @@ class ViewDependence:
         tracks: Number of tracks that were seen from enough directions.
         share: Share of the variance of a left-out observation that degree 1 explains; negative if
             degree 1 predicts worse than the mean, NaN without tracks.
-        low: Lower end of its 95 % interval, tracks resampled.
-        high: Upper end of its 95 % interval.
+        low: Lower end of the 95 % interval of the share, with tracks resampled.
+        high: Upper end of the 95 % interval of the share.
     """
 
     tracks: int
@@ -48,8 +48,8 @@ def view_dependence(scene: Scene) -> ViewDependence:
     """Measure the view dependence of the tracks of the training photos.
 
     For each track that is seen from enough directions, every observation is predicted from the
-    other observations: by their mean, and by a plane over the directions. Exposures are removed
-    first.
+    other observations: by their mean, and by a plane over the directions. Differences in exposure
+    are removed first.
 
     Raises:
         UserError: A photo cannot be decoded.

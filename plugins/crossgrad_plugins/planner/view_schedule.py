@@ -1,4 +1,4 @@
-"""The decision on how often far and near views are drawn, by the directions in which they look."""
+"""The decision how often far and near views are drawn, from their viewing directions."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -34,7 +34,7 @@ class Directions:
 
     @property
     def differ(self) -> bool:
-        """True if far views look in one direction, and near views in another."""
+        """True if far views look in one direction and near views in another direction."""
         return self.far <= WITHIN and self.near >= BEYOND
 
 

@@ -151,7 +151,7 @@ def prepare_scene(photos: Path, scene: Path, settings: Settings, threads: int | 
 
 
 def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None = None) -> Report:
-    """Make a scene from a folder of photos, or its missing parts, and return the report.
+    """Make a scene, or its missing parts, from a folder of photos; return the report.
 
     Args:
         photos: Folder of the photos.
@@ -160,8 +160,8 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
         threads: CPU threads, or None for all cores.
 
     Raises:
-        UserError: There are too few photos, the scene folder contains something else, no photos fit
-            together, or the disk is full.
+        UserError: There are too few photos, the scene folder has other contents, no photos match,
+            or the disk is full.
     """
     layout = Layout(scene)
     check_ours(layout, photos)
@@ -180,7 +180,9 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
 
 
 def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
-    """Make a scene from photos. If it is ready, its photos and working folder may be missing.
+    """Make a scene from photos.
+
+    If the scene is complete, its photos and working folder may be missing.
 
     Returns:
         Messages about the scene.

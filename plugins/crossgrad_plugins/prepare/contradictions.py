@@ -45,15 +45,16 @@ def contradicted(
 ) -> dict[int, tuple[int, int]]:
     """Return the photos whose matches with other photos of the model contradict their pose.
 
-    Repeated structures in different places look alike. Such pairs pass the verification of two
-    views, and may place a photo that is added early. Pairs with photos that are added later show
-    the error. The photo with the smallest share of agreeing matches is removed first, and its
-    matches no longer count for the other photos.
+    Repeated structures in different places look alike. Pairs of such photos pass the verification
+    of two views, and may misplace a photo that is added early. Pairs with photos that are added
+    later show the error. The photo with the smallest share of agreeing matches is removed first,
+    and its matches no longer count for the other photos.
 
     Args:
         model: The model.
         database: COLMAP's database with the verified matches.
-        settled: Photos for which no other place has more agreeing matches. They are never returned.
+        settled: Photos for which no other pose has more agreeing matches. These photos are never
+            returned.
 
     Returns:
         Number of each such photo -> its matches for and against the pose.
@@ -78,7 +79,7 @@ class _Counts:
     """Sums over pairs for each photo.
 
     Attributes:
-        size: One more than the largest number of a photo.
+        size: Largest number of a photo, plus one.
     """
 
     size: int

@@ -78,7 +78,7 @@ def levelled(
     line: tuple[NDArray[np.float64], NDArray[np.float64]],
     tops: Mapping[str, NDArray[np.float64]],
 ) -> "pycolmap.Sim3d | None":
-    """Return the similarity rolled about a line so that photos are level, or None if unclear.
+    """Return the similarity rolled about a line so that photos are level; None if this is unclear.
 
     Args:
         model: The model.

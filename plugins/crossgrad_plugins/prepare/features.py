@@ -37,7 +37,7 @@ _TRIED: Final = 5
 def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     """Find the features and return their number by photo name, 0 for an unreadable photo.
 
-    Features are stored in the database. Photos with stored features are skipped.
+    Features are stored in the database. Photos whose features are already stored are skipped.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -166,7 +166,10 @@ def _write_camera(
 
 
 def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
-    """Return the initial calibration. The focal length is from EXIF, or 1.2 x the longer side."""
+    """Return the initial calibration.
+
+    The focal length comes from EXIF, or is 1.2 x the longer side.
+    """
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()

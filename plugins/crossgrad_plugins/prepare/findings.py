@@ -27,7 +27,7 @@ class Lost:
 
     Attributes:
         name: The photo's name.
-        features: Number of its features.
+        features: Number of features of the photo.
         links: Number of photos with which it has verified matches.
         why: Possible reason for the missing pose.
     """
@@ -90,7 +90,8 @@ def lost_photos(
         features: Name -> number of features.
         links: Pairs with verified matches.
         models: Photo names of each model, and True if the model is in the scene.
-        misplaced: Name of a photo taken out of a model -> its matches for and against its pose.
+        misplaced: Name of a photo that was taken out of a model -> its matches for and against its
+            pose.
     """
     partners: Counter[str] = Counter()
     for link in links:
@@ -187,7 +188,7 @@ def bridges_of(
 
 
 def parts_of(plan: Plan, models: Sequence[frozenset[str]]) -> list[frozenset[str]]:
-    """Return the photos of each model, and the missing photos of folders mostly in no model."""
+    """Return the photos of each model, and photos that are missing with most of their folder."""
     posed = frozenset().union(*models)
     missing: dict[str, set[str]] = defaultdict(set)
     sizes: Counter[str] = Counter(photo.folder for photo in plan.used)
@@ -255,6 +256,6 @@ def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str
 
 
 def fallbacks(low: float, high: float) -> list[float]:
-    """Return heights from the lower to the higher end, with a constant factor between them."""
+    """Return heights from the lower to the higher end, with a constant ratio of neighbours."""
     steps = min(_MOST_RUNGS, max(1, math.ceil(math.log(high / low) / math.log(_RUNG))))
     return [low * (high / low) ** (step / steps) for step in range(steps + 1)]

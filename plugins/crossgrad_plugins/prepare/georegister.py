@@ -117,7 +117,7 @@ def _line(
 def _aligned(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """Return the similarity between points [N, 3] with which most agree, and the agreeing ones."""
+    """Return the similarity with which most points [N, 3] agree, and the points that agree."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()
@@ -139,7 +139,7 @@ def _aligned(
 def _on_a_line(
     here: NDArray[np.float64], there: NDArray[np.float64]
 ) -> tuple["pycolmap.Sim3d", NDArray[np.bool_]] | None:
-    """Return a similarity for points [N, 3] on a line, and the agreeing points.
+    """Return a similarity for points [N, 3] on a line, and the points that agree with it.
 
     The roll about the line is arbitrary. Scale and direction are medians over all pairs of points
     (Theil-Sen estimator), or over pairs of at most `_ASKED` points along the line.

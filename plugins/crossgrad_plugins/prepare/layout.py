@@ -22,7 +22,7 @@ PLAN: Final = "plan.json"
 
 @dataclass(frozen=True)
 class Layout:
-    """The paths in a scene folder. A file or folder gets its name only when it is complete.
+    """The paths in a scene folder. A file or folder gets its final name only when it is complete.
 
     Attributes:
         scene: The scene's folder.
@@ -72,7 +72,10 @@ class Layout:
 
     @property
     def undistorted(self) -> Path:
-        """Undistorted photos before they are moved. Only the scratch folder of this path exists."""
+        """Undistorted photos before they are moved.
+
+        Only the scratch folder of this path is ever created.
+        """
         return self.work / "undistorted"
 
     @property
@@ -102,7 +105,7 @@ class Layout:
 
     @property
     def is_ready(self) -> bool:
-        """True if the scene is complete, so that nothing more is written."""
+        """True if the scene is complete and nothing more has to be written."""
         return self.report.is_file() and self.model.is_dir() and self.images.is_dir()
 
     @property
@@ -170,10 +173,10 @@ def _is_hidden(path: Path) -> bool:
 
 
 def emptied(folder: Path) -> Path:
-    """Make the folder new and empty, and return it.
+    """Make the folder empty, create it if it is missing, and return it.
 
     Raises:
-        UserError: The disk is full, or the folder may not be written to.
+        UserError: The disk is full, or the folder is not writable.
     """
     with disk_errors(folder):
         _delete(folder)
@@ -196,7 +199,7 @@ def clear_leftovers(layout: Layout) -> None:
 
 
 def clear_damaged(layout: Layout) -> None:
-    """Delete truncated models, and everything that was made from them."""
+    """Delete truncated models, and everything that was made from truncated models."""
     damaged = False
     for made in (layout.models, layout.placed, layout.model):
         damaged = damaged or not _is_sound(layout, made)
@@ -205,7 +208,7 @@ def clear_damaged(layout: Layout) -> None:
 
 
 def _is_sound(layout: Layout, made: Path) -> bool:
-    """Return whether the models of a stage are complete, or not made yet."""
+    """Return True if the models of a stage are complete, or not made yet."""
     models = models_in(made) if made == layout.models else [made]
     return not made.is_dir() or all(is_whole(model) for model in models)
 

@@ -34,7 +34,8 @@ def sound_models(
     """Return the models without weakly supported photos, each connected part as its own model.
 
     Global mapping places every photo that it can reach by rotations, even through a single wrong
-    pair, and gives no warning. The points that remain show whether the photo is supported.
+    pair, and gives no warning. The points that remain after a check show whether the photo is
+    supported.
 
     Args:
         models: The models after mapping.
@@ -66,7 +67,7 @@ def _parts(model: "pycolmap.Reconstruction") -> list[frozenset[int]]:
 
 
 def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.Reconstruction":
-    """Return a copy of the model with only the photos of a part."""
+    """Return a copy of the model with only the photos of one part."""
     import pycolmap
 
     alone = pycolmap.Reconstruction(model)
@@ -96,7 +97,7 @@ def found_models(layout: Layout, plan: Plan, threads: int) -> "list[pycolmap.Rec
     """Return the models, sorted by number of photos, the largest first.
 
     Raises:
-        UserError: No two photos could be brought together, the disk is full, or pycolmap failed.
+        UserError: No two photos could be connected, the disk is full, or pycolmap failed.
     """
     if not layout.models.is_dir():
         scratch = emptied(scratch_of(layout.models))
@@ -137,7 +138,7 @@ def _without_misplaced(
     Args:
         layout: The paths of the scene.
         models: The models, the largest first.
-        settled: Photos of the largest model for which no better place is known.
+        settled: Photos of the largest model for which no better pose is known.
     """
     found: dict[str, tuple[int, int]] = {}
     for number, model in enumerate(models):

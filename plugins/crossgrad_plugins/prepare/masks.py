@@ -113,7 +113,7 @@ def _asked(root: Path, wanted: Path | None) -> str | None:
 
 
 def _below(folder: str, name: str) -> str | None:
-    """Return a photo's name relative to the parent of a mask folder, or None if outside of it."""
+    """Return a photo's name relative to a mask folder's parent, or None if the photo is outside."""
     base = PurePosixPath(folder).parent.as_posix()
     if base == ".":
         return name
@@ -184,7 +184,7 @@ def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) 
 def _tell_folders(
     root: Path, folders: Mapping[str, Sequence[str]], photos: Sequence[str], wanted: Path | None
 ) -> Iterator[LeftOut]:
-    """Yield messages on mask folders, on `masks` itself only if it contains other files."""
+    """Yield messages on mask folders; on `masks` itself only if it contains other files."""
     asked = _asked(root, wanted)
     for folder, inside in sorted(folders.items()):
         named = _of_photos(root, folder, inside, photos)
@@ -227,7 +227,7 @@ def with_mask(photo: Photo, mask: Path) -> Photo:
 
 
 def counting_pixels(root: Path, photo: Photo) -> NDArray[np.uint8] | None:
-    """Return [H, W] with 255 for pixels that count by mask and transparency, or None for all.
+    """Return [H, W] with 255 for pixels that mask and transparency admit, or None for all.
 
     Raises:
         UserError: The photo or its mask is damaged, or the mask no longer fits.

@@ -1,4 +1,4 @@
-"""Search for photo pairs with matches that one epipolar geometry explains."""
+"""Search for photo pairs whose matches are explained by one epipolar geometry."""
 
 import json
 from dataclasses import dataclass
@@ -109,7 +109,7 @@ class Link:
     Attributes:
         first: Name of one photo.
         second: Name of the other photo.
-        matches: Number of matches that their epipolar geometry explains.
+        matches: Number of matches that the epipolar geometry of the two photos explains.
     """
 
     first: str
@@ -224,7 +224,7 @@ def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
 
 
 def _pairs(layout: Layout, pairings: dict[str, object]) -> str:
-    """Return the number of pairs to compare as text, " of 378", or "" if it is slow to compute."""
+    """Return the number of pairs to compare as text (" of 378"), or "" if it is slow to compute."""
     import pycolmap
 
     kinds: dict[str, Any] = {

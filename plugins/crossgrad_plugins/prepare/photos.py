@@ -31,7 +31,7 @@ _MAKE, _MODEL, _FOCAL, _FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405
 
 
 def camera_of(image: "Image") -> str:
-    """Return make, model and focal length from EXIF, which agree for photos of the same zoom."""
+    """Return make, model and focal length from EXIF, which are equal for photos of one zoom."""
     header = image.getexif()
     details = header.get_ifd(_EXIF)
     parts = [header.get(_MAKE), header.get(_MODEL), _number(details.get(_FOCAL)),
@@ -91,7 +91,7 @@ def find_photos(
 
     Args:
         root: The folder.
-        settings: Gives the mask folder, and which photos share a calibration.
+        settings: Settings that give the mask folder, and the photos that share a calibration.
         tell: Called with the number of inspected photos and the number of all photos.
         fewest: Least number of photos. A pose requires at least two photos.
 
@@ -123,7 +123,7 @@ def find_photos(
 
 
 def has_photos(root: Path) -> bool:
-    """Return whether a folder or its subfolders contain photos."""
+    """Return True if a folder or its subfolders contain photos."""
     return any(Path(name).suffix.lower() in _READ for name in _names(root))
 
 
@@ -272,7 +272,7 @@ def _look(image: "Image", header: PhotoHeader) -> tuple[float, float, bool]:
 
 
 def _most_pixels(header: PhotoHeader) -> int:
-    """Return the greatest pixel count of a photo, which COLMAP decodes at full size."""
+    """Return the maximum pixel count of a photo, because COLMAP decodes photos at full size."""
     return pillow.MOST_PIXELS * (_REDUCIBLE if header.reducible else 1)
 
 

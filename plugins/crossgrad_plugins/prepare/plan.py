@@ -1,4 +1,4 @@
-"""The plan: used photos and settings, which a later call on the same scene has to match."""
+"""The plan: used photos and settings; a later call on the same scene must match them."""
 
 import hashlib
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ class Photo(_Fixed):
         position: GPS position, or None.
         mask: Path of the mask, or None.
         mask_sha256: Digest of the mask, or None in plans of older versions.
-        transparent: True if the photo has pixels with alpha below a half, which do not count.
+        transparent: True if the photo has pixels with alpha below 0.5, which are ignored.
         brightness: Mean of the grey levels, 0 to 255.
         sharpness: Mean square of the Laplacian of the grey levels at a reduced size.
         bytes: Size of the file.
@@ -123,7 +123,7 @@ class Plan(_Fixed):
 
 
 def agreed(layout: Layout, plan: Plan) -> Plan:
-    """Return the plan to carry out, and write it if the scene has no such plan yet.
+    """Return the plan to carry out, and write it if the scene has no plan yet.
 
     The same photos and masks may be in another folder than before. A finished scene no longer
     needs its photos, so some may be missing.
@@ -187,7 +187,7 @@ def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
     Args:
         known: The plan of the scene.
         plan: The new plan.
-        some: True if photos may be missing from the new plan.
+        some: True if photos of the old plan may be missing from the new plan.
     """
     was, now = known.settings.model_dump(), plan.settings.model_dump()
     # Only the content of masks is compared, not their folder.

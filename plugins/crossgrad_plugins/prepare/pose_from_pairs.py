@@ -2,9 +2,10 @@
 
 All pairs with photos that have poses are used. The relative pose of a pair gives a rotation and a
 direction from the other photo. The distance comes from the direction of a second pair, or from
-points that the other photo shows. Each distance gives a candidate pose. The best pose has the most
-agreeing matches. A pair counts only if enough of its matches agree. Source of the relative
-pose: Hartley and Zisserman, Multiple View Geometry, 9.6. The rest is our own method.
+points that the other photo shows. Each distance gives one candidate pose. The candidate with the
+most agreeing matches is used. A pair counts only if enough of its matches agree. Source of the
+relative pose: Hartley and Zisserman, Multiple View Geometry, 9.6. The other steps were developed
+for crossgrad.
 """
 
 import itertools
@@ -54,8 +55,8 @@ class PairView:
     Attributes:
         other: Number of the other photo.
         pose: Pose of the other photo, world to camera.
-        focals: Focal lengths of the other photo and of the photo, in pixels.
-        rays: [N, 2] matches in the other photo and in the photo, in units of the focal length.
+        focals: Focal length of the other photo and of this photo, in pixels.
+        rays: [N, 2] matches in the other photo and in this photo, in units of the focal length.
         features: [N] indices of the matched features of the other photo.
     """
 
@@ -66,7 +67,7 @@ class PairView:
     features: NDArray[np.int64]
 
     def agreeing(self, pose: "pycolmap.Rigid3d") -> int:
-        """Return the number of matches that agree with a pose, or 0 if too few of the pair do."""
+        """Return the number of matches that agree with a pose, or 0 if too few agree."""
         near = int((off_lines((self.pose, pose), self.rays, self.focals) <= _PIXELS).sum())
         return near if near >= _AGREEING * len(self.features) else 0
 
@@ -132,12 +133,12 @@ class Pairs:
         return sorted(found, key=lambda sight: (-len(sight.features), sight.other))
 
     def without(self, aside: Collection[tuple[int, int]]) -> frozenset[int]:
-        """Return the photos for which `aside` contains all pairs."""
+        """Return the photos for which `aside` contains all pairs of the photo."""
         left = {photo for pair in self.matches if pair not in aside for photo in pair}
         return frozenset(self.partners.keys() - left)
 
     def contradicting(self, poses: "Mapping[int, pycolmap.Rigid3d]") -> frozenset[tuple[int, int]]:
-        """Return the pairs of photos with poses that do not agree with these poses."""
+        """Return the pairs of posed photos whose matches contradict the poses."""
         return frozenset(
             (sight.other, photo)
             for photo in poses
@@ -155,7 +156,10 @@ def support(sights: Sequence[PairView], pose: "pycolmap.Rigid3d") -> Support:
 def best_place(
     model: "pycolmap.Reconstruction", sights: Sequence[PairView]
 ) -> "tuple[Support, pycolmap.Rigid3d | None]":
-    """Return the pose with the most evidence, and the evidence. The pose is None without any."""
+    """Return the pose with the most evidence, and the evidence.
+
+    The pose is None if there is no evidence.
+    """
     most, best = Support(), None
     for pose in _places(model, sights[:_ASKED]):
         this = support(sights, pose)
@@ -185,7 +189,7 @@ class _Way:
         rotation: [3, 3] world to the photo.
         start: [3] centre of the other photo.
         direction: [3] direction from the other photo to the photo, of length 1.
-        distances: Distances along the direction, from points that the other photo shows.
+        distances: Distances along the direction, computed from points that the other photo shows.
     """
 
     rotation: NDArray[np.float64]
@@ -201,7 +205,7 @@ class _Way:
         return pycolmap.Rigid3d(pycolmap.Rotation3d(self.rotation), -self.rotation @ center)
 
     def crossing(self, other: "_Way") -> float | None:
-        """Return the distance nearest to another half-line, or None if they do not meet."""
+        """Return the distance at which another half-line crosses this one, or None if none does."""
         turned = (np.trace(self.rotation @ other.rotation.T) - 1.0) / 2.0
         along = float(self.direction @ other.direction)
         if turned < _SAME_ROTATION or abs(along) > _SAME_DIRECTION:
@@ -253,7 +257,7 @@ def _distances(
 
 
 class Rays:
-    """Features of photos without lens distortion, read when needed and cached.
+    """Features of photos without lens distortion; they are read when needed, and cached.
 
     Args:
         cameras: Cameras by number. Missing cameras are read from the database.
@@ -294,7 +298,7 @@ def off_lines(
     rays: tuple[NDArray[np.float32], NDArray[np.float32]],
     focals: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return the distances [N] of matches from epipolar lines in pixels, the larger of two photos.
+    """Return the distances [N] of matches from epipolar lines in pixels: the larger of two photos.
 
     Args:
         poses: Poses of two photos, world to camera.

@@ -1,6 +1,7 @@
 """Long calls of pycolmap, and a check of the models that pycolmap writes.
 
-The models are checked before pycolmap reads them, because it loops without end on truncated files.
+The models are checked before pycolmap reads them, because pycolmap loops without end on truncated
+files.
 """
 
 import struct
@@ -61,8 +62,8 @@ def waited(
 
     Args:
         what: Name of the call, for messages.
-        call: The call. Its argument is a token by which it can be cancelled.
-        far: Returns the progress as text. It is called every few seconds.
+        call: The call. The argument of the call is a token by which the call can be cancelled.
+        far: Function that returns the progress as text. The function is called every few seconds.
 
     Raises:
         UserError: Pycolmap failed. The error contains the reason.
@@ -132,7 +133,7 @@ def check_written(folder: Path) -> None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Return whether all files of a model exist and are not truncated."""
+    """Return True if all files of a model exist and are not truncated."""
     try:
         read_binary(folder)
     except UserError:
@@ -142,7 +143,7 @@ def is_whole(folder: Path) -> bool:
 
 
 def _has_all(path: Path, record: int) -> bool:
-    """Return whether a file contains as many records as its header says."""
+    """Return True if a file contains as many records as its header says."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

@@ -1,10 +1,11 @@
 """Second search for poses of photos that mapping left out or probably misplaced, by pairs.
 
-Mapping adds a photo by the model's points that it shows, and does not check the pose again later.
-A photo may share many features with two photos, but few with a third, and then shows few such
-points. Repeated walls and pavements may place a photo wrongly at first. Doubtful photos are
-therefore placed again by all their pairs (pose_from_pairs.py). Pairs that contradict the poses are
-disabled, points are triangulated again, and mapping continues.
+Mapping adds a photo by those points of the model that the photo shows, and does not check the pose
+again later. A photo may share many features with two photos, but few with a third photo; such a
+photo shows few points of the model. Because of repeated walls and pavements, a photo may get a
+wrong pose at first. Therefore doubtful photos are placed again by means of all their pairs
+(pose_from_pairs.py). Pairs that contradict the poses are disabled, points are triangulated again,
+and mapping continues.
 """
 
 import logging
@@ -41,10 +42,10 @@ Poses: TypeAlias = "Mapping[int, pycolmap.Rigid3d]"
 
 @dataclass(frozen=True)
 class Look:
-    """The poses of doubtful photos by their pairs.
+    """The poses of doubtful photos, computed from their pairs.
 
     Attributes:
-        better: Photo -> a pose with more evidence than its current pose, if it has one.
+        better: Photo -> a pose with more evidence than its current pose, if there is such a pose.
         settled: Doubtful photos with a pose, for which no better pose was found.
         agreeing: Number of matches that agree with the poses of the model, over all photos.
     """
@@ -64,17 +65,17 @@ def looked_again(
     """Return the models after photos of the largest model were placed again by their pairs.
 
     Args:
-        models: Models of mapping. Photos of smaller models move to the largest model if there is
-            more evidence for it.
+        models: Models of mapping. Photos of smaller models move to the largest model if their poses
+            in it have more evidence.
         database: COLMAP's database with the verified matches.
         scratch: An empty folder.
         adjust: Function that continues mapping.
-        cancelled: Returns True if the call was cancelled. It is called for every photo.
+        cancelled: Returns True if the call was cancelled. The function is called for every photo.
 
     Returns:
         The models, and the settled photos of the largest model. The largest model is returned in
-        its state with most agreeing matches. For settled photos no better pose is known, although
-        pairs contradict their pose.
+        the state in which most matches agree. Settled photos keep their pose because no better pose
+        is known, although some pairs contradict it.
 
     Raises:
         UserError: The disk is full.
@@ -139,7 +140,7 @@ class _Again:
         self._aside: frozenset[tuple[int, int]] = frozenset()
 
     def look(self, model: "pycolmap.Reconstruction") -> Look:
-        """Return the evidence on photos that are doubtful in a model, or missing from it."""
+        """Return the evidence on photos that are doubtful in a model or missing from the model."""
         with _opened(self._database) as database:
             return self._look(model, self._pairs(model, database), self._elsewhere(database))
 
@@ -173,7 +174,7 @@ class _Again:
         return Look(better, frozenset(settled), agreeing)
 
     def _elsewhere(self, database: "pycolmap.Database") -> dict[int, Support]:
-        """Return the evidence for poses in the other models, with the cameras of these models."""
+        """Return the evidence for poses in the other models, and the cameras of these models."""
         found = {}
         for model in self._others:
             pairs, poses = Pairs(_cameras_of(model), database), poses_of(model)
@@ -232,10 +233,10 @@ def _cameras_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Camera]
 
 
 def _best_known(models: Models, database: "pycolmap.Database") -> "dict[int, pycolmap.Camera]":
-    """Return each camera as refined by the first model that contains it, else a better guess.
+    """Return each camera as refined by the first model that contains it, or else a guess.
 
     Without EXIF, a focal length is guessed from the size of the photos. Mapping has refined the
-    same guess for other cameras, and the median of this correction is applied. With a wrong focal
+    same guess for other cameras; the median of these refinements is applied. With a wrong focal
     length, poses have large errors, and bundle adjustment does not always correct them.
     """
     known: dict[int, pycolmap.Camera] = {}

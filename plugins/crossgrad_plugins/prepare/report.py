@@ -35,7 +35,8 @@ class Report:
         links: Pairs with verified matches.
         result: Content of the scene.
         ways: Method that chose photos to compare, and method that found poses.
-        misplaced: Name -> matches for and against the pose of photos taken out of a model.
+        misplaced: Name of a photo that was taken out of a model -> its matches for and against its
+            pose.
     """
 
     plan: Plan
@@ -63,7 +64,7 @@ class Report:
 
     @property
     def bridges(self) -> tuple[BridgeReport, ...]:
-        """The gaps in the scene, in which photos are missing."""
+        """The gaps in the scene where photos are missing."""
         parts = parts_of(self.plan, [frozenset(part.photos) for part in self.result.parts])
         return bridges_of(self.plan, self.links, parts, self.heights)
 

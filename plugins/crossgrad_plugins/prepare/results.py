@@ -28,12 +28,14 @@ class Part:
     """A model as mapping found it.
 
     Attributes:
-        photos: Names of its photos.
-        points: Number of its points.
+        photos: Names of the model's photos.
+        points: Number of the model's points.
         error: Mean reprojection error in pixels.
-        unplaced: Reason why it has no place on Earth. Empty if it has one.
-        joined: True if it is in the scene: the largest model, and models that GPS joins to it.
-        heights: Name -> metres above ground. Empty without a place on Earth.
+        unplaced: Reason why the model has no place on Earth. Empty if the model has a place on
+            Earth.
+        joined: True if the model is in the scene, as the largest model or as a model that GPS joins
+            to it.
+        heights: Name -> metres above ground. Empty if the model has no place on Earth.
     """
 
     photos: tuple[str, ...]

@@ -27,7 +27,7 @@ _BYTES_PER_PIXEL, _BESIDE = 1.0, 2**18
 
 
 def write_scene(layout: Layout, plan: Plan, threads: int) -> None:
-    """Write the undistorted photos, their masks and, when all photos exist, the model.
+    """Write the undistorted photos and their masks, and then the model.
 
     Raises:
         UserError: The disk is full, or pycolmap failed.
@@ -111,7 +111,7 @@ def _moved(here: Path, there: Path) -> None:
 
 
 def _is_written(photo: Path) -> bool:
-    """Return whether a photo file exists and is complete."""
+    """Return True if a photo file exists and is complete."""
     # A JPEG writer that cannot write aborts the process. Other files may be truncated.
     if not photo.is_file() or photo.suffix.lower() in {".jpg", ".jpeg"}:
         return photo.is_file()

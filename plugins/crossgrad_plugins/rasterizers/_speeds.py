@@ -31,14 +31,14 @@ def torch(device: str) -> float:
 
 
 def gsplat_missing() -> str:
-    """Return the requirement of gsplat that is missing and how to install it; empty if none is."""
+    """Return gsplat's missing requirement and how to install it; empty if nothing is missing."""
     from crossgrad_plugins.rasterizers.gpu.missing import compiler_missing, package_missing
 
     return package_missing("gsplat") or compiler_missing("gsplat") or ""
 
 
 def gswarp_missing() -> str:
-    """Return the requirement of gswarp that is missing and how to install it; empty if none is."""
+    """Return gswarp's missing requirement and how to install it; empty if nothing is missing."""
     from crossgrad_plugins.rasterizers.gpu.missing import package_missing
 
     return package_missing(*GSWARP_PACKAGES) or ""

@@ -140,12 +140,12 @@ class GsplatRasterizer(Rasterizer):
 
 
 def _batch(tensors: Sequence[Tensor]) -> Tensor:
-    """Return [K, ...] of K tensors; a single tensor is not copied."""
+    """Return [K, ...] of K tensors; if there is only one tensor, it is not copied."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
 def _colors(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Return [N, 3] RGB like `view_colors`; harmonics above degree 0 use one kernel."""
+    """Return [N, 3] RGB as `view_colors` does; harmonics above degree 0 use one kernel."""
     center = camera.center.to(gaussians.means, non_blocking=True)
     coefficients = coefficients_of(gaussians) if gaussians.colors is None else None
     if coefficients is None or not gaussians.sh_degree:

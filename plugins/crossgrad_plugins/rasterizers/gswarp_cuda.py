@@ -122,10 +122,10 @@ def _colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
 
 
 def settings_of(camera: Camera, background: Tensor, enlarged: float, degree: int) -> dict[str, Any]:
-    """Return the fields of gswarp's settings for a camera of a scene enlarged by a factor.
+    """Return the fields of gswarp's settings for a camera of a scene that is enlarged by a factor.
 
-    Above degree 0, gswarp evaluates harmonics itself. Its matrices are transposed. The projection
-    maps the image to [-1, 1] and includes the principal point.
+    Above degree 0, gswarp itself evaluates the harmonics. The matrices of gswarp are transposed.
+    The projection maps the image to [-1, 1] and includes the principal point.
     """
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= enlarged

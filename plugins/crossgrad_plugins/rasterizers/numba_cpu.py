@@ -140,7 +140,7 @@ def _arrays(gaussians: Gaussians) -> GaussianArrays:
 
 
 def _counter(frame: Frame) -> Callable[[Tensor], Tensor]:
-    """Return the function for `Screen.count`; it does not keep the images of the frame alive."""
+    """Return the function for `Screen.count`, which does not keep the frame's images alive."""
     drawn = frame.projected, frame.lists, frame.masks, frame.options
 
     def count(marked: Tensor) -> Tensor:
@@ -212,7 +212,7 @@ class _Draw(torch.autograd.Function):
 def _gradient(
     gaussians: GaussianArrays, rows: Tensor | None, name: str, array: NDArray[np.float32] | None
 ) -> Tensor | None:
-    """Return the gradient of one input, as sparse rows if this was requested."""
+    """Return the gradient of one input, as sparse rows if sparse rows were requested."""
     if array is None:
         return None
     values = torch.from_numpy(array)

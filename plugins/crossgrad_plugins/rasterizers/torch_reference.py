@@ -59,7 +59,7 @@ def square_boxes(means: Tensor, radii: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def common_tiles(boxes: Tensor, others: Tensor) -> Tensor:
-    """Return [N, 4] the intersections of tile boxes; if empty, the end equals the start."""
+    """Return [N, 4] the intersections of tile boxes; an empty intersection ends where it starts."""
     first = torch.maximum(boxes[:, :2], others[:, :2])
     last = torch.minimum(boxes[:, 2:], others[:, 2:])
     return torch.cat([first, torch.maximum(first, last)], -1)
@@ -71,7 +71,7 @@ _LARGEST_RADIUS = 2.0**30
 class TorchRasterizer(Rasterizer):
     """Renders Gaussians by the common rule set, in the data type of their means.
 
-    Fast rasterizers are tested against it, so it is written to be short rather than fast.
+    Fast rasterizers are tested against this rasterizer, so the code is short rather than fast.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset(
@@ -138,7 +138,7 @@ class TorchRasterizer(Rasterizer):
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return the Gaussians to draw, front to back, their tile boxes [V, 4], and their radii.
 
-        The radii [N] int32 are the published radii; None unless the footprint is `3-sigma`.
+        The radii [N] int32 are the published radii, or None unless the footprint is `3-sigma`.
         """
         projection, shapes, colors = self._splats(gaussians, camera)
         table = splat_table(projection.means, projection.depths, colors, shapes)

@@ -1,4 +1,4 @@
-"""Tests that tell which reader accepts a folder, without an import of the readers.
+"""Functions that tell which reader accepts a folder; they do not import the readers.
 
 The entry points of the group `crossgrad.readers.accepts` name these functions.
 """
@@ -38,12 +38,12 @@ _MOST: Final = 10_000
 
 
 def blender(path: Path, folder: str = ".") -> bool:
-    """Return whether the folder holds a NeRF synthetic scene."""
+    """Return True if the folder holds a NeRF synthetic scene."""
     return begins_with(path / folder / BLENDER_FILE, b"{")
 
 
 def colmap(path: Path) -> bool:
-    """Return whether the folder holds a COLMAP model."""
+    """Return True if the folder holds a COLMAP model."""
     try:
         return bool(find_models(path))
     except OSError:
@@ -51,22 +51,22 @@ def colmap(path: Path) -> bool:
 
 
 def matrixcity(path: Path) -> bool:
-    """Return whether the folder is a MatrixCity block, or contains such blocks."""
+    """Return True if the folder is a MatrixCity block or contains such blocks."""
     return any(holds(path / name, _ROTATION) for name in pose_files(path))
 
 
 def metashape(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds a Metashape XML file of cameras."""
+    """Return True if the folder holds a Metashape XML file of cameras."""
     return bool(METASHAPE.find(Inside(path), file))
 
 
 def nerfstudio(path: Path, file: str = TRANSFORMS_FILE) -> bool:
-    """Return whether the folder holds a frames file of nerfstudio or instant-ngp."""
+    """Return True if the folder holds a frames file of nerfstudio or instant-ngp."""
     return begins_with(path / file, b"{") and not holds(path / file, _ROTATION)
 
 
 def opensfm(path: Path, names: Sequence[str] = OPENSFM_FILES) -> bool:
-    """Return whether the folder holds an OpenSfM reconstruction."""
+    """Return True if the folder holds an OpenSfM reconstruction."""
     return any(begins_with(path / name, b"[") for name in names)
 
 
@@ -76,17 +76,17 @@ def photos_alone(path: Path) -> bool:  # noqa: ARG001 - no folder is prepared un
 
 
 def realitycapture(path: Path, file: str | None = None) -> bool:
-    """Return whether the folder holds a RealityCapture CSV of camera parameters."""
+    """Return True if the folder holds a RealityCapture CSV of camera parameters."""
     return bool(REALITYCAPTURE.find(Inside(path), file))
 
 
 def uc_gs(path: Path, images: str = "images") -> bool:
-    """Return whether the folder holds a COLMAP model with photo names that mark held-out photos."""
+    """Return True if the folder holds a COLMAP model with photo names that mark held-out photos."""
     return colmap(path) and any(map(is_held_out, _photos_below(path / images)))
 
 
 def pose_files(scene: Path) -> list[str]:
-    """Return the pose files of all blocks, or only the scene's own pose file if there is one."""
+    """Return the scene's own pose file if there is one, else the pose files of all blocks."""
     found = [path.relative_to(scene).as_posix() for path in _walk(scene, 0)]
     return [TRANSFORMS_FILE] if TRANSFORMS_FILE in found else sorted(found)
 
@@ -105,7 +105,7 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def is_held_out(name: str) -> bool:
-    """Return whether UC-GS holds out a photo with this name."""
+    """Return True if UC-GS holds out a photo with this name."""
     path = PurePosixPath(name)
     folders = (folder.lower() for folder in path.parts[:-1])
     named = _EVAL.search(path.name.lower()) is not None
@@ -143,9 +143,10 @@ class Kind:
         form: Format of the file, such as XML.
         program: Program that writes the file.
         suffix: Suffix of the file name, with the dot.
-        holds: Returns whether a file is of this kind, from its first bytes.
-        expected: Description of a correct file, for errors.
-        nearly: Returns whether a file is almost of this kind.
+        holds: Function that returns whether a file is of this kind, from the first bytes of the
+            file.
+        expected: Description of a correct file, for error messages.
+        nearly: Function that returns whether a file is almost of this kind.
     """
 
     form: str
@@ -168,7 +169,7 @@ class Kind:
         return [path for path in inside.files("*") if path.suffix.lower() == self.suffix]
 
     def one(self, inside: Inside, named: str | None) -> Path:
-        """Return the file named by `reader.file`, or else the only file that (almost) matches.
+        """Return the file named by `reader.file`, else the only file (almost) of this kind.
 
         Raises:
             UserError: There is no such file, there are several, or the name leads out of the scene.

@@ -34,7 +34,7 @@ def from_opengl(
 def from_opencv(
     rotation: NDArray[np.float64], center: NDArray[np.float64], frame: Frame3D = SAME
 ) -> NDArray[np.float64]:
-    """Return the pose like `from_opengl`, for OpenCV's axes: x right, y down, z forward."""
+    """Return the pose as `from_opengl` does, for OpenCV's axes: x right, y down, z forward."""
     pose = np.eye(4)
     pose[:3, :3] = (frame.rotation @ rotation).T
     pose[:3, 3] = -pose[:3, :3] @ frame.points(center[None])[0]
@@ -53,7 +53,7 @@ class Frame(Pinhole):
     def brown(self, radial: Sequence[float], tangential: Sequence[float]) -> Calibration:
         """Return the calibration with Brown's distortion, in OpenCV's terms k1, k2, k3, p1, p2.
 
-        The simplest COLMAP model that holds all terms is used: a pinhole if all are zero.
+        The simplest COLMAP model that has all terms is used: a pinhole if all terms are zero.
         """
         k1, k2, k3 = radial
         params = (*self.params, k1, k2, *tangential)

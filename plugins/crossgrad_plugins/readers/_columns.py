@@ -54,10 +54,10 @@ def head_of(path: Path) -> bytes:
 
 
 def begins_with(path: Path, sign: bytes) -> bool:
-    """Return whether a file begins with `sign`, after a byte order mark and white space."""
+    """Return True if a file begins with `sign`, after a byte order mark and white space."""
     return head_of(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(sign)
 
 
 def holds(path: Path, piece: bytes) -> bool:
-    """Return whether the first bytes of a file contain `piece`."""
+    """Return True if the first bytes of a file contain `piece`."""
     return piece in head_of(path)

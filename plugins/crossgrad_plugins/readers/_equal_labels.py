@@ -16,7 +16,7 @@ class Labelled:
     """A camera, identified by its label.
 
     Attributes:
-        label: Label as in the file. It may contain folders and may lack the photo's suffix.
+        label: Label as in the file. The label may contain folders and may lack the photo's suffix.
         group: Label of the camera's group, or an empty text.
         sensor: Label of the camera's sensor.
         size: Width and height of the sensor's photos, in pixels.
@@ -37,7 +37,7 @@ class Labelled:
 def paired(
     cameras: Sequence[Labelled], photos: FileNames, folder: Path
 ) -> tuple[list[str], list[str]]:
-    """Return the photo of each camera, or its label if the photo is missing, and notes.
+    """Return the photo of each camera, or the camera's label if the photo is missing, and notes.
 
     A label can match photos in several folders. The photo is then chosen by folders named in the
     label, by the label of the group and by the label of the sensor. If several photos remain, the
@@ -130,7 +130,7 @@ def _leave_to_others(cameras: Sequence[Labelled], fits: list[list[str]]) -> None
 
 
 def _is_sure(camera: Labelled, name: str) -> bool:
-    """Return whether the label, the group or the sensor names the folder of a photo."""
+    """Return True if the label, the group or the sensor names the folder of a photo."""
     hints = (PurePosixPath(camera.label).parts[:-1], (camera.group,), (camera.sensor,))
     return camera.label == name or any(
         hint and all(hint) and _in_folders([name], hint) for hint in hints
@@ -138,7 +138,7 @@ def _is_sure(camera: Labelled, name: str) -> bool:
 
 
 def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
-    """Pair groups or sensors with folders by their order, and return a note if this was needed."""
+    """Pair groups or sensors with folders by order, and return a note if order was needed."""
     unclear = [i for i, names in enumerate(fits) if len(names) > 1]
     folders = sorted({_folder(name) for i in unclear for name in fits[i]})
     for of in ("group", "sensor"):

@@ -1,4 +1,4 @@
-"""Names of files within a scene: a name must not lead out of the scene's folder.
+"""Names of files within a scene: a name must not lead out of the folder of the scene.
 
 Symbolic links are resolved. docs/reliability.md explains the rule.
 """
@@ -77,7 +77,7 @@ class Inside:
         return plain
 
     def found(self, text: str, where: object, base: str, files: FileNames) -> str:
-        """Return like `name`, but if the file is missing, search `files` by the end of the path.
+        """Return the same as `name`; if the file is missing, search `files` by the end of the path.
 
         Raises:
             UserError: There is no such file, and the name leads out of the scene.
@@ -103,8 +103,8 @@ class Inside:
     def file(self, name: str, where: object) -> Path:
         """Return the path of a normalised name. The file may be missing, or may be a link.
 
-        Photos and masks do not need this check: their folder may be anywhere, and a file that is
-        not a photo is refused.
+        Photos and masks do not need this check: the folder of the photos may be anywhere, and a
+        file that is not a photo is refused.
 
         Raises:
             UserError: A folder in the path is a link that leads out of the scene.

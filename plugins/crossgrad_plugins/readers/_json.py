@@ -28,7 +28,7 @@ class Fields:
     Attributes:
         value: The members of the object.
         file: The file that contains the object.
-        place: Path of the object in the file, such as `frames[3]`. Empty for the top object.
+        place: Path of the object in the file, such as `frames[3]`. Empty for the object at the top.
     """
 
     value: Mapping[str, object]
@@ -37,18 +37,18 @@ class Fields:
 
     @property
     def here(self) -> str:
-        """The file and place of the object, for errors."""
+        """The file and the place of the object in the file, for error messages."""
         return f"{self.file}: {self.place}"
 
     def where(self, key: str) -> str:
-        """Return the file and place of a field, for errors."""
+        """Return the file and the place of a field, for error messages."""
         return f"{self.file}: {self.place}{'.' if self.place else ''}{key}"
 
     def __contains__(self, key: str) -> bool:
         return self.value.get(key) is not None
 
     def wrong(self, key: str, expected: str, found: str | None = None) -> NoReturn:
-        """Refuse a field.
+        """Raise an error that refuses a field.
 
         Raises:
             UserError: Always.
@@ -164,7 +164,8 @@ def read_object(path: Path) -> Fields:
     """Return the object in a JSON file.
 
     Raises:
-        UserError: As for `read_json`, or the file does not contain an object.
+        UserError: The file is missing, too large, too deep or not JSON, or does not contain an
+            object.
     """
     value = read_json(path)
     if not isinstance(value, dict):
@@ -187,7 +188,7 @@ def _number(value: object) -> float | None:
 
 
 def _flat(value: object, shape: tuple[int, ...]) -> Iterator[object]:
-    """Yield the values in nested lists of this shape, and nothing from a list of another length."""
+    """Yield the values in nested lists of this shape; a list of another length yields no values."""
     if not shape:
         yield value
     elif isinstance(value, list) and len(value) == shape[0]:

@@ -1,10 +1,10 @@
 """Multi-camera systems of Metashape: poses of slave cameras, computed from their masters.
 
-A slave camera has no transform of its own. Its sensor contains a location and a rotation. The
-location is the slave's centre in the axes of the master, in the units of the chunk. The rotation
-turns the slave's axes into the master's axes. The transform of the slave is therefore
-transform of the master * [rotation | location].
-Source: Metashape Expert Manual, "The slave-sensor transform: composition rule",
+A slave camera has no transform of its own. The sensor of a slave camera contains a location and a
+rotation. The location is the slave's centre in the axes of the master, in the units of the chunk.
+The rotation turns the slave's axes into the master's axes. The transform of the slave is therefore
+the transform of the master * [rotation | location]. Source: Metashape Expert Manual, "The
+slave-sensor transform: composition rule",
 https://photogrammetrycommunity.github.io/metashape-expert-manual/workflow/camera-calibration/slave-sensor-transform-recipes/
 """
 
@@ -58,7 +58,7 @@ class Rig:
         return cls(offsets, transforms, sensors)
 
     def is_slave(self, camera: Element) -> bool:
-        """Return whether the pose of a camera is computed from a master and an offset."""
+        """Return True if the pose of a camera is computed from a master and an offset."""
         return camera.find("transform") is None and camera.get("master_id") is not None
 
     def pose(self, camera: Element) -> NDArray[np.float64] | None:

@@ -30,7 +30,7 @@ def raw_scene(
         images: Photo folder relative to the scene, `.` for the scene's own folder.
         views: The posed photos.
         points: Points in the same frame as the poses.
-        notes: Notes on what the reader did.
+        notes: Notes on the actions of the reader.
     """
     return RawScene(
         root=inside.scene,
@@ -59,13 +59,13 @@ def find_points(
     frame: Frame3D = SAME,
     base: str = "",
 ) -> PointCloud:
-    """Return the points of the named file, else of a PLY with a usual name, else no points.
+    """Return the points of the named file, or else of a PLY with a usual name, or else no points.
 
     Args:
         inside: The scene.
-        options: If they name a file of points, no points are read here.
+        options: If the options name a file of points, no points are read here.
         named: Requested file, relative to `base`.
-        where: Place of the name, for errors.
+        where: Place of the name, for error messages.
         frame: Transform from the file's frame to the world.
         base: Folder of the file that names the points.
 

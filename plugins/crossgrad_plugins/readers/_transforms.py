@@ -43,9 +43,9 @@ class Posed:
 
     Attributes:
         photo: Name of the photo, relative to the scene.
-        calibration: Its lens.
+        calibration: The lens of the photo.
         pose: [4, 4] world to camera.
-        mask: Its mask file, if the frame names a mask.
+        mask: The mask file of the photo, if the frame names one.
     """
 
     photo: str
@@ -81,7 +81,8 @@ def read_frame(
     Args:
         inside: The scene.
         frame: The frame.
-        whole: The file, with the fields that all frames share. Fields of the frame come first.
+        whole: The file, with the fields that all frames share. Fields of the frame take precedence
+            over fields of the file.
         base: Folder of the file, relative to the scene.
         world: Transform from the file's world frame to the scene's world frame.
 
@@ -112,9 +113,9 @@ def transform_of(fields: Fields, key: str) -> NDArray[np.float64]:
 def read_lens(inside: Inside, frame: Fields, whole: Fields, photo: str) -> Calibration:
     """Return the lens of a frame. If the file gives no size, the photo's size is used.
 
-    A field of the frame comes before the file's field with the same name. If the frame gives a
-    quantity in one way, the file's fields for the other way are ignored: they describe another
-    lens.
+    A field of the frame takes precedence over the file's field with the same name. If the frame
+    gives a quantity in one way, the file's fields that give it in another way are ignored, because
+    they describe another lens.
 
     Raises:
         UserError: A field is missing or wrong, or the lens cannot be undistorted.
@@ -156,7 +157,10 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
 
 
 def _says_fisheye(fields: Fields) -> bool | None:
-    """Return whether a frame or file declares a fisheye lens, or None if it declares no lens."""
+    """Return True or False if a frame or file declares a lens: True for a fisheye lens.
+
+    Return None without a lens.
+    """
     if "camera_model" not in fields and "is_fisheye" not in fields:
         return None
     model = fields.text("camera_model", "PERSPECTIVE").upper()
@@ -204,7 +208,7 @@ def _focal(holder: Callable[[str], Fields], name: str, angle_name: str, side: in
 def _terms(
     holder: Callable[[str], Fields], number: Callable[[str, float | None], float]
 ) -> tuple[Sequence[float], Sequence[float]]:
-    """Return k1 to k4 and p1, p2, from single fields or from one list in this order."""
+    """Return k1 to k4 and p1, p2, from single fields, or from one list in this order."""
     fields = holder("distortion_params")
     if "distortion_params" in fields:
         terms = fields.numbers("distortion_params", 6).tolist()
@@ -213,7 +217,7 @@ def _terms(
 
 
 def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
-    """Return the photo folder (`.` for the scene's own) and the views named relative to it."""
+    """Return the photo folder (`.` for the scene's own), and the views named relative to it."""
     images = shared_folder(frame.photo for frame in frames)
     start = 0 if images == "." else len(images) + 1
     return images, tuple(

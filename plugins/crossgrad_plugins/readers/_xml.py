@@ -2,8 +2,9 @@
 
 Entities make XML dangerous: they expand without a bound and can name other files. Entities can only
 be declared in a document type. The supported formats use no document type, so a file with a
-document type is refused before its content is read. Size, depth and number of elements are bounded
-too, so that a file needs at most about ten times its size in memory. No further package is needed.
+document type is refused before its content is read. Size, depth and number of elements are limited
+too, so that a file needs at most about ten times its size in memory. No additional package is
+needed.
 """
 
 from pathlib import Path
@@ -95,7 +96,7 @@ def numbers(element: Element | None, count: int, file: Path, place: str) -> NDAr
     """Return the numbers [count] in the text of an element.
 
     Raises:
-        UserError: The element is missing or has another content.
+        UserError: The element is missing, or has other content than the expected numbers.
     """
     words = (element.text or "").split() if element is not None else []
     values: list[object] = []

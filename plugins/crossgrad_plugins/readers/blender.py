@@ -26,8 +26,8 @@ _BEHIND: Final = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "none": No
 class BlenderReader(Reader):
     """NeRF synthetic scenes: `transforms_train.json`, `transforms_test.json` and their photos.
 
-    The fields are those of nerfstudio's format, mostly only `camera_angle_x`. The alpha channel
-    of a photo is the fraction of a pixel that the object covers. Photos are blended over
+    The fields are the fields of nerfstudio's format, mostly only `camera_angle_x`. The alpha
+    channel of a photo is the fraction of a pixel that the object covers. Photos are blended over
     `reader.background` (white, as in NeRF). `--background` should name the same colour.
     """
 

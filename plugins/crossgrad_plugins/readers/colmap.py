@@ -62,7 +62,7 @@ class ColmapReader(Reader):
         return self.placed(build_scene(raw, options), raw)
 
     def placed(self, scene: Scene, raw: RawScene) -> Scene:
-        """Return the scene with its place on Earth, if the place is known.
+        """Return the scene with its place on Earth if that place is known.
 
         Raises:
             UserError: A file named by an option, or a `georef.json`, is missing or unreadable.
@@ -85,14 +85,14 @@ class ColmapReader(Reader):
 def read_raw(path: Path, images: str, wanted: str | None, options: SceneOptions) -> RawScene:
     """Return a COLMAP scene as stored in its files.
 
-    If the model has no points, they come from a PLY in the model's folder, or in a folder above it
-    within the scene.
+    If the model has no points, the points come from a PLY in the model's folder, or in a folder
+    above it within the scene.
 
     Args:
         path: The scene's folder.
         images: Folder of the photos within the scene.
         wanted: Folder of the model within the scene, or None for the model with most images.
-        options: If they name a file of points, no PLY is searched.
+        options: If the options name a file of points, no PLY is searched.
 
     Raises:
         UserError: There is no model, or a file of the model cannot be read.
@@ -171,7 +171,7 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
 def _find_rows(
     points: NDArray[np.uint64], ids: NDArray[np.uint64], order: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the rows of the points with these ids, without ids that the model does not contain."""
+    """Return the rows of the points with these ids, without ids unknown to the model."""
     if not len(ids):
         return np.zeros(0, dtype=np.int64)
     # searchsorted is many times faster with sorted queries.

@@ -54,8 +54,8 @@ _ON_EARTH: Final = ("GEOGCS", "PROJCS", "GEOCCS", "COMPD_CS")
 class MetashapeReader(Reader):
     """Agisoft Metashape's XML of cameras, with photos in a folder and points from a PLY.
 
-    The chunk's transform is applied. If it gives geocentric coordinates, cameras are moved to the
-    local frame at their middle: x east, y north, z up, in metres.
+    The chunk's transform is applied. If the transform gives geocentric coordinates, cameras are
+    moved to the local frame at their centre: x east, y north, z up, in metres.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -201,7 +201,7 @@ def _world(
 
 
 def _transform(chunk: Element, file: Path, component: str) -> tuple[Frame3D, str | None]:
-    """Return the similarity of the component or else of the chunk, and its source, or None."""
+    """Return the component's similarity, else the chunk's, and its source; None without any."""
     places = [(each, "component") for each in chunk.iterfind("components/component")
               if each.get("id", "") == component]  # fmt: skip
     for holder, name in (*places, (chunk, "chunk")):
@@ -257,7 +257,7 @@ def _sensor(element: Element, file: Path, place: str) -> Calibration:
 
 
 def _is_rolling(element: Element) -> bool:
-    """Return whether Metashape compensates the rolling shutter of a sensor."""
+    """Return True if Metashape compensates the rolling shutter of a sensor."""
     told = [each.get("value") for each in element.iterfind("property")
             if each.get("name") == _ROLLING]  # fmt: skip
     told += [each.get("value", each.text) for each in element.iterfind(_ROLLING)]

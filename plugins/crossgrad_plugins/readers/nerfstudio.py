@@ -35,9 +35,9 @@ class NerfstudioReader(Reader):
     """nerfstudio's and instant-ngp's `transforms.json`, with any lens that can be undistorted.
 
     Format: https://docs.nerf.studio/quickstart/data_conventions.html. `applied_transform` and
-    `applied_scale` are undone, so that cameras and points are in the coordinates in which they
-    were posed. `train_filenames` and `test_filenames` (else `val_filenames`) give the split,
-    unless there is a train_list.txt or test_list.txt.
+    `applied_scale` are undone, so that cameras and points are in the coordinates that the poses had
+    before these transforms. `train_filenames` and `test_filenames` (else `val_filenames`) give the
+    split, unless there is a train_list.txt or test_list.txt.
     """
 
     file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
@@ -73,7 +73,7 @@ class NerfstudioReader(Reader):
         return by_gps(build_scene(raw, options), raw)
 
     def _points(self, whole: Fields, base: str) -> tuple[str | None, object]:
-        """Return the requested file of points, and the place that names the file."""
+        """Return the requested file of points, and the place in the scene that names the file."""
         if self.points is not None:
             return self.points, "reader.points"
         if "ply_file_path" in whole:
@@ -84,7 +84,7 @@ class NerfstudioReader(Reader):
 
 
 def _applied(whole: Fields) -> Frame3D:
-    """Return the transform from the world as it was posed to the world of the file."""
+    """Return the transform from the original world of the poses to the world of the file."""
     scale = whole.positive("applied_scale") if "applied_scale" in whole else 1.0
     if "applied_transform" not in whole:
         return Frame3D(np.eye(3), np.zeros(3), scale)

@@ -2,7 +2,8 @@
 
 Sources of the format: https://opensfm.org/docs/geometry.html (axes, camera models, pixels),
 https://opensfm.org/docs/dataset.html (reconstruction file format). Normalised coordinates have
-their origin in the middle of the photo. Their unit is the longer side of the photo.
+their origin in the middle of the photo. The unit of normalised coordinates is the longer side of
+the photo.
 """
 
 from collections.abc import Sequence
@@ -41,7 +42,8 @@ class OpenSfmReader(Reader):
     """OpenSfM's `reconstruction.json`, by itself or in a project of OpenDroneMap.
 
     If there are several reconstructions, the reconstruction with the most photos is read.
-    Perspective, radial, Brown's and fisheye cameras are undistorted. Other cameras are refused.
+    Perspective, radial, Brown's and fisheye cameras are undistorted. Scenes with other cameras are
+    refused.
     """
 
     images: str = Field("images", description="folder of the photos within the scene")
@@ -93,7 +95,7 @@ class OpenSfmReader(Reader):
 
 
 def _choose(file: Path) -> tuple[Fields, list[str]]:
-    """Return the reconstruction with the most photos, and a note on the others, if any."""
+    """Return the reconstruction with the most photos, and a note on other reconstructions."""
     whole = Fields({"reconstructions": read_json(file)}, file)
     models = whole.items("reconstructions")
     if not models:
@@ -197,8 +199,8 @@ def _points(chosen: Fields) -> PointCloud:
 def _column(points: Sequence[Fields], key: str) -> NDArray[np.float64]:
     """Return one field [P, 3] of all points.
 
-    All points are converted at once, because there may be millions. If a number is wrong, they are
-    converted one by one, so that the error names the field.
+    All points are converted at once, because there may be millions. If a number is wrong, the
+    points are converted one by one, so that the error names the field.
     """
     stored = [each.value.get(key) for each in points]
     lists = [each for each in stored if isinstance(each, list) and len(each) == 3]  # noqa: PLR2004

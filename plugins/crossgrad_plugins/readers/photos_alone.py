@@ -14,8 +14,8 @@ class PhotosAloneReader(Reader):
     """Photos without poses (`--prepare`): their cameras are found, which takes minutes or more.
 
     The prepared scene is stored in a folder next to the photos. Later calls of `crossgrad prepare`
-    and resumed runs use it again. When it is complete, the photos and its folder `prepare/` may be
-    deleted. This reader is never chosen automatically.
+    and resumed runs use it again. When the scene is complete, the photos and the scene's folder
+    `prepare/` may be deleted. This reader is never chosen automatically.
     """
 
     scene: Path | None = Field(

@@ -121,7 +121,9 @@ def _rows(file: Path) -> list[_Row]:
 
 
 def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
-    """Return the cells of a row, with numbers converted. Other text is refused when it is used.
+    """Return the cells of a row, with numbers converted.
+
+    Cells with other text are refused only when they are used.
 
     Numbers may use a comma instead of the decimal point.
     """
@@ -156,7 +158,7 @@ def _lens(fields: Fields, photo: Path) -> Calibration:
     """Return the lens of a photo. If the photo is missing, its size is set to 1 x 1 pixel.
 
     Raises:
-        UserError: A number is wrong, or a term has no counterpart in COLMAP's models.
+        UserError: A number is wrong, or a distortion term has no counterpart in COLMAP's models.
     """
     focal = fields.positive("f")
     px, py, k1, k2, k3, k4, t1, t2 = (fields.number(key, 0.0) for key in _LENS)

@@ -19,8 +19,8 @@ class UcGsReader(ColmapReader):
     """COLMAP scenes whose photo folders begin with `train` and `test`, as in UC-GS.
 
     A photo is held out if a folder in its path begins with `test`, or if its name contains the
-    word `eval`. All other photos are trained on. Further folders (`aerial`, `street`) give the
-    regimes. Without such folders, the footprint gives the regimes.
+    word `eval`. All other photos are used for training. Further folders (`aerial`, `street`) give
+    the regimes. Without such folders, the footprint gives the regimes.
     """
 
     @override

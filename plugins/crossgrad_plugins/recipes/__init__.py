@@ -1,1 +1,1 @@
-"""Recipes: the decided settings of a run."""
+"""Recipes, which decide settings of a run."""

@@ -74,7 +74,7 @@ class Auto(Recipe):
 
 
 class Choice:
-    """The values that several decisions share. Each value is computed once.
+    """Values that several decisions need. Each value is computed once.
 
     Args:
         facts: The facts about the run.
@@ -86,13 +86,13 @@ class Choice:
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether the backbone's Gaussians have their own axes and are rendered as published."""
+        """True if the backbone's Gaussians have their own axes and are rendered as published."""
         backbone = self.facts.backbone
         return bool(backbone.axes) and backbone.response == "plain"
 
     @cached_property
     def few_passes(self) -> bool:
-        """Whether the run renders each training photo only a few times."""
+        """True if the run renders each training photo only a few times."""
         views = self.facts.views
         if views is None or "beta2" in self.given:
             return False
@@ -121,7 +121,7 @@ class Choice:
         return self.facts.densifier(self.densifier_name)
 
     def default_growth(self, *, budgeted: bool) -> Literal["unbounded", "budget"]:
-        """Return the growth mode for any length: set by the user or by the densifier."""
+        """Return the growth mode for any length: set by the user, or else by the densifier."""
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
@@ -137,13 +137,13 @@ class Choice:
 
     @cached_property
     def growth(self) -> Literal["unbounded", "budget"]:
-        """The growth mode of this run; there is no budget at the published length."""
+        """The growth mode of this run; at the published length there is no budget."""
         usual = self.default_growth(budgeted=self.densifier.budgeted)
         return usual if self.length < REFERENCE or "growth" in self.given else "unbounded"
 
     @cached_property
     def led(self) -> bool:
-        """Whether growth follows the schedule of a budget that suits the length."""
+        """True if growth follows the schedule of a budget that suits the length."""
         return self.growth == "budget" and self.length < REFERENCE
 
 
@@ -312,7 +312,7 @@ def _rate_factor(choice: Choice) -> float:
 
 
 def _beta1(choice: Choice) -> float:
-    """Return the decay of the first moment: published for batch rules and for anchors."""
+    """Return the decay of the first moment: the published value for batch rules and for anchors."""
     facts = choice.facts
     if facts.views is None or facts.batched or not facts.backbone.axes:
         return BETA1

@@ -24,13 +24,13 @@ OPENED: Final = 10.0
 
 
 def budget(start: int, length: int, pixels: float = PIXELS, *, few_passes: bool = False) -> int:
-    """Return the maximum number of primitives of a run; 0 for no bound, as at the published length.
+    """Return the maximum number of primitives; 0 means no limit, as at the published length.
 
     Args:
         start: Number of primitives at the start.
         length: Length of the run, in views.
         pixels: Mean number of pixels of a training photo.
-        few_passes: Whether the run renders each photo only a few times.
+        few_passes: True if the run renders each photo only a few times.
     """
     if length >= REFERENCE:
         return 0

@@ -36,7 +36,7 @@ class Vanilla30k(Auto):
 
 
 class Vanilla60k(Auto):
-    """One view per step, with as many views as an arm with two views per step renders."""
+    """One view per step, with as many views in total as an arm with two views per step renders."""
 
     settings: ClassVar[Mapping[str, Any]] = {
         **BASE,
@@ -92,7 +92,7 @@ class GradNorm(Auto):
 
 
 class ConfGate(Auto):
-    """A near and a far view per step, and the gate by the confidence of a conflict."""
+    """A near and a far view per step, and the gate that uses the confidence of a conflict."""
 
     settings: ClassVar[Mapping[str, Any]] = {**PAIRS, "operator": "confgate"}
 

@@ -35,8 +35,8 @@ class Course:
     """A sequence of increasing scales, followed by full size.
 
     Attributes:
-        ends: Shares of the window, at most 1, at which each scale ends; never decreasing.
-        scales: The scales, in (0, 1), as many as `ends`; never decreasing.
+        ends: Shares of the window, at most 1, at which the scales end; they never decrease.
+        scales: The scales, in (0, 1), one for each of `ends`; they never decrease.
     """
 
     ends: tuple[float, ...] = ()
@@ -93,8 +93,8 @@ class Part:
 class CoarseToFine(Resolution):
     """Renders and compares small photos first, then larger photos.
 
-    A scale never decreases. This also holds if the length of the run follows the clock and its end
-    moves: the state contains the largest scale that each course has reached.
+    A scale never decreases. This also holds if the clock limits the run and the expected end
+    changes: the state contains the largest scale that each course has reached.
     """
 
     smallest: int = Field(
@@ -103,7 +103,7 @@ class CoarseToFine(Resolution):
 
     @abstractmethod
     def window(self, schedule: Schedule) -> float:
-        """Return the count of views or steps from which views have full size; 0: from the start."""
+        """Return the count of views or steps after which views have full size, or 0."""
 
     @abstractmethod
     def parts(self) -> Mapping[str, Part]:
@@ -130,7 +130,7 @@ class CoarseToFine(Resolution):
         return tuple(found), PluginState({_REACHED: cast("Json", reached)})
 
     def measured(self, scene: Scene) -> "CoarseToFine":
-        """Return the resolution fitted to the scene; a run fits it before its first step."""
+        """Return the resolution fitted to the scene; a run calls this before the first step."""
         return cast("CoarseToFine", self.fitted_to(scene))
 
     @override
@@ -152,7 +152,7 @@ class CoarseToFine(Resolution):
         return schedule.pace.views(step) * (rendered / every if every else 1.0)
 
     def of_photo(self, camera: Camera, scale: float) -> float:
-        """Return the scale, raised so that the photo keeps enough pixels."""
+        """Return the scale, raised if the photo would otherwise have too few pixels."""
         least = self.smallest / min(camera.width, camera.height)
         return 1.0 if max(scale, least) >= FULL_FROM else max(scale, least)
 

@@ -13,7 +13,7 @@ from crossgrad_plugins.resolutions.coarse_to_fine import CoarseToFine, Course, P
 class Octaves(CoarseToFine):
     """Photos at 1/4 of their size first, then at 1/2, then at full size for the rest of the run.
 
-    Ours.
+    This schedule was developed for crossgrad.
     """
 
     quarter_until: float = Field(

@@ -46,11 +46,12 @@ class Scales(BaseModel):
 
 
 class Spectral(CoarseToFine):
-    """Keeps photos small as long as the small size contains much of their spectrum.
+    """Keeps photos small as long as the small size contains most of their spectrum.
 
     X(F_r) is the sum of the amplitudes of the frequencies that photos at 1 / r of the size contain.
-    A run begins with the r at which X(F_r) = X(F) / ratio. It leaves an r for a finer r after the
-    share X(F_r) / X(F) of the window. Between the levels of r, the number of pixels grows linearly.
+    A run begins with the r at which X(F_r) = X(F) / ratio. The run changes from an r to the next
+    finer r after the share X(F_r) / X(F) of the window. Between the levels of r, the number of
+    pixels grows linearly.
 
     Source: DashGaussian (arXiv 2503.18402).
     """
@@ -163,8 +164,8 @@ def kept_shares(views: Sequence[View]) -> Floats:
     X(F) is the sum of the amplitudes |DFT| of the grey photos. X(F_r) is the sum over the
     frequencies that a photo at 1 / r of the size contains: at most 1 / r of the highest frequency,
     in x and in y. Each photo is processed by one thread, and sums are in the order of the photos,
-    so the result does not depend on the number of threads. Photos whose amplitudes are all zero
-    keep everything at every scale.
+    so the result does not depend on the number of threads. For photos whose amplitudes are all
+    zero, the share is 1 at every scale.
 
     Args:
         views: The views, at least one.
@@ -185,7 +186,7 @@ def _of_view(view: View) -> Floats:
 
 
 def grey_window(image: Tensor, mask: Tensor | None) -> Floats:
-    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean of others.
+    """Return [h, w] the middle of a photo in grey, 0 to 255; masked pixels get the mean.
 
     Args:
         image: [H, W, 3] uint8.

@@ -17,10 +17,10 @@ _EIGHTH, _QUARTER = 0.3, 0.6
 
 
 class Strided(CoarseToFine):
-    """Renders one pixel of each n x n up to a share of the run, a different pixel in each step.
+    """Renders one pixel of each n x n block up to a share of the run, a new pixel in each step.
 
     Photos are not reduced. The rendered pixels have the same values as in the full render. So the
-    gradients of a per-pixel error are unbiased. Ours.
+    gradients of a per-pixel error are unbiased. This schedule was developed for crossgrad.
     """
 
     strided: ClassVar[bool] = True

@@ -1,7 +1,7 @@
 """Dropout of random Gaussians in training views, so that a run does not overfit few photos.
 
-Source: DropGaussian (Park et al. 2025), whose share grows with the steps. The constant share and
-the choice of scenes are ours (docs/few-photos.md).
+Source: DropGaussian (Park et al. 2025), where the share of omitted Gaussians grows with the steps.
+The constant share and the choice of scenes were developed for crossgrad (docs/few-photos.md).
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ class Dropout(Rule):
 
     @hookimpl
     def crossgrad_view_gaussians(self, context: GaussiansContext) -> GaussiansResult:
-        """Raise the opacity of the remaining Gaussians to replace the omitted ones."""
+        """Raise the opacity of the remaining Gaussians to compensate for the omitted Gaussians."""
         gaussians = context.gaussians
         draws = _draws(context.rngs[NAME], len(gaussians), gaussians.opacities.device)
         raised = gaussians.opacities * ((draws >= self.share) / (1.0 - self.share))
@@ -37,7 +37,7 @@ class Dropout(Rule):
 
 
 def _draws(rng: np.random.Generator, count: int, device: torch.device) -> Tensor:
-    """Return [N] uniform numbers in [0, 1), drawn on the device, because the CPU is slow."""
+    """Return [N] uniform numbers in [0, 1), drawn on the device, because CPU draws are slow."""
     if device.type == "cpu":
         return torch.from_numpy(rng.random(count, dtype=np.float32))
     generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 63)))

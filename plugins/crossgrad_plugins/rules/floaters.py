@@ -1,8 +1,8 @@
 """Removal of floaters at the end of a run: primitives near a camera that no training photo shows.
 
 A step may move a Gaussian behind its camera or out of the photo at the side. Then no photo has a
-gradient for it, so it does not change any more. If it is opaque, it hides the scene in photos from
-nearby (docs/floaters.md). The rule is ours.
+gradient for it, so it does not change any more. If the Gaussian is opaque, it hides the scene in
+photos from nearby (docs/floaters.md). The rule was developed for crossgrad.
 """
 
 from typing import Final
@@ -81,12 +81,12 @@ def _primitives(model: Model) -> int:
 def floaters(model: Model, empty: float) -> Tensor:
     """Return [F] int64 rows of primitives in empty space that touch no training photo.
 
-    A hidden primitive counts as touched. A primitive is a floater only if the rasterizer omits it
-    from every training photo.
+    A primitive that is hidden by other primitives counts as touched. So a primitive is a floater
+    only if the rasterizer omits it from every training photo.
 
     Args:
         model: The model at the end of the run.
-        empty: See `in_empty_space`.
+        empty: Share of the distance from a camera to the nearest point that the camera sees.
     """
     parameters, backbone = model.parameters, model.backbone
     if backbone.positions not in parameters:
@@ -116,12 +116,12 @@ def cameras_that_tell(scene: Scene) -> list[View]:
 
 
 def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -> NDArray[np.bool_]:
-    """Return [N] bool: whether each position is in the empty space around the nearest camera.
+    """Return [N] bool: True if a position is in the empty space around the nearest camera.
 
     Args:
         positions: [N, 3], local frame.
-        scene: The scene; its training cameras and their SfM points are used.
-        empty: Share of the distance from a camera to the nearest point that it sees.
+        scene: The scene; its training cameras and the SfM points that they see are used.
+        empty: Share of the distance from a camera to the nearest point that the camera sees.
     """
     from scipy.spatial import cKDTree  # Slow to import.
 

@@ -21,7 +21,7 @@ class LrTail(Rule):
     def crossgrad_rate_factor(
         self, rate: LearningRate, step: int, schedule: Schedule
     ) -> float | None:
-        """Decay log-linearly from 1 to `factor`; return None for rates that decay already."""
+        """Decay rates log-linearly from 1 to `factor`; return None for rates that decay already."""
         total = schedule.total
         step, start = min(step, total), (1.0 - self.share) * total
         if rate.decays or step <= start:

@@ -1,9 +1,9 @@
 """A bound on the sizes of Gaussians near cameras.
 
-A rasterizer projects a Gaussian as if it were small compared with its distance. A large Gaussian
-beside or behind a camera therefore spreads over the camera's view, and a training photo may not
-show it (docs/floaters.md). Cameras that have the Gaussian in their photo correct its size
-themselves. The rule is ours.
+A rasterizer projects a Gaussian as if the Gaussian were small compared with its distance. A large
+Gaussian beside or behind a camera therefore spreads over the camera's view, and a training photo
+may not show it (docs/floaters.md). If a camera has the Gaussian in its photo, training corrects the
+size without this rule. The rule was developed for crossgrad.
 """
 
 from math import log
@@ -38,7 +38,7 @@ _AT_ONCE: Final = 2**20
 
 
 class ScaleClamp(Rule):
-    """Bounds standard deviations of Gaussians by the distance to cameras that do not show them."""
+    """Limits standard deviations of Gaussians by the distance to cameras that do not show them."""
 
     ratio: float = Field(
         0.5,
@@ -49,7 +49,7 @@ class ScaleClamp(Rule):
 
     @hookimpl
     def crossgrad_after_optimizer(self, context: AfterStepContext) -> DensifyResult | None:
-        """Shorten axes that are too long, in every step that checks the sizes."""
+        """Shorten axes that are too long, in each step in which sizes are checked."""
         names, scene, ratio = context.backbone.gaussian_tensors, context.scene, self.ratio
         if context.step % EVERY or names is None:
             return None
@@ -76,8 +76,9 @@ class ScaleClamp(Rule):
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:
     """Return [N] bool: True for all positions [N, 3] nearer than `distances` [N] to any camera.
 
-    A few positions that are farther away may be True as well. The product form of the squared
-    distance is fastest. It loses precision for large coordinates, so an error bound is subtracted.
+    A few positions that are farther away may be True as well. The squared distance is computed as a
+    product, which is fastest. The product loses precision for large coordinates, so an error bound
+    is subtracted.
     """
     centers = torch.from_numpy(scene.centers).to(positions)
     squares, of_centers = (each.square().sum(dim=1) for each in (positions, centers))

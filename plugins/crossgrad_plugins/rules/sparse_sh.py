@@ -1,4 +1,4 @@
-"""SH bands that are updated only in some steps, which saves time (docs/schedules.md)."""
+"""Updates of SH bands in only some of the steps, which saves time (docs/schedules.md)."""
 
 from collections.abc import Mapping
 

@@ -53,7 +53,7 @@ class WeightAveraging(Rule):
     def crossgrad_eval_parameters(
         self, states: Mapping[str, PluginState]
     ) -> Mapping[str, Tensor] | None:
-        """Return the mean parameters, or None if no step was averaged yet."""
+        """Return the mean parameters, or None if no step has been averaged yet."""
         held = states.get(NAME, EMPTY_STATE)
         count = held.values.get(_COUNT)
         if not isinstance(count, int):
@@ -67,7 +67,7 @@ def _added(
 ) -> PluginState:
     """Return the state with the parameters added to its sums.
 
-    Sums have the same bits for any number of threads. The division follows when the means are used.
+    Sums have the same bits for any number of threads. The sums are divided when the means are used.
     """
     known = {**state.tensors, **state.per_primitive}
     sums: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})

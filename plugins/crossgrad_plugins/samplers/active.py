@@ -32,8 +32,8 @@ class Active(Sampler):
     the view's scale changes. Views that were never rendered have no running loss; they are drawn
     first, as first view or as partner.
 
-    Source: the paper, active loss-disparity pairing. The values of top, temperature and decay are
-    ours, because the paper does not give them.
+    Source: the paper, active loss-disparity pairing. The values of top, temperature and decay were
+    chosen for crossgrad, because the paper does not give them.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)
@@ -64,8 +64,8 @@ class Active(Sampler):
     ) -> tuple[dict[str, float], dict[str, int]]:
         """Return the running loss and the octave of each view (its index as text, for JSON).
 
-        The losses include the last step. A view's running loss starts again when the view is
-        rendered at another octave of scale. Views at full size have no entry in the octaves.
+        The losses include the last completed step. A view's running loss starts again when the view
+        is rendered at another octave of scale. Views at full size have no entry in the octaves.
         """
         losses = dict(cast("Mapping[str, float]", state.values.get("losses", {})))
         octaves = dict(cast("Mapping[str, int]", state.values.get("octaves", {})))

@@ -26,7 +26,7 @@ class Anchors30(Sampler):
     Intended for operator `anchors`, which projects only between the views of an anchor pair.
 
     Source: the paper, operator variants (the nearest and farthest 30 % are anchors; the sampling
-    rule is ours).
+    rule was developed for crossgrad).
     """
 
     views: ClassVar[ViewCounts] = ViewCounts(2, 2)

@@ -22,7 +22,7 @@ HALVES = ("first", "second")
 
 
 class NearFar(Sampler):
-    """K/2 near and K/2 far views per step, alternating within the step.
+    """K/2 near and K/2 far views per step; near and far views alternate within the step.
 
     With `alternating`, a step has one view: near in odd steps, far in even steps. If the grouping
     has two other labels, they alternate in alphabetical order.
@@ -54,7 +54,7 @@ class NearFar(Sampler):
         return 1 if self.alternating else self.default_views
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 2)
 
     @override
@@ -69,8 +69,8 @@ class NearFar(Sampler):
 class ThreeWay(Sampler):
     """One near, one middle and one far view per step.
 
-    A step has three renders, so compare this sampler with others at equal rendered views, not at
-    equal steps.
+    A step has three renders, so compare this sampler with other samplers at equal rendered views,
+    not at equal steps.
 
     Source: the paper, partition threshold study; groups are thirds of the radial distance.
     """
@@ -87,7 +87,7 @@ class ThreeWay(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, 3)
 
     @override
@@ -99,7 +99,7 @@ class ThreeWay(Sampler):
 class RandomSplit(Sampler):
     """K/2 views from each of two random halves of the training views, drawn once at the first step.
 
-    The sampler ignores the grouping of the run; its labels are `first` and `second`.
+    The sampler ignores the grouping of the run, and uses the labels `first` and `second`.
 
     Source: the paper announces this control but gives no results.
     """
@@ -116,7 +116,7 @@ class RandomSplit(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         return idle_order(self.order, selection.views_per_step, len(HALVES))
 
     @override
@@ -146,8 +146,8 @@ def balanced_draw(
     Args:
         groups: Label -> positions of its training views, in the order of the draws.
         context: The step.
-        state: The state that this function returned last. With order `epoch` it contains one
-            `EpochOrder` per label.
+        state: The state that the previous call of this function returned. With order `epoch` the
+            state contains one `EpochOrder` per label.
         order: How views are drawn within a group.
     """
     share = context.views_per_step // len(groups)

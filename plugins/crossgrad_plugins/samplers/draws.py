@@ -49,7 +49,7 @@ class EpochOrder:
     def to_json(self) -> dict[str, Json]:
         """Return the state as plain data.
 
-        The order is shared and not copied, because it never changes.
+        The list `order` is shared and not copied, because it never changes.
         """
         return {"order": cast("list[Json]", self.order), "dealt": self.drawn_views}
 
@@ -80,7 +80,7 @@ def draw(
 
 
 def require_enough(available: int, count: int) -> None:
-    """Raise an error if a draw needs more different views than are available.
+    """Raise an error if a draw needs more different views than there are.
 
     Raises:
         UserError: `count` is larger than `available`.
@@ -110,7 +110,7 @@ def training_views(context: SampleContext) -> range:
 
 
 def members_of(context: SampleContext) -> Mapping[str, tuple[int, ...]]:
-    """Return label -> positions of its training views; `near` is first and `far` is last."""
+    """Return label -> positions of the label's training views; `near` is first, `far` is last."""
     return _members(context.groups or ())
 
 

@@ -16,11 +16,11 @@ class FarthestPoint(Sampler):
 
     An epoch starts at a random view. A step takes the next K views of the order. A point of pose
     space is the camera centre and the unit viewing direction times `direction_weight`; distances
-    are Euclidean. The unit of the centre is the root mean square distance from the mean centre,
-    both computed without stray cameras. (If each step started a new order, the outermost cameras
-    would be rendered far more often than others.)
+    are Euclidean. The unit of the centre is the root mean square distance from the mean centre;
+    both are computed without stray cameras. (If each step started a new order, the outermost
+    cameras would be rendered far more often than others.)
 
-    Source: farthest-point sampling, Eldar et al. 1997; the pose space is ours.
+    Source: farthest-point sampling, Eldar et al. 1997; the pose space was developed for crossgrad.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts()

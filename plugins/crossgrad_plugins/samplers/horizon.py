@@ -22,7 +22,7 @@ _DIGITS = 6
 
 
 class Horizon(Sampler):
-    """Alternates a far views and b near views; each group has its own epochs.
+    """Alternates between a far views and b near views; each group has its own epochs.
 
     The cycle continues across steps, so the ratio is exact for every K.
 
@@ -46,7 +46,7 @@ class Horizon(Sampler):
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if 0.0 < self.coarse_share < 1.0:
             return {}
         name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")
@@ -75,7 +75,7 @@ class Horizon(Sampler):
 
 
 def _turn(state: PluginState, coarse: bool) -> int:
-    """Return the position within the cycle of the stage; 0 at the start of a stage."""
+    """Return the position in the cycle of the current stage; 0 at the start of a stage."""
     if state.values.get("coarse") != coarse:
         return 0
     return cast("int", state.values["turn"])

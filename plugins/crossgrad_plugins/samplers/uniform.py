@@ -20,8 +20,8 @@ from crossgrad_plugins.samplers.draws import EpochOrder, Order, draw, drawn, tra
 class Random(Sampler):
     """K uniform training views, independent of each other and of earlier steps.
 
-    Source: the paper, `r2view`. Its Proposition 2 assumes independent draws, so they are the
-    default.
+    Source: the paper, `r2view`. Proposition 2 of the paper assumes independent draws, so
+    independent draws are the default.
     """
 
     views: ClassVar[ViewCounts] = ViewCounts()
@@ -31,7 +31,7 @@ class Random(Sampler):
     distinct: bool = Field(False, description="draw K different views, not K independent ones")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if selection.views_per_step > 1:
             return {}
         return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}

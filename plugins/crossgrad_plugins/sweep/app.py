@@ -126,7 +126,7 @@ class Sweep:
 
     @property
     def at_a_time(self) -> int:
-        """The number of parallel runs, as far as it is known."""
+        """The number of parallel runs; 1 if it is unknown."""
         return len(self.machine.cores) if self.machine else self.request.workers or 1
 
     def standings(self, *, alive: bool) -> tuple[Standing, ...]:
@@ -143,7 +143,7 @@ class Sweep:
         return 0
 
     def foretell(self) -> int:
-        """Print the runs that would be started, and their estimated time."""
+        """Print the runs that would be started, and the estimated time of these runs."""
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         left = [each for each in found if each.state != "finished"]
         ids = {each.job.id for each in left}
@@ -176,8 +176,8 @@ class Sweep:
         """Carry out the runs that are not finished.
 
         Returns:
-            The exit code: 0 if all runs are finished, 1 if one failed, or 128 plus the number of
-            the signal that stopped the sweep.
+            The exit code: 0 if all runs are finished, 1 if a run failed, or 128 plus the number of
+                the signal that stopped the sweep.
 
         Raises:
             UserError: Another sweep is active in the folder, or the folder is not writable.

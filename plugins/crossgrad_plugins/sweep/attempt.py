@@ -39,7 +39,7 @@ class Bound:
     """A memory limit that watches a process.
 
     Attributes:
-        most: Maximum memory in bytes; None for no limit.
+        most: Maximum memory in bytes; None means no limit.
         taken: Memory in bytes when the limit was exceeded; 0 before.
     """
 
@@ -90,10 +90,10 @@ class Worker:
     Attributes:
         name: Name of the worker and of its file of records.
         out: Folder of the sweep.
-        folder: Working folder of its processes; paths in settings are relative to it.
+        folder: Working folder of the processes; paths in settings are relative to it.
         threads: Threads per run.
-        cores: Numbers of its cores; empty for any cores.
-        memory: Maximum memory of a run in bytes; None for no limit.
+        cores: Numbers of the worker's cores; empty means any cores.
+        memory: Maximum memory of a run in bytes; None means no limit.
         command: The command that trains a run.
     """
 
@@ -125,11 +125,11 @@ def is_free(job: Job, worker: Worker) -> bool:
 
 
 class Attempt:
-    """A process that trains a run from its start, or from its newest checkpoint.
+    """A process that trains a run from the start or from the newest checkpoint of the run.
 
     Args:
         job: The run.
-        worker: The worker that carries it out.
+        worker: The worker that carries out the run.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
@@ -146,7 +146,7 @@ class Attempt:
             self._process = self._started(output)
 
     def poll(self) -> Outcome | None:
-        """Return the outcome; None while the process runs."""
+        """Return the outcome of the process; None while the process runs."""
         code = self._process.poll()
         if code is None:
             if self._bound.is_exceeded(self._process.pid) and not self._asked:
@@ -214,7 +214,7 @@ class Attempt:
         return Outcome("failed", self._reason(folder, code) or f"ended with exit status {code}")
 
     def _reason(self, folder: Path, code: int) -> str:
-        """Return why the run failed: its own error, or the end of its process's output."""
+        """Return why the run failed: the run's own error, or the last output of its process."""
         error = (summary_of(folder) or {}).get("error")
         # A refused run does not write the summary, which may be from an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
@@ -249,7 +249,7 @@ class Retries:
     def once_more(self, job: Job, outcome: Outcome, worker: str = "sweep") -> bool:
         """Return True if a run must be tried again after an attempt.
 
-        A run that died too often gets a record that it failed.
+        If a run died too often, a record says that the run failed.
         """
         if outcome.status != "died":
             return False
@@ -278,7 +278,7 @@ def carried_out(job: Job, worker: Worker, name: str) -> Outcome:
 
     Args:
         job: The run.
-        worker: The worker that carries it out.
+        worker: The worker that carries out the run.
         name: Name of the worker in records.
     """
     worker = replace(worker, name=name)

@@ -23,23 +23,22 @@ Ends: TypeAlias = Mapping[tuple[str, str], Mapping[int, float | None]]
 def best_grid(
     grid: Grid, cells: Iterable[Job], standings: Iterable[Standing], folder: Path
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a grid with each arm twice: unchanged, and with its best parameters per scene.
+    """Return a grid with each arm twice: unchanged, and with the best parameters of each scene.
 
-    Its seeds differ from the seeds on which the parameters were chosen.
+    The seeds of the new grid differ from the seeds on which the parameters were chosen.
 
     Args:
         grid: The grid in which parameters vary.
-        cells: Its combinations.
+        cells: All combinations of the grid.
         standings: State of each run.
         folder: Folder of the new grid.
 
-    Returns:
-        The content of its file, and notes. The notes name parameters with a failed run, which are
-        not candidates, and best parameters at the end of their values.
+    Returns: The content of the new grid file, and notes. The notes name parameter values with a
+    failed run, which are not candidates, and best values at the end of the tested range.
 
     Raises:
-        UserError: A run of some arm and scene has not ended, all its values failed, or the grid has
-            no parameters that vary.
+        UserError: A run of some arm and scene has not ended, all its values failed, or no parameter
+            of the grid varies.
     """
     if len(choices(grid)) == len(grid.arms):
         raise UserError(
@@ -92,8 +91,8 @@ def _twice(arm: Arm, best: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, A
 def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[str, Any]:
     """Return settings by scene that give an arm the chosen parameters.
 
-    Settings by scene that the arm already has still override them. If one layer of settings cannot
-    express the result, all settings of the best runs are returned.
+    Settings by scene that the arm already has override the chosen parameters. If one layer of
+    settings cannot express the result, all settings of the best runs are returned.
     """
     arm, name = chosen.arm, scene_name(scene)
     wanted = chosen.settings(base, scene)
@@ -105,10 +104,10 @@ def _with_parameters(chosen: Choice, base: Settings, scene: str | None) -> dict[
 
 
 def _below(values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values below settings that override them, in one layer.
+    """Merge values with the settings that override them, in one layer.
 
     If a setting chooses another component, the options of the replaced component are dropped. A run
-    has one length, so another length is dropped, too.
+    has one length, so if a setting sets the length, a length among the values is dropped, too.
     """
     lengths = LENGTHS if LENGTHS & own.keys() else frozenset()
     components = {name.removesuffix(".name") for name in own if name.endswith(".name")}

@@ -1,9 +1,10 @@
-"""The process of a run: `crossgrad run` that stops, with a checkpoint, when its parent is gone.
+"""The process of a run: `crossgrad run`, stopped with a checkpoint when its parent ends.
 
     python -m crossgrad_plugins.sweep.child CORES ARGUMENT ...
 
-CORES are the numbers of the cores that it may use, joined by commas, or `-` for any. Its standard
-input is a pipe from its parent; when the pipe closes, the run is requested to stop.
+CORES are the numbers of the cores that the process may use, joined by commas, or `-` for any. The
+standard input is a pipe from the parent process; when the pipe closes, the run is requested to
+stop.
 """
 
 import os

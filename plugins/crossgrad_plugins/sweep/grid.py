@@ -49,9 +49,9 @@ class Parameter(_Part):
     """A setting that varies.
 
     Attributes:
-        values: Its values.
-        value: Its only value.
-        parameters: Settings inside it, such as the options of a component.
+        values: The values of the setting.
+        value: The only value of the setting, if it does not vary.
+        parameters: Settings inside this setting, such as the options of a component.
     """
 
     values: tuple[Any, ...] | None = Field(None, min_length=1)
@@ -83,7 +83,7 @@ class Arm(_Part):
 
     Attributes:
         name: Name of the configuration.
-        settings: Its settings.
+        settings: The settings of the configuration.
         parameters: Settings that vary in this arm, in addition to those that vary in all arms.
         by_scene: Name of a scene's folder -> settings for that scene only.
     """
@@ -123,7 +123,7 @@ class Grid(_Part):
         base: Settings of all runs, as in a configuration file.
         scenes: Scene folders; None is the bundled scene.
         seeds: Seeds.
-        arms: Configurations by name; by default a single one.
+        arms: Configurations by name; by default there is only one.
         parameters: Settings that vary in all arms.
         metric: The metric of the final table.
     """
@@ -148,7 +148,7 @@ class Grid(_Part):
     @model_validator(mode="before")
     @classmethod
     def _axes_with_names(cls, given: object) -> object:
-        """Move scenes and seeds out of the parameters; other grid formats list them there."""
+        """Move scenes and seeds out of the parameters, where other grid formats list them."""
         if not isinstance(given, dict) or not isinstance(given.get("parameters"), dict):
             return given
         moved = {"scene": "scenes", "seed": "seeds"}
@@ -191,7 +191,7 @@ class Choice(_Part):
     def settings(
         self, base: Settings, scene: str | None, assignments: Sequence[str] = ()
     ) -> Settings:
-        """Return the settings of its runs on a scene, without the seed.
+        """Return the settings of the choice's runs on a scene, without the seed.
 
         Args:
             base: The settings of all runs of the grid.
@@ -255,7 +255,7 @@ def _absolute(scene: str, here: Path) -> str:
 
 
 def _own(errors: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Drop errors about too few items that only follow from invalid items of the same list."""
+    """Drop errors about too few items if the cause is an invalid item of the same list."""
     return [
         each
         for each in errors
@@ -331,15 +331,15 @@ def _number_of_runs(grid: Grid) -> int:
 
 
 def scene_name(scene: str | None) -> str:
-    """Return the name of a scene: its folder's name."""
+    """Return the name of a scene, which is the name of its folder."""
     return "the bundled scene" if scene is None else Path(scene).name
 
 
 def with_scenes(grid: Grid, scenes: Sequence[Path]) -> Grid:
-    """Return the grid with other scenes; settings by scene are kept for scenes with the same name.
+    """Return the grid with other scenes; settings by scene are kept for scenes with equal names.
 
     Raises:
-        UserError: Two scenes have one name.
+        UserError: Two scenes have the same name.
     """
     names = [path.resolve().name for path in scenes]
     if len(set(names)) < len(names):

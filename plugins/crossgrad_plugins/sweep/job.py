@@ -20,12 +20,12 @@ class Job:
     """A run.
 
     Attributes:
-        id: Its id, which is the name of its folder.
-        label: Name of its configuration.
-        scene: Name of its scene.
-        seed: Its seed.
-        settings: The settings with which it is started.
-        seconds: Its budget of training seconds; None if another setting limits its length.
+        id: The id, which is the name of the run's folder.
+        label: Name of the run's configuration.
+        scene: Name of the run's scene.
+        seed: The seed of the run.
+        settings: The settings with which the run is started.
+        seconds: Limit of training seconds; None if another setting limits the length of the run.
     """
 
     id: str
@@ -42,7 +42,7 @@ class Job:
 
 
 def run_id(resolved: Mapping[str, Any], fingerprint: str) -> str:
-    """Return the id of a run: a hash of its resolved configuration, seed included, and its scene.
+    """Return the id of a run: a hash of its resolved configuration, with seed, and its scene.
 
     Args:
         resolved: The configuration with all options of all components.

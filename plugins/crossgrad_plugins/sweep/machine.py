@@ -1,4 +1,4 @@
-"""The number of parallel runs on this machine: separate cores for each, memory for all."""
+"""The number of parallel runs on this machine: each run gets separate cores and enough memory."""
 
 import time
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _IDLE = slice(3, 5)
 
 @dataclass(frozen=True)
 class Machine:
-    """Cores and memory, divided among workers.
+    """Cores and memory of this machine, divided among workers.
 
     Attributes:
         cores: The core numbers of each worker.
@@ -68,7 +68,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
-    """Return the cores, idle cores first, because another sweep may use some cores."""
+    """Return the cores with idle cores first, because another sweep may use some of the cores."""
     with suppress(OSError, ValueError):  # Not Linux, or another format of the counts.
         before = _counts()
         time.sleep(_LOOK)
@@ -87,7 +87,7 @@ def _counts() -> dict[int, list[int]]:
 
 
 def _busy(before: list[int], after: list[int]) -> float:
-    """Return the share of ticks between two counts in which a core was busy."""
+    """Return the share of time, measured in ticks between two counts, in which a core was busy."""
     ticks = [late - early for early, late in zip(before, after, strict=True)]
     return 1.0 - sum(ticks[_IDLE]) / max(1, sum(ticks))
 

@@ -42,7 +42,7 @@ class Plan:
 
     @property
     def jobs(self) -> tuple[Job, ...]:
-        """The runs, each run once."""
+        """The runs of the plan, without repetitions."""
         found: dict[str, Job] = {}
         for job in self.cells:
             found.setdefault(job.id, job)
@@ -56,7 +56,7 @@ def planned(grid: Grid, path: Path, assignments: Sequence[str] = ()) -> Plan:
 
     Args:
         grid: The grid.
-        path: Its file; paths in settings are relative to its folder.
+        path: The file of the grid; paths in settings are relative to the folder of this file.
         assignments: `KEY=VALUE` texts that override the grid.
 
     Raises:
@@ -87,7 +87,7 @@ class _Checked:
 
 @dataclass
 class _Planner:
-    """A planner that checks configurations and collects their problems, each problem once."""
+    """Checks configurations and collects the problems, each problem once."""
 
     base: Settings
     assignments: tuple[str, ...]
@@ -140,13 +140,13 @@ class _Planner:
 
 
 def _shortened(places: Sequence[str]) -> str:
-    """Return the first places, and the number of further places."""
+    """Return the first places, and the number of omitted places."""
     more = len(places) - MOST_PLACES
     return "; ".join([*places[:MOST_PLACES], *([f"and {more} more"] if more > 0 else [])])
 
 
 def _faults(config: "RunConfig") -> Iterator[UserError]:
-    """Yield the errors of the components themselves."""
+    """Yield the errors that the components themselves report."""
     for slot, choice in chosen(config):
         try:
             build(slot, choice.name, choice.options)

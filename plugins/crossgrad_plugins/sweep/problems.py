@@ -19,7 +19,7 @@ class Problem:
     Attributes:
         place: The place in the grid.
         what: The problem.
-        hint: The remedy; empty if it is unknown.
+        hint: The remedy; empty if none is known.
     """
 
     place: str

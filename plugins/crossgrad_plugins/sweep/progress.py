@@ -26,8 +26,8 @@ class UnderWay:
 
     Attributes:
         job: The run.
-        record: The record of its start.
-        row: Its newest evaluation, column -> text.
+        record: The record of the start of the run.
+        row: The newest evaluation of the run, column -> text.
     """
 
     job: Job
@@ -42,7 +42,7 @@ class Watch:
     Attributes:
         layout: Folder of the sweep.
         before: State of each run when the sweep started.
-        ended: Id of a run -> record of its last end since then.
+        ended: Id of a run -> record of its last end since the start of the sweep.
         under_way: The active runs.
     """
 
@@ -58,7 +58,7 @@ class Watch:
         self._begun: dict[str, Record] = {}
 
     def look(self) -> list[Record]:
-        """Read new records; return the records of runs that ended since the last call."""
+        """Read new records; return the records of runs that ended since the previous call."""
         # The clocks of machines differ, so a new record may have an earlier time.
         found = [each for each in read_records(self.layout.records) if each not in self._known]
         self._known.update(found)
@@ -133,7 +133,7 @@ class Screen:
                 _write(f"... {one_line(self._end(record))}\n")
 
     def close(self) -> None:
-        """Show the final state; a live table stays on the screen."""
+        """Show the final state; a live table is not removed from the screen."""
         self.show(at_once=True)
 
     def _draw(self, lines: list[str]) -> None:
@@ -210,7 +210,7 @@ def estimated(jobs: Sequence[Job], of: Mapping[str, Job], records: Iterable[Reco
     Args:
         jobs: The runs.
         of: Id -> run, of all runs that the records may concern.
-        records: The records of the workers.
+        records: The records that the workers wrote.
     """
     same: dict[tuple[str, ...], list[float]] = {}
     for record in records:

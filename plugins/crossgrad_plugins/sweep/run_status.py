@@ -25,9 +25,9 @@ class Standing:
 
     Attributes:
         job: The run.
-        state: Its state; an `interrupted` run has started and continues from its checkpoint.
-        error: The reason of its failure.
-        summary: The content of its summary.json, once it is finished.
+        state: The state; an `interrupted` run has started and continues from its checkpoint.
+        error: The reason why the run failed.
+        summary: The content of the run's summary.json, if the run is finished.
     """
 
     job: Job
@@ -46,12 +46,12 @@ class Record:
     """A line of a worker's file.
 
     Attributes:
-        event: An attempt at a run `begun`, or `ended`.
+        event: `begun` for the start of an attempt at a run, or `ended`.
         run: Id of the run.
         worker: Name of the worker.
         time: UTC, ISO 8601.
         host: Name of the machine.
-        status: How the attempt ended; None for a start.
+        status: How the attempt ended; None at its start.
         seconds: Wall seconds of the attempt.
         error: The error message.
     """
@@ -79,7 +79,7 @@ def standings(
     Args:
         jobs: The runs.
         layout: The folder of the sweep.
-        records: The records of its workers.
+        records: The records of the sweep's workers.
         alive: True if a sweep is active in the folder.
     """
     last = {record.run: record for record in records}
@@ -110,12 +110,12 @@ def figure(standing: Standing, name: str) -> float | None:
 
 
 def begun(folder: Path) -> bool:
-    """Return True if a run has a folder in which it can continue."""
+    """Return True if a run has a folder from which the run can continue."""
     return (folder / "config.yaml").is_file()
 
 
 def newest_row(folder: Path) -> dict[str, str]:
-    """Return the newest evaluation of a run, column -> text; empty before the first one."""
+    """Return the newest evaluation of a run, column -> text; empty before the first evaluation."""
     path = folder / "metrics.csv"
     if not path.is_file():
         return {}
@@ -159,7 +159,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def read_records(folder: Path) -> list[Record]:
-    """Read the records of all workers, ordered by time; skip incomplete and invalid lines."""
+    """Read the records of all workers, ordered by time, without incomplete or invalid lines."""
     paths = sorted(folder.glob("*.jsonl"))
     return sorted((each for path in paths for each in _lines(path)), key=lambda each: each.time)
 

@@ -72,9 +72,9 @@ def _cell(values: Sequence[float] | None, best: float | None) -> str:
 
 
 def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
-    """Write runs.csv, the table of runs; rows of earlier grids in the folder follow below.
+    """Write runs.csv, the table of runs; rows of earlier grids in the folder follow at the end.
 
-    A run of both grids gets its name in the new grid.
+    A run that is in both grids gets its name in the new grid.
     """
     rows = [(job.id, job.scene, job.label, str(job.seed)) for job in cells]
     known = {run for run, *_ in rows}
@@ -91,8 +91,8 @@ def write_plan(layout: Layout, cells: Iterable[Job]) -> None:
 def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
     """Return run and configuration of the rows of runs.csv that belong to earlier grids.
 
-    The rows of the newest grid come first. If a scene, configuration and seed has another run
-    above, this other run replaces the row, even if it has not finished.
+    The rows of the newest grid come first. A row belongs to an earlier grid if a row above it has
+    another run of the same scene, configuration and seed, even if this other run has not finished.
 
     Raises:
         UserError: The table cannot be read.
@@ -106,10 +106,10 @@ def earlier_rows(layout: Layout) -> frozenset[tuple[str, str]]:
 
 
 def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
-    """Return the rows of runs.csv; empty if there is no such table, or one with other columns.
+    """Return the rows of runs.csv; empty if there is no such table or if it has other columns.
 
     Raises:
-        UserError: The table cannot be read, or `writes` would overwrite one with other columns.
+        UserError: The table cannot be read, or `writes` would overwrite a table with other columns.
     """
     if not layout.plan.is_file():
         return []

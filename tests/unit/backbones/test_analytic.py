@@ -9,7 +9,7 @@ from crossgrad_core.testing.backbones import created
 from crossgrad_core.testing.fixtures import sample_camera, sample_phase
 
 
-def test_decodes_to_exponentials_and_sigmoids_without_dilation():
+def test_parameters_decode_to_exponentials_and_sigmoids_without_dilation():
     backbone = AnalyticSplatting()
     parameters = created(backbone)
     gaussians = backbone.decode(parameters, sample_camera(), sample_phase())

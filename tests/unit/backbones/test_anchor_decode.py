@@ -93,7 +93,7 @@ def anchor_gaussians(backbone, parameters, row, camera, factor, code):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("faded", [False, True])
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_every_gaussian_is_that_of_the_formulas(options, faded, dtype):
+def test_every_decoded_gaussian_agrees_with_the_formulas(options, faded, dtype):
     backbone, parameters = model(options, dtype)
     camera = VIEWS[0].camera
     rows = torch.tensor([0, 3, 4, 11, 17, 21])
@@ -162,7 +162,7 @@ def passes(position, log_scale, camera):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_frustum_filter_keeps_what_reaches_a_pixel(dtype):
+def test_the_frustum_filter_keeps_gaussians_that_reach_a_pixel(dtype):
     rng = np.random.default_rng(5)
     kept = 0
     for view in VIEWS:
@@ -179,7 +179,7 @@ def test_the_frustum_filter_keeps_what_reaches_a_pixel(dtype):
     assert 100 < kept < 60 * len(VIEWS) - 100
 
 
-def test_a_camera_decodes_what_passes_the_filter():
+def test_a_camera_decodes_exactly_the_anchors_that_pass_the_frustum_filter():
     backbone, parameters = model({})
     parameters["anchors"] *= 8.0
     camera = VIEWS[1].camera

@@ -36,7 +36,7 @@ def double(backbone, parameters, rows):
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_gradients_through_the_rasterizer_are_finite_differences(options):
+def test_gradients_through_the_rasterizer_pass_a_numerical_check(options):
     backbone = Scaffold(**{"offsets": 2, "feature": 8, **options})
     parameters = double(backbone, jittered(backbone), 8)
     names = trained(backbone)
@@ -95,7 +95,7 @@ LOSSES = [
 
 @pytest.mark.parametrize("faded", [False, True])
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_the_fused_pass_is_the_plain_one(options, faded):
+def test_the_fused_pass_agrees_with_the_plain_pass(options, faded):
     backbone = Scaffold(**options)
     parameters = jittered(backbone)
     rows = torch.arange(0, len(parameters["anchors"]), 2)
@@ -157,7 +157,7 @@ def test_networks_without_influence_on_the_loss_get_no_gradient():
 
 
 @pytest.mark.parametrize("anchors", [3000, 9001])
-def test_the_bits_do_not_depend_on_the_threads(anchors):
+def test_the_bits_do_not_depend_on_the_number_of_threads(anchors):
     backbone = Scaffold()
     few = jittered(backbone)
     source = torch.arange(anchors) % len(few["anchors"])
@@ -177,7 +177,7 @@ def test_the_bits_do_not_depend_on_the_threads(anchors):
 
 
 @pytest.mark.parametrize("case", ["behind", "transparent", "one", "none"])
-def test_nothing_or_little_to_draw_is_finite(case):
+def test_views_with_few_or_no_gaussians_give_finite_gradients(case):
     backbone = Scaffold()
     parameters = {n: t.detach().clone() for n, t in jittered(backbone).items()}
     if case == "behind":
@@ -198,7 +198,7 @@ def test_nothing_or_little_to_draw_is_finite(case):
     assert all(gradient is None or gradient.isfinite().all() for gradient in gradients)
 
 
-def test_the_volume_term_is_that_of_the_view():
+def test_the_volume_term_is_computed_from_the_gaussians_of_the_view():
     backbone = Scaffold()
     parameters = jittered(backbone)
     views = sample_scene().train_views

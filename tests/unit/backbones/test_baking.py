@@ -55,7 +55,7 @@ def expected(gaussians, cameras, blur):
 @pytest.mark.parametrize("blur", [0.1, 1 / 12])
 @pytest.mark.parametrize("cameras", [CAMERAS[:1], CAMERAS], ids=["one", "all"])
 @pytest.mark.parametrize("size", [1.0, 0.1, 0.01])
-def test_scales_and_opacities_are_those_of_the_formulas(blur, cameras, size):
+def test_baked_scales_and_opacities_agree_with_the_formulas(blur, cameras, size):
     gaussians = sample_gaussians(harmonics=True).detached()
     gaussians = replace(gaussians, scales=gaussians.scales * size, response="analytic")
     baked = as_plain(gaussians, cameras, blur, NEAR)
@@ -74,14 +74,14 @@ def test_baking_leaves_gaussians_outside_all_views_unchanged():
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e6])
-def test_extreme_sizes_stay_finite_and_positive(size):
+def test_baking_keeps_extreme_sizes_finite_and_positive(size):
     gaussians = sample_gaussians(harmonics=True).detached()
     baked = as_plain(replace(gaussians, scales=gaussians.scales * size), CAMERAS, 0.1, NEAR)
     assert (baked.scales > 0).all() and baked.scales.isfinite().all()
     assert ((baked.opacities >= 0) & (baked.opacities <= 1)).all()
 
 
-def test_baking_zero_gaussians_works():
+def test_baking_an_empty_model_works():
     none = Gaussians(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
     assert len(as_plain(none, CAMERAS, 0.1, NEAR)) == 0
 
@@ -112,7 +112,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("backbone", "most"), [("analytic", 0.02), ("mip", 0.02), ("distance", 0)])
-def test_a_trained_scene_loses_little_at_the_camera_it_is_baked_for(
+def test_a_trained_scene_loses_little_quality_at_the_camera_it_is_baked_for(
     backbone, most, scene, tmp_path
 ):
     choice = ComponentChoice(name=backbone)

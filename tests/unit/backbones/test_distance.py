@@ -53,7 +53,7 @@ def same_bits(one, other):
 
 
 @pytest.mark.parametrize("camera", CAMERAS[::4])
-def test_with_zero_weights_it_is_vanilla_bit_for_bit(camera):
+def test_zero_weights_give_vanilla_bit_for_bit(camera):
     parameters = created(DistanceConditioned())
     vanilla = Vanilla().decode(created(Vanilla()), camera, sample_phase())
     same_bits(DistanceConditioned().decode(parameters, camera, sample_phase()), vanilla)
@@ -64,7 +64,7 @@ def test_with_zero_weights_it_is_vanilla_bit_for_bit(camera):
 @pytest.mark.parametrize(
     "camera", [*CAMERAS[::4], at(CAMERAS[0], 9, 9, 9), at(CAMERAS[0], 0, 0, 0)]
 )
-def test_the_encoding_is_the_standardised_log_distance_within_the_range_of_training(camera):
+def test_the_encoding_is_the_standardised_log_distance_clamped_to_the_training_range(camera):
     scale = fitted_scale(CAMERAS)
     assert encoded(scale, [camera]).numpy() == pytest.approx(encoding_by_loops(camera), rel=1e-9)
 
@@ -120,7 +120,7 @@ def test_decoding_adds_weights_times_the_encoding(left_out):
         assert float(gaussians.opacities[i].detach()) == pytest.approx(wanted, rel=1e-5)
 
 
-def test_baking_is_exact_for_one_camera_and_takes_the_mean_encoding_of_several():
+def test_baking_is_exact_for_one_camera_and_uses_the_mean_encoding_for_several():
     backbone = DistanceConditioned()
     parameters = with_weights(created(backbone))
     for camera in CAMERAS[::4]:
@@ -143,7 +143,7 @@ def regularized(backbone, parameters, step, gaussians=None):
 
 
 @pytest.mark.parametrize("step", [1, 15_000, 30_000])
-def test_the_penalty_is_length_and_squared_derivative_at_the_training_cameras(step):
+def test_the_penalty_contains_length_and_squared_derivative_at_the_training_cameras(step):
     backbone = DistanceConditioned(l2_weight=0.3, smoothness_weight=0.7)
     parameters = with_weights(created(backbone))
     total = 0.0
@@ -156,7 +156,7 @@ def test_the_penalty_is_length_and_squared_derivative_at_the_training_cameras(st
     assert float(regularized(backbone, parameters, step).loss.detach()) == pytest.approx(wanted)
 
 
-def test_there_is_no_penalty_per_view_nor_without_conditions():
+def test_the_penalty_is_absent_per_view_and_without_conditions():
     parameters = created(DistanceConditioned())
     drawn = DistanceConditioned().decode(parameters, sample_camera(), sample_phase())
     assert regularized(DistanceConditioned(), parameters, 1, drawn) is None
@@ -183,7 +183,7 @@ def test_a_reset_caps_the_opacity_at_every_distance():
     assert (before < cap).any() and (before > cap).any()
 
 
-def test_gradients_through_the_reference_rasterizer():
+def test_gradients_through_the_reference_rasterizer_pass_a_numerical_check():
     backbone = DistanceConditioned(sh_degree=0)
     parameters = with_weights(created(backbone))
     few = {

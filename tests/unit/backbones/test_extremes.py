@@ -20,7 +20,7 @@ def extreme(name, backbone, crowd=5_000):
 
 @pytest.mark.parametrize("name", list(cases(1)))
 @pytest.mark.parametrize("backbone", OURS)
-def test_finite_and_close_to_float64(backbone, name):
+def test_extreme_parameters_give_finite_results_close_to_float64(backbone, name):
     model = build("backbones", backbone, {})
     case = extreme(name, model)
     exact = outcome(model, TorchRasterizer(), case, torch.float64)
@@ -33,7 +33,7 @@ def test_finite_and_close_to_float64(backbone, name):
 
 
 @pytest.mark.parametrize("backbone", OURS)
-def test_a_million_gaussians_in_one_pixel(backbone):
+def test_a_million_gaussians_in_one_pixel_give_finite_results(backbone):
     model = build("backbones", backbone, {})
     found = outcome(
         model, NumbaRasterizer(), extreme("crowded pixel", model, 1_000_000), torch.float32

@@ -29,7 +29,7 @@ def quantile(values, q):
     return values[low] + (place - low) * (values[high] - values[low])
 
 
-def test_distance_range_is_a_quantile_of_quantiles():
+def test_the_distance_range_is_a_quantile_of_quantiles():
     rng = np.random.default_rng(0)
     points, centers = rng.normal(size=(300, 3)), rng.uniform(-5, 5, (9, 3))
     pooled = []
@@ -50,7 +50,7 @@ def test_distance_range_is_a_quantile_of_quantiles():
         ([[0, 0, 0], [0, 0, 1e-30]], [[0, 0, 0], [0, 5, 0]], 5.0, MOST_LEVELS),
     ],
 )
-def test_number_of_levels_at_the_edges(points, centers, largest, levels):
+def test_the_number_of_levels_is_defined_for_degenerate_distances(points, centers, largest, levels):
     found, smallest = distance_range(np.array(points, float), np.array(centers, float), 1.0)
     assert found == pytest.approx(largest) and smallest > 0.0
     assert number_of_levels(found, smallest, 2) == levels
@@ -59,11 +59,11 @@ def test_number_of_levels_at_the_edges(points, centers, largest, levels):
 @pytest.mark.parametrize(
     ("ratio", "fork", "levels"), [(1, 2, 1), (8, 2, 4), (11, 2, 4), (12, 2, 5), (27, 3, 4)]
 )
-def test_number_of_levels(ratio, fork, levels):
+def test_the_number_of_levels_follows_from_the_distance_ratio(ratio, fork, levels):
     assert number_of_levels(5.0 * ratio, 5.0, fork) == levels
 
 
-def test_bounding_range_takes_all_axes_together():
+def test_the_bounding_range_covers_all_axes_together():
     points = np.array([[-2.0, 0.0, 1.0], [0.5, 3.0, -1.0]])
     assert bounding_range(points) == pytest.approx((-2.2, 5.5))
     assert bounding_range(np.ones((4, 3)))[1] == 0.0
@@ -88,7 +88,7 @@ def test_the_automatic_root_cell_is_four_distances_between_points():
     assert automatic_root_cell(points[:1]) > 0.0
 
 
-def test_root_cell_of_a_given_layer_and_of_a_single_place():
+def test_the_root_cell_follows_the_given_layer_and_has_a_default_for_a_single_point():
     assert root_cell(8.0, 10, 0.02) == 8.0 / 1024
     assert root_cell(0.0, -1, 0.02) == root_cell(0.0, 10, 0.02) == 0.02
 
@@ -174,7 +174,7 @@ def test_float32_distinguishes_the_cells_of_the_finest_level(fork, reach):
     assert resolvable_levels(3, fork, 0.5, 0.0) == 3
 
 
-def test_automatic_visible_share_is_the_mean():
+def test_the_automatic_visible_share_is_the_mean():
     shares = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     assert visible_share(shares, -1.0) == 0.5
     assert visible_share(shares, 0.01) == 0.01
@@ -195,7 +195,7 @@ def test_levels_open_one_by_one(step, top):
     assert allowed_top(step, (4736.84, 7894.74, 10_000.0), 2) == top
 
 
-def test_level_openings_with_ratio_one_and_without_levels():
+def test_level_openings_work_with_ratio_one_and_without_levels():
     assert opening_steps(9.0, 3, 1.0) == pytest.approx((3.0, 6.0, 9.0))
     assert opening_steps(9.0, 0, 1.5) == ()
     assert allowed_top(0, (), 0) == 0

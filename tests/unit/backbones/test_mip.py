@@ -54,7 +54,7 @@ def widths_by_loops(means, parity):
 
 
 @pytest.mark.parametrize("parity", [False, True])
-def test_filter_widths(parity):
+def test_filter_widths_agree_with_a_loop(parity):
     means = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (300, 3)))
     found = filter_widths(means, cameras(), NEAR, parity=parity)
     expected = widths_by_loops(means, parity)
@@ -80,7 +80,7 @@ def sizes(*sigmas):
     return torch.tensor(sigmas, dtype=torch.float64).log().float()[:, None].repeat(1, 3)
 
 
-def test_decoding_widens_and_fades():
+def test_decoding_enlarges_scales_and_reduces_opacities():
     backbone = MipSplatting()
     parameters = created(backbone)
     gaussians = backbone.decode(parameters, sample_camera(), sample_phase())
@@ -92,7 +92,7 @@ def test_decoding_widens_and_fades():
     assert (gaussians.response, gaussians.dilation) == ("antialiased", 0.1)
 
 
-def test_float32_holds_tiny_and_huge_scales():
+def test_float32_represents_tiny_and_huge_scales():
     raw = sizes(1e-12, 1e-6, 1e-3, 1.0, 1e6).requires_grad_()
     logits = torch.linspace(-3, 3, 5).requires_grad_()
     widths = torch.full((5,), 1e-3)
@@ -117,7 +117,7 @@ def test_scales_beyond_float32_give_no_nan(raw):
     assert not log_scales.grad.isnan().any() and not logits.grad.isnan().any()
 
 
-def test_gradients_through_the_reference_rasterizer():
+def test_gradients_through_the_reference_rasterizer_pass_a_numerical_check():
     backbone = MipSplatting(sh_degree=0)
     parameters = created(backbone)
     few = {name: tensor.detach()[:6].double() for name, tensor in parameters.items()}
@@ -159,7 +159,7 @@ def test_a_reset_caps_the_filtered_opacity():
         (Schedule.for_run(16_000, "absolute"), range(15_100, 16_000, 100)),
     ],
 )
-def test_the_filter_is_renewed_in_the_last_half(schedule, steps):
+def test_the_filter_is_updated_in_the_last_half(schedule, steps):
     assert [s for s in range(1, schedule.total + 1) if renews(schedule, s)] == list(steps)
 
 
@@ -172,7 +172,7 @@ def after_step(parameters, *, step, edited):
     )
 
 
-def test_a_renewal_is_an_edit_of_the_filter_alone():
+def test_an_update_of_the_filter_changes_no_other_tensor():
     parameters = created(MipSplatting())
     moved = {**parameters, "means": parameters["means"].detach() * 1.5}
     assert after_step(moved, step=15_050, edited=False) is None

@@ -59,7 +59,7 @@ def leveled(seed=0, **options):
     return backbone, parameters, scene
 
 
-def test_levels_and_lattice_of_a_scene_worked_out_by_hand():
+def test_levels_and_lattice_agree_with_a_scene_calculated_by_hand():
     """Cameras 1 and 8 away from a single point: D = 8, d = 1, four levels."""
     backbone = Octree(dist_ratio=1.0, base_layer=2, visible_threshold=0.0, plant_everywhere=True)
     scene = scene_of([1.0, 8.0], [[0.0, 0, 0], [1e-9, 0, 0]])
@@ -81,7 +81,7 @@ def test_cameras_at_one_distance_need_one_level():
         assert used.mask.all()
 
 
-def test_one_point_and_one_camera_make_one_anchor():
+def test_one_point_and_one_camera_create_one_anchor():
     backbone = Octree()
     parameters = backbone.create(scene_of([2.0], [[0.1, 0.1, 0.1]]), np.random.default_rng(0))
     assert parameters["anchors"].shape == (1, 3)
@@ -104,7 +104,7 @@ def test_the_automatic_threshold_removes_anchors_that_few_cameras_see():
 
 
 @pytest.mark.parametrize("rounding", WHOLE)
-def test_used_anchors_and_their_fading_by_the_formula(rounding):
+def test_used_anchors_and_their_fade_factors_agree_with_the_formula(rounding):
     backbone, parameters, scene = leveled(rounding=rounding, visible_threshold=0.0)
     root, fork, levels, distance = parameters["lattice"][3:7].tolist()
     camera = scene.views[1].camera
@@ -124,7 +124,7 @@ def test_used_anchors_and_their_fading_by_the_formula(rounding):
     assert 0 < int(used.mask.sum()) < len(used.mask) or rounding in {"ceil", "progressive"}
 
 
-def test_a_moving_camera_fades_levels_in_and_never_drops_the_coarsest():
+def test_a_moving_camera_fades_levels_in_and_always_uses_the_coarsest():
     backbone, parameters, scene = leveled(rounding="progressive", visible_threshold=0.0)
     camera, before = scene.views[0].camera, None
     for far in np.geomspace(0.4, 40.0, 400):
@@ -143,7 +143,7 @@ def test_a_moving_camera_fades_levels_in_and_never_drops_the_coarsest():
 @pytest.mark.parametrize(
     ("step", "top"), [(0, 1), (1, 1), (2499, 1), (2500, 2), (9_999, 2), (10_000, 2), (40_000, 2)]
 )
-def test_training_opens_levels_one_by_one_and_evaluation_has_them_all(step, top):
+def test_training_opens_levels_one_by_one_and_evaluation_uses_all_levels(step, top):
     """Three levels, coarse phase of 2500 of 10,000 steps, one level to open."""
     backbone, parameters, scene = leveled(visible_threshold=0.0)
     parameters["extra_levels"][:] = 9.0
@@ -160,7 +160,7 @@ def test_training_opens_levels_one_by_one_and_evaluation_has_them_all(step, top)
     assert int(parameters["levels"][used.mask].max()) == 2
 
 
-def test_drawn_gaussians_are_those_of_used_anchors_with_faded_opacity():
+def test_rendered_gaussians_belong_to_used_anchors_and_have_faded_opacity():
     backbone, parameters, scene = leveled(rounding="progressive", visible_threshold=0.0)
     plain = backbone.model_copy(update={"rounding": "ceil"})
     camera = scene.views[1].camera
@@ -187,7 +187,7 @@ def test_a_camera_that_sees_nothing_gets_no_gaussians_and_no_gradient():
     assert math.isfinite(float(loss.detach()))
 
 
-def test_baking_for_a_far_camera_leaves_fine_levels_out():
+def test_baking_for_a_far_camera_omits_fine_levels():
     backbone, parameters, scene = leveled()
     near, far = (scene.views[i].camera for i in (0, 2))
     counts = []
@@ -201,7 +201,7 @@ def test_baking_for_a_far_camera_leaves_fine_levels_out():
     assert counts[0] > counts[1]
 
 
-def test_gradients_through_the_reference_rasterizer():
+def test_gradients_through_the_reference_rasterizer_pass_a_numerical_check():
     backbone, parameters, scene = leveled(
         rounding="progressive", visible_threshold=0.0, offsets=1, feature=2
     )
@@ -246,7 +246,7 @@ def test_the_lattice_tensor_contains_all_values_that_decoding_needs():
 
 
 @pytest.mark.parametrize("backbone", [Octree(), Scaffold()])
-def test_no_visible_gaussian_to_start_from_is_reported(backbone):
+def test_a_start_without_visible_gaussians_is_reported(backbone):
     scene = sample_scene()
     faint = Vanilla().bake(
         Vanilla().create(scene, np.random.default_rng(0)), EVALUATION, [sample_camera()]
@@ -273,7 +273,7 @@ def test_omitted_anchors_are_reported_with_the_option():
     assert Octree(plant_everywhere=True).fitted_to(sample_scene())[1] == ()
 
 
-def test_a_stray_camera_does_not_set_the_levels():
+def test_an_outlier_camera_does_not_determine_the_levels():
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 3))
     distances = np.linspace(1.0, 4.0, 10)
     lattices = [

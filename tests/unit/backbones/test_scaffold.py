@@ -52,13 +52,13 @@ def test_the_automatic_voxel_is_twice_the_median_distance_to_the_nearest_point()
 @pytest.mark.parametrize(
     "points", [np.zeros((1, 3)), np.zeros((5, 3)), np.full((2, 3), 7e4)], ids=["one", "same", "far"]
 )
-def test_degenerate_clouds_have_anchors_too(points):
+def test_degenerate_point_clouds_also_get_anchors(points):
     size = automatic_voxel_size(points)
     assert size > 0
     assert len(voxel_centers(points, size)) == 1
 
 
-def test_scales_are_the_distances_to_three_neighbours():
+def test_initial_scales_are_the_distances_to_three_neighbours():
     parameters = created()
     anchors = parameters["anchors"].double().numpy()
     distances = np.linalg.norm(anchors[:, None] - anchors[None], axis=2)
@@ -69,7 +69,7 @@ def test_scales_are_the_distances_to_three_neighbours():
     assert not parameters["offsets"].any() and not parameters["features"].any()
 
 
-def test_networks_start_uniform_as_linear_layers_do():
+def test_networks_are_initialized_uniformly_like_linear_layers():
     parameters = created(feature=32, offsets=40)
     for name, width in (("mlp_cov.0", 35), ("mlp_cov.2", 32)):
         for kind in ("weight", "bias"):
@@ -81,7 +81,7 @@ def test_networks_start_uniform_as_linear_layers_do():
     assert not torch.equal(parameters["mlp_cov.0.weight"], other["mlp_cov.0.weight"])
 
 
-def test_published_learning_rates():
+def test_learning_rates_equal_the_published_rates():
     rates = {b.name: b.lr for b in Scaffold(feature_bank=True, appearance=4).blocks()}
     table = {
         "anchors": (0.0, 0.0),
@@ -98,7 +98,7 @@ def test_published_learning_rates():
         assert (rates[name].at(0.0), rates[name].at(1.0)) == pytest.approx((first, last))
 
 
-def test_rates_that_are_published_as_constant_may_end_lower():
+def test_learning_rates_published_as_constant_may_decay():
     finals = {"lr_features_final": 1e-4, "lr_scales_final": 2e-4, "lr_cov_final": 3e-4}
     rates = {b.name: b.lr.at(1.0) for b in Scaffold(**finals).blocks()}
     names = ("features", "scales", "mlp_cov")
@@ -107,7 +107,7 @@ def test_rates_that_are_published_as_constant_may_end_lower():
     assert frozen["features"].at(0.5) == 0.0
 
 
-def test_a_training_view_has_its_own_code_and_any_other_the_mean():
+def test_a_training_view_uses_its_appearance_code_and_any_other_view_the_mean():
     backbone = Scaffold(appearance=3)
     parameters = backbone.create(SCENE, np.random.default_rng(0))
 
@@ -147,7 +147,7 @@ def test_the_volume_is_regularized_per_view():
     assert regularized(Scaffold(volume_weight=0.0), gaussians) is None
 
 
-def test_a_ply_gives_anchors_where_its_visible_gaussians_are():
+def test_a_ply_gives_anchors_at_its_visible_gaussians():
     means = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
     gaussians = Gaussians(
         means, torch.zeros(3, 4), torch.ones(3, 3), torch.tensor([0.5, 0.001, 0.9])
@@ -165,7 +165,7 @@ def spread():
 
 
 @pytest.mark.parametrize("view", [0, 3, 7])
-def test_baking_for_one_camera_keeps_the_gaussians_that_it_sees(view):
+def test_baking_for_one_camera_keeps_the_gaussians_that_the_camera_sees(view):
     backbone, parameters = spread()
     camera = VIEWS[view].camera
     live = backbone.decode(parameters, camera, EVALUATION).detached()
@@ -226,7 +226,7 @@ def averaged(tables, anchor, slot, views):
     return parts[0][1], scales, rotation, total / views, fitted(parts)
 
 
-def test_baked_for_several_cameras_is_the_mean_of_those_that_see_an_anchor():
+def test_baking_for_several_cameras_averages_over_the_cameras_that_see_an_anchor():
     backbone, parameters = spread()
     cameras = [view.camera for view in VIEWS]
     tables = [looks(backbone, parameters, camera) for camera in cameras]

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("keeps_threads")
     ("name", "options"),
     [*((name, {}) for name in entries("backbones")), ("scaffold", {"feature_bank": True})],
 )
-def test_same_bits_on_any_number_of_threads(name, options, large_scene):
+def test_decoding_gives_the_same_bits_on_any_number_of_threads(name, options, large_scene):
     backbone, _ = build("backbones", name, options).fitted_to(large_scene)
     trained = sorted(t for block in backbone.trained_blocks() for t in block.tensors)
     parameters = backbone.create(large_scene, np.random.default_rng(1))

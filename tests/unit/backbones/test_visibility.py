@@ -41,14 +41,14 @@ def test_depths_and_visibility_agree_with_a_loop(camera):
 
 
 @pytest.mark.parametrize("near", [0.5, 2.0])
-def test_nothing_is_seen_at_the_near_plane(near):
+def test_points_in_front_of_the_near_plane_are_not_visible(near):
     camera = replace(CAMERAS[0], world_to_camera=torch.eye(4, dtype=torch.float64))
     points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.51], [0.0, 0.0, 2.5]])
     _, seen = depths_in_view(columns_of(points), camera, near)
     assert seen.tolist() == [False, near < 0.51, True]
 
 
-def test_the_finest_pixel_is_that_of_the_nearest_camera_in_pixels():
+def test_the_finest_pixel_belongs_to_the_nearest_camera_in_pixels():
     expected = []
     for mean in means().numpy():
         looks = [(camera, *looked_at(mean, camera)) for camera in CAMERAS]

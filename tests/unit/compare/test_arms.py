@@ -24,7 +24,7 @@ def names(folder, *runs):
     return [arm.name for arm in arms(folder, *runs)]
 
 
-def test_seeds_scenes_and_lengths_make_no_arm(tmp_path):
+def test_seeds_scenes_and_lengths_do_not_distinguish_arms(tmp_path):
     runs = [
         RunFolder(seed=0),
         RunFolder(seed=1, steps=300),
@@ -41,7 +41,7 @@ def test_an_arm_is_named_by_the_setting_that_differs(tmp_path):
     assert found == ["views=1", "views=2", "views=10"]
 
 
-def test_defaults_that_follow_from_a_component_are_not_in_the_name_of_an_arm(tmp_path):
+def test_an_arm_name_omits_defaults_that_follow_from_a_component(tmp_path):
     [scaffold, vanilla] = arms(
         tmp_path,
         RunFolder(settings={**SCAFFOLD, "densifier": {"name": "anchor", "levels": 3}}),
@@ -51,7 +51,7 @@ def test_defaults_that_follow_from_a_component_are_not_in_the_name_of_an_arm(tmp
     assert scaffold.settings == {"backbone": "scaffold", "densifier": "anchor"}
 
 
-def test_two_things_that_differ_are_both_named(tmp_path):
+def test_an_arm_name_contains_both_settings_that_differ(tmp_path):
     found = names(
         tmp_path,
         RunFolder(views_per_step=2),
@@ -79,7 +79,7 @@ def test_options_distinguish_arms_of_one_component_next_to_another_component(tmp
     ]
 
 
-def test_settings_that_follow_from_the_scene_do_not_make_an_arm(tmp_path):
+def test_settings_that_follow_from_the_scene_do_not_distinguish_arms(tmp_path):
     low, high = ({"backbone": {"name": "vanilla", "sh_degree": n}} for n in (1, 3))
     runs = [
         RunFolder(scene=scene, settings=settings, views_per_step=views)
@@ -89,7 +89,7 @@ def test_settings_that_follow_from_the_scene_do_not_make_an_arm(tmp_path):
     assert names(tmp_path, *runs) == ["views=1", "views=2"]
 
 
-def test_an_option_that_an_older_version_lacks_makes_no_arm(tmp_path):
+def test_an_option_missing_in_an_older_version_does_not_distinguish_arms(tmp_path):
     old = {"backbone": {"name": "vanilla"}}
     new = {"backbone": {"name": "vanilla", "sh_degree": 3}}
     assert len(names(tmp_path, RunFolder(settings=old), RunFolder(seed=1, settings=new))) == 1
@@ -117,7 +117,7 @@ def test_an_option_that_is_none_in_one_arm_distinguishes_the_arms(tmp_path):
     assert names(tmp_path, *runs) == ["loss.clip=0.5", "loss.clip=none"]
 
 
-def test_a_setting_that_a_file_lacks_is_as_one_that_is_not_set(tmp_path):
+def test_a_setting_missing_in_a_file_equals_a_setting_that_is_none(tmp_path):
     few = {"max_gaussians": 5000}
     runs = RunFolder(), RunFolder(seed=1), RunFolder(settings=few), RunFolder(seed=1, settings=few)
     for number, run in enumerate(runs):
@@ -142,7 +142,7 @@ def swept(folder: Path):
     return {arm.name: len(arm.runs) for arm in arms_of(found.runs, found.failed)}
 
 
-def test_one_label_of_two_sweeps_is_told_apart_by_settings(tmp_path):
+def test_equal_labels_of_two_sweeps_are_distinguished_by_settings(tmp_path):
     sweep(tmp_path / "a", {"run": RunFolder()})
     sweep(tmp_path / "b", {"run": RunFolder(settings={"backbone": {"name": "mip"}})})
     assert swept(tmp_path) == {"backbone=mip": 1, "backbone=vanilla": 1}
@@ -160,7 +160,7 @@ def test_a_label_with_one_configuration_per_scene_names_the_arm(tmp_path):
     assert swept(tmp_path) == {"one": 3, "two, rate_factor=1": 1, "two, rate_factor=2": 1}
 
 
-def test_no_two_arms_have_one_name(tmp_path):
+def test_arm_names_are_unique(tmp_path):
     sweep(tmp_path / "a", {"x": RunFolder(), "x, views=2": RunFolder(steps=9, views_per_step=4)})
     sweep(tmp_path / "b", {"x": RunFolder(views_per_step=2)})
     assert swept(tmp_path) == {"views=1": 1, "views=2": 1, "views=4": 1}
@@ -173,7 +173,7 @@ def test_a_run_with_two_labels_counts_once_next_to_a_run_without_label(tmp_path)
     assert swept(tmp_path) == {"views=1": 1, "views=2": 1}
 
 
-def test_labels_of_a_sweep_are_taken_and_a_run_can_have_two(tmp_path):
+def test_sweep_labels_become_arm_names_and_a_run_can_have_two(tmp_path):
     RunFolder(seed=0).write(tmp_path / "runs" / "aa")
     RunFolder(seed=0, steps=900).write(tmp_path / "runs" / "bb")
     plan = "run,scene,configuration,seed\naa,city,views,0\nbb,city,seconds,0\nbb,city,steps,0\n"
@@ -182,7 +182,7 @@ def test_labels_of_a_sweep_are_taken_and_a_run_can_have_two(tmp_path):
     assert [arm.name for arm in arms_of(found.runs)] == ["seconds", "steps", "views"]
 
 
-def test_lengths_in_a_label_do_not_make_an_arm(tmp_path):
+def test_lengths_in_a_label_do_not_distinguish_arms(tmp_path):
     for number in range(4):
         RunFolder(steps=100 + 100 * number).write(tmp_path / "runs" / str(number))
     labels = ('"run, steps=100"', '"run, steps=200"', '"two, views=2, seconds=9"', "run")
@@ -200,13 +200,13 @@ def test_arms_can_be_renamed(tmp_path):
             renamed(found, [wrong])
 
 
-def test_runs_that_were_to_end_after_some_views_are_another_arm():
+def test_runs_with_a_planned_number_of_views_form_another_arm():
     whole = settings_of({"planned_seconds": 60.0, "planned_views": None})
     assert settings_of({"planned_seconds": 60.0, "planned_views": 500}) != whole
     assert settings_of({"planned_seconds": 90.0, "planned_views": None}) == whole
 
 
-def test_settings_are_flat_texts():
+def test_settings_are_flattened_to_texts():
     config = {
         "scene": "x",
         "seed": 3,
@@ -228,7 +228,7 @@ def test_settings_are_flat_texts():
     }
 
 
-def test_names_may_have_other_digits_and_colons(tmp_path):
+def test_arm_names_may_contain_colons_and_unicode_digits(tmp_path):
     plan = ["run,scene,configuration,seed"]
     for number, name in enumerate(("rate 10\u2074", "two", "two: x")):
         RunFolder(views_per_step=1 + number).write(tmp_path / "runs" / f"r{number}")

@@ -52,7 +52,7 @@ def test_runs_that_cannot_be_compared_are_refused(tmp_path, other, what, found):
     assert error.value.todo
 
 
-def test_two_scenes_of_one_name_are_refused(tmp_path):
+def test_two_scenes_with_the_same_name_are_refused(tmp_path):
     first, second = RunFolder().write(tmp_path / "1"), RunFolder(seed=1).write(tmp_path / "2")
     scene = (first / "scene.json").read_text().replace('"sha256": "city"', '"sha256": "other"')
     (second / "scene.json").write_text(scene)
@@ -61,7 +61,7 @@ def test_two_scenes_of_one_name_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("content", ['{"format": 1, "views": {"a/1.j', "{}", "[]", '{"views": 1}'])
-def test_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
+def test_a_run_with_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
     """Without it nobody would see that photos differ."""
     RunFolder().write(tmp_path / "1")
     other = RunFolder(views_per_step=2).write(tmp_path / "2")
@@ -82,7 +82,7 @@ def test_a_missing_scene_file_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize("rows", [0, 1])
-def test_a_finished_run_without_its_metrics_is_refused(tmp_path, rows):
+def test_a_finished_run_with_incomplete_metrics_is_refused(tmp_path, rows):
     folder = RunFolder().write(tmp_path / "1")
     lines = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     (folder / "metrics.csv").write_text("".join(lines[:1])[: None if rows else 20])
@@ -98,7 +98,7 @@ def test_another_training_split_is_refused(tmp_path):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
-def test_a_run_records_for_which_metrics_less_is_better(tmp_path):
+def test_the_record_of_a_run_says_for_which_metrics_less_is_better(tmp_path):
     for name, views, error in (("worse", 1, 9.0), ("better", 2, 4.0)):
         path = RunFolder(views_per_step=views).write(tmp_path / name) / "summary.json"
         summary = json.loads(path.read_text()) | {"falling": ["mae"]}
@@ -109,7 +109,7 @@ def test_a_run_records_for_which_metrics_less_is_better(tmp_path):
     assert [each.favours for each in found.ends] == ["views=2"]
 
 
-def test_runs_without_held_out_photos_are_refused_for_that(tmp_path):
+def test_runs_without_held_out_photos_are_refused_with_this_reason(tmp_path):
     path = RunFolder().write(tmp_path / "run") / "summary.json"
     summary = json.loads(path.read_text())
     summary["overall"] = {"views": 0, "psnr": None, "ssim": None}
@@ -118,7 +118,7 @@ def test_runs_without_held_out_photos_are_refused_for_that(tmp_path):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
-def test_figures_of_other_metrics_are_left_out_with_a_note(tmp_path):
+def test_metrics_with_different_definitions_are_left_out_with_a_note(tmp_path):
     found = comparison(tmp_path, RunFolder(), RunFolder(seed=1, definitions={"ssim": "other"}))
     assert [quantity.name for quantity in found.quantities] == ["psnr"]
     assert any("ssim is not compared" in note for note in found.notes)
@@ -136,7 +136,7 @@ def test_figures_of_other_metrics_are_left_out_with_a_note(tmp_path):
     ],
     ids=str,
 )
-def test_seconds_of_another_machine_are_not_drawn(tmp_path, environment):
+def test_wall_seconds_of_different_machines_are_not_drawn(tmp_path, environment):
     usual = {"calibration": {"rate": 1.0}} if "calibration" in environment else {}
     runs = RunFolder(environment=usual), RunFolder(seed=1, environment=environment)
     found = comparison(tmp_path, *runs)
@@ -147,7 +147,7 @@ def test_seconds_of_another_machine_are_not_drawn(tmp_path, environment):
     assert "leave --clock out" in error.value.todo
 
 
-def test_a_busy_machine_leaves_cpu_seconds(tmp_path):
+def test_runs_on_a_busy_machine_are_compared_by_cpu_seconds_only(tmp_path):
     runs = [RunFolder(seed=n, cpu_seconds=50.0, environment=LOADED) for n in range(2)]
     assert costs(comparison(tmp_path, *runs)) == ["cpu_seconds", "views", "steps"]
     with pytest.raises(UserError, match="--clock cpu"):
@@ -159,20 +159,20 @@ def test_a_busy_machine_leaves_cpu_seconds(tmp_path):
     [("auto", ["seconds", "cpu_seconds"]), ("wall", ["seconds"]), ("cpu", ["cpu_seconds"]),
      ("none", [])],
 )  # fmt: skip
-def test_the_clock_can_be_chosen(tmp_path, clock, expected):
+def test_the_user_can_choose_the_clock(tmp_path, clock, expected):
     runs = [RunFolder(seed=n, cpu_seconds=50.0) for n in range(2)]
     found = comparison(tmp_path, *runs, clock=ClockChoice(clock))
     assert costs(found) == [*expected, "views", "steps"]
 
 
-def test_cpu_seconds_of_several_threads_do_not_compare(tmp_path):
+def test_cpu_seconds_of_several_threads_are_not_compared(tmp_path):
     many = {"torch_threads": 2}
     runs = [RunFolder(seed=n, cpu_seconds=50.0, environment=many) for n in range(2)]
     assert costs(comparison(tmp_path, *runs)) == ["seconds", "views", "steps"]
 
 
 @pytest.mark.parametrize(("rate", "left"), [(1.2, ["cpu_seconds"]), (1.4, [])])
-def test_cpu_seconds_compare_between_runs_of_about_the_same_speed(tmp_path, rate, left):
+def test_cpu_seconds_are_compared_between_machines_of_similar_speed(tmp_path, rate, left):
     runs = [
         RunFolder(
             seed=seed,
@@ -184,7 +184,7 @@ def test_cpu_seconds_compare_between_runs_of_about_the_same_speed(tmp_path, rate
     assert costs(comparison(tmp_path, *runs)) == [*left, "views", "steps"]
 
 
-def test_runs_without_cpu_seconds_have_no_such_axis_and_no_note(tmp_path):
+def test_runs_without_cpu_seconds_get_no_axis_of_cpu_seconds_and_no_note(tmp_path):
     found = comparison(tmp_path, RunFolder(), RunFolder(seed=1))
     assert costs(found) == ["seconds", "views", "steps"]
     assert found.notes == ()
@@ -202,7 +202,7 @@ def test_runs_with_different_regimes_are_compared_overall_only(tmp_path):
     ("options", "match"),
     [({"metric": "lpips"}, "no run has this figure"), ({"baseline": "x"}, "no arm has this name")],
 )
-def test_names_that_are_not_there_are_refused(tmp_path, options, match):
+def test_unknown_names_of_metrics_and_arms_are_refused(tmp_path, options, match):
     with pytest.raises(UserError, match=match) as error:
         comparison(tmp_path, RunFolder(), RunFolder(views_per_step=2), **options)
     assert "psnr" in error.value.expected or "views=1" in error.value.expected
@@ -238,7 +238,7 @@ def made_with(views, seed, commit, **more):
         (("a", "a", None, None), "'views=2' ran at crossgrad 0.2.0: "),
     ],
 )
-def test_arms_and_pairs_of_different_code_have_a_note(tmp_path, commits, expected):
+def test_arms_and_pairs_trained_with_different_code_get_a_note(tmp_path, commits, expected):
     arms = [(views, seed) for views in (1, 2) for seed in (0, 1)]
     runs = [made_with(*arm, commit) for arm, commit in zip(arms, commits, strict=True)]
     notes = differing_code(comparison(tmp_path, *runs).main)
@@ -250,13 +250,13 @@ def test_arms_and_pairs_of_different_code_have_a_note(tmp_path, commits, expecte
         assert note.endswith("that they are equally fast is not given, and bits may differ")
 
 
-def test_runs_that_do_not_say_where_they_come_from_have_no_note(tmp_path):
+def test_runs_of_unknown_code_version_get_no_note(tmp_path):
     unknown = {"commit": None, "crossgrad": None}
     runs = RunFolder(environment=unknown), made_with(2, 0, "a")
     assert differing_code(comparison(tmp_path, *runs).main) == []
 
 
-def test_many_arms_are_not_all_named(tmp_path):
+def test_a_note_about_many_arms_names_only_three(tmp_path):
     runs = [made_with(views, 0, f"c{views}") for views in range(1, 7)]
     (note,) = differing_code(comparison(tmp_path, *runs).main)
     assert "'views=3' ran at commit c3; 3 more: " in note
@@ -265,7 +265,7 @@ def test_many_arms_are_not_all_named(tmp_path):
     assert "'views=2', 'views=3', 'views=4' and 2 more ran at commit b: " in note
 
 
-def test_the_command_prints_the_note(tmp_path, monkeypatch, capsys):
+def test_compare_prints_the_note_about_different_code(tmp_path, monkeypatch, capsys):
     for views, commit in ((1, "aaaaaaa"), (2, "bbbbbbb")):
         made_with(views, 0, commit).write(tmp_path / "runs" / f"{views}")
     monkeypatch.setattr(app, "drawn_figures", lambda _: [])

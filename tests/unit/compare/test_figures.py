@@ -30,7 +30,7 @@ WORDS, WIDE = "ochota_kap_hybrid, gain ", "W"
         (200, WIDE, 1.0),
     ],
 )
-def test_a_legend_fits_its_figure_whatever_its_labels(length, letters, share):
+def test_a_legend_fits_its_figure_for_labels_of_any_length(length, letters, share):
     labels = [f"{number} {letters * 200}"[:length] for number in range(9)]
     with styled(), warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -63,7 +63,7 @@ def test_a_title_fits_its_panel_and_keeps_every_letter(beside, scene):
 
 
 @pytest.mark.parametrize("arms", [1, 7, 14, 28])
-def test_arms_look_different(arms):
+def test_each_arm_has_its_own_color_dash_and_marker(arms):
     found = list(looks([f"arm {index}" for index in range(arms)]).values())
     assert len({(look.color, str(look.dash)) for look in found}) == arms
     assert len({(look.color, look.marker) for look in found}) == arms

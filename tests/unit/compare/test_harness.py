@@ -67,36 +67,36 @@ SELVES = [
 
 
 @pytest.mark.parametrize(("scenes", "pairs", "law"), SELVES)
-def test_a_method_is_not_different_from_itself(scenes, pairs, law):
+def test_a_method_is_seldom_reported_different_from_itself(scenes, pairs, law):
     assert self_comparisons(scenes=scenes, pairs=pairs, law=law) <= 16
 
 
 @pytest.mark.parametrize(
     ("pairs", "effects"), [(10, (0.1, -0.1, 0.2, -0.2, 0.0)), (12, (0.1, -0.1, 0.2, -0.2))]
 )
-def test_a_method_is_not_different_from_itself_on_different_scenes(pairs, effects):
+def test_a_method_is_seldom_reported_different_from_itself_on_different_scenes(pairs, effects):
     assert self_comparisons(scenes=len(effects), pairs=pairs, effects=effects) <= 16
 
 
 @pytest.mark.parametrize("scenes", [1, 4])
-def test_one_run_that_diverged_makes_no_difference(scenes):
+def test_one_diverged_run_does_not_make_two_equal_methods_different(scenes):
     assert self_comparisons(scenes=scenes, pairs=12, noise=0.03, diverged=15.0) <= 16
 
 
 @pytest.mark.parametrize("law", [NORMAL, HEAVY])
 @pytest.mark.parametrize("scenes", [1, 4])
-def test_a_difference_is_found(scenes, law):
+def test_a_real_difference_is_found(scenes, law):
     noise = NOISE * np.sqrt(2.0)  # 0.1 dB of each run, which is harder than 0.1 dB of a pair.
     assert share(Verdict.DIFFERENT, 0.3, scenes=scenes, law=law, noise=noise) >= 0.8
 
 
 @pytest.mark.parametrize("law", [NORMAL, HEAVY])
 @pytest.mark.parametrize("scenes", [1, 4])
-def test_equals_are_called_equivalent(scenes, law):
+def test_equal_methods_are_called_equivalent(scenes, law):
     assert share(Verdict.EQUIVALENT, 0.0, scenes=scenes, law=law) >= 0.5
 
 
-def test_a_difference_of_the_margin_is_seldom_called_equivalent():
+def test_a_difference_as_large_as_the_margin_is_seldom_called_equivalent():
     assert share(Verdict.EQUIVALENT, MARGIN, scenes=4) <= 0.1
 
 

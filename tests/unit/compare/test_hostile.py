@@ -49,7 +49,7 @@ def _folder(tmp_path):
         ("config.yaml", "crossgrad: 9.9\n"),
     ],
 )
-def test_a_damaged_file_is_named_or_its_run_left_out(folder, file, content):
+def test_a_damaged_file_is_named_or_its_run_is_left_out(folder, file, content):
     (folder / "1-1" / file).write_text(content)
     with pytest.raises(UserError) as error:
         read_runs([folder], skip_broken=False)
@@ -61,7 +61,7 @@ def test_a_damaged_file_is_named_or_its_run_left_out(folder, file, content):
     assert file in found.left_out["1-1"]
 
 
-def test_a_damaged_summary_is_found_below_its_surface(folder):
+def test_a_summary_with_values_of_wrong_type_is_left_out(folder):
     (folder / "1-1" / "summary.json").write_text('{"status": "finished", "overall": 3, "notes": 1}')
     found = read_runs([folder], skip_broken=True)
     assert list(found.left_out) == ["1-1"]
@@ -95,7 +95,7 @@ def set_view(value):
         ("summary.json", lambda summary: summary["environment"].update(torch_threads=10**400)),
     ],
 )
-def test_damage_deep_in_a_file_is_named_or_its_run_left_out(folder, file, change):
+def test_a_damaged_nested_value_is_named_or_its_run_is_left_out(folder, file, change):
     changed(folder / "1-1" / file, change)
     with pytest.raises(UserError) as error:
         read_runs([folder], skip_broken=False)
@@ -106,7 +106,7 @@ def test_damage_deep_in_a_file_is_named_or_its_run_left_out(folder, file, change
 
 
 @pytest.mark.parametrize("file", ["metrics.csv", "per_view.csv"])
-def test_a_number_beyond_all_others_is_damage(folder, file):
+def test_a_number_with_400_digits_counts_as_damage(folder, file):
     path = folder / "1-1" / file
     first, second, *lines = path.read_text().splitlines()
     cells = second.split(",")
@@ -125,13 +125,13 @@ def test_a_target_reached_at_zero_cost_has_a_ratio(tmp_path):
     assert ratios(found.reached) == {"views=1": [1.0], "views=2": [1.0]}
 
 
-def test_a_run_without_phases_is_compared(folder):
+def test_a_run_without_phase_times_is_compared(folder):
     changed(folder / "1-1" / "summary.json", lambda summary: summary["seconds"].pop("phases"))
     found = compared(read_runs([folder], skip_broken=False), Options())
     assert len(phases_of(found)) == 2
 
 
-def test_a_run_without_an_end_is_left_out_and_listed(folder):
+def test_an_unfinished_run_is_left_out_and_listed(folder):
     (folder / "1-1" / "summary.json").unlink()
     RunFolder(seed=7, status="stopped").write(folder / "stopped")
     RunFolder(seed=8, status="failed").write(folder / "failed")
@@ -143,32 +143,32 @@ def test_a_run_without_an_end_is_left_out_and_listed(folder):
     assert [len(arm.failed) for arm in found.arms] == [1, 0]
 
 
-def test_no_run_has_ended(tmp_path):
+def test_a_comparison_without_finished_runs_is_refused(tmp_path):
     RunFolder(status="stopped").write(tmp_path / "1")
     with pytest.raises(UserError, match="no run has finished"):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
 @pytest.mark.parametrize("name", ["empty", "missing"])
-def test_a_place_without_runs_is_refused(tmp_path, name):
+def test_a_folder_without_runs_is_refused(tmp_path, name):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no run to compare"):
         read_runs([tmp_path / name], skip_broken=False)
 
 
-def test_a_folder_that_is_named_twice_counts_once(folder):
+def test_a_folder_given_twice_counts_once(folder):
     found = read_runs([folder, folder / "1-0", folder / "1-0"], skip_broken=False)
     assert len(found.runs) == 6
 
 
-def test_a_copy_of_a_run_is_no_second_seed(folder):
+def test_a_copy_of_a_run_does_not_count_as_a_second_seed(folder):
     shutil.copytree(folder / "1-0", folder / "copy")
     found = compared(read_runs([folder], skip_broken=False), Options())
     assert found.left_out == {"copy": "repeats 1-0"}
     assert len(found.ends[0].pairs) == 3
 
 
-def test_one_seed_is_inconclusive_and_says_so(tmp_path):
+def test_a_single_seed_gives_an_inconclusive_verdict_with_the_reason(tmp_path):
     for views in (1, 2):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
@@ -176,7 +176,7 @@ def test_one_seed_is_inconclusive_and_says_so(tmp_path):
     assert "one pair says nothing about noise" in text
 
 
-def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
+def test_a_single_seed_of_three_arms_gives_no_statement_about_noise(tmp_path):
     for views in (1, 2, 3):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
@@ -184,7 +184,7 @@ def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
     assert "one pair says nothing about noise" in text and "1 pairs" not in text
 
 
-def test_three_seeds_say_how_many_would_do(tmp_path):
+def test_three_seeds_give_the_number_of_pairs_that_would_suffice(tmp_path):
     for views, offsets in ((1, (0.0, 0.1, -0.1)), (2, (0.1, -0.1, 0.1))):
         for seed, offset in enumerate(offsets):
             RunFolder(seed=seed, views_per_step=views, final=20.0 + offset).write(
@@ -193,7 +193,7 @@ def test_three_seeds_say_how_many_would_do(tmp_path):
     assert "pairs needed to tell 0.1 dB" in headlines(tmp_path)
 
 
-def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
+def test_a_single_arm_still_gets_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
@@ -201,7 +201,7 @@ def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
     assert "nothing to compare" in capsys.readouterr().out
 
 
-def test_arms_on_other_scenes_are_not_paired(tmp_path):
+def test_arms_on_different_scenes_are_not_paired(tmp_path):
     RunFolder(scene="city").write(tmp_path / "1")
     RunFolder(scene="park", views_per_step=2).write(tmp_path / "2")
     # No setting varies within a scene, so there is one arm.
@@ -210,7 +210,7 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
     assert "share no scene with the same seed" in headlines(tmp_path)
 
 
-def test_a_figure_that_one_run_did_not_measure_is_not_compared(tmp_path):
+def test_a_metric_that_one_run_did_not_measure_is_not_compared(tmp_path):
     more = RunFolder(views_per_step=2).write(tmp_path / "more")
     changed(more / "summary.json", lambda summary: summary["overall"].update(sharpness=0.3))
     RunFolder().write(tmp_path / "less")
@@ -219,7 +219,7 @@ def test_a_figure_that_one_run_did_not_measure_is_not_compared(tmp_path):
     assert len(found.arms) == 2
 
 
-def test_figures_of_views_that_are_gone_are_reported(folder):
+def test_missing_per_view_metrics_are_reported(folder):
     (folder / "1-1" / "per_view.csv").unlink()
     with pytest.raises(UserError) as error:
         read_runs([folder], skip_broken=False)
@@ -228,7 +228,7 @@ def test_figures_of_views_that_are_gone_are_reported(folder):
     assert list(read_runs([folder], skip_broken=True).left_out) == ["1-1"]
 
 
-def test_results_without_their_configuration_are_not_passed_over(folder):
+def test_results_without_a_configuration_are_reported(folder):
     (folder / "1-1" / "config.yaml").unlink()
     with pytest.raises(UserError, match="without its"):
         read_runs([folder], skip_broken=False)
@@ -237,7 +237,7 @@ def test_results_without_their_configuration_are_not_passed_over(folder):
     assert list(found.left_out.values()) == ["has no config.yaml"]
 
 
-def test_a_file_is_refused_as_what_it_is(folder):
+def test_a_file_given_as_a_folder_of_runs_is_refused(folder):
     grid = folder / "grid.yaml"
     grid.write_text("base: {}")
     with pytest.raises(UserError) as error:
@@ -247,13 +247,13 @@ def test_a_file_is_refused_as_what_it_is(folder):
 
 @pytest.mark.parametrize("name", ["margin", "target"])
 @pytest.mark.parametrize("value", [float("inf"), float("nan")])
-def test_no_figure_is_at_infinity(folder, name, value):
+def test_no_point_of_a_figure_is_at_infinity(folder, name, value):
     with pytest.raises(UserError) as error:
         app.compare([folder], Options(**{name: value}), folder / "out", skip_broken=False)
     assert error.value.where == f"--{name}"
 
 
-def test_a_comparison_that_was_broken_off_is_replaced(folder, monkeypatch):
+def test_an_incomplete_comparison_is_replaced(folder, monkeypatch):
     monkeypatch.setattr(app, "drawn_figures", lambda found: [draw_differences(found)])
     out = folder / "out"
     app.compare([folder], Options(), out, skip_broken=False)
@@ -281,7 +281,7 @@ def test_arms_without_final_metrics_are_reported_as_such(tmp_path):
     assert "no scene and seed has PSNR at the ends of two arms" in headlines(tmp_path)
 
 
-def test_a_tie_has_no_leader(tmp_path):
+def test_equal_means_give_no_leader(tmp_path):
     for views in (1, 2):
         RunFolder(views_per_step=views).write(tmp_path / f"{views}")
     assert "Inconclusive: no difference between views=1 and views=2" in headlines(tmp_path)

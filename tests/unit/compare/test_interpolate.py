@@ -22,7 +22,7 @@ def comparison(folder: Path, *runs: RunFolder, **options):
     return compared(read_runs([folder], skip_broken=False), Options(**options))
 
 
-def test_a_curve_is_read_between_its_evaluations_and_nowhere_else(tmp_path):
+def test_a_curve_is_interpolated_only_between_its_evaluations(tmp_path):
     model = RunFolder(steps=600, seconds=60.0, evaluations=6)
     found = comparison(tmp_path, model)
     run, quantity = found.runs[0], found.quantity
@@ -34,7 +34,7 @@ def test_a_curve_is_read_between_its_evaluations_and_nowhere_else(tmp_path):
     assert value_at(run, quantity, STEPS, 700) is None
 
 
-def test_the_cost_to_a_quality_is_interpolated_or_infinite(tmp_path):
+def test_the_cost_of_reaching_a_quality_is_interpolated_or_infinite(tmp_path):
     model = RunFolder(steps=600, seconds=60.0, evaluations=6)
     found = comparison(tmp_path, model)
     run, quantity = found.runs[0], found.quantity
@@ -44,7 +44,7 @@ def test_the_cost_to_a_quality_is_interpolated_or_infinite(tmp_path):
     assert cost_to(run, quantity, STEPS, 21.1) == inf
 
 
-def test_quality_at_equal_cost_is_read_where_the_shorter_run_ends(tmp_path):
+def test_quality_at_equal_cost_is_measured_at_the_end_of_the_shorter_run(tmp_path):
     one = RunFolder(views_per_step=1, steps=1200, final=21.0)
     two = RunFolder(views_per_step=2, steps=600, final=21.5)
     found = comparison(tmp_path, one, two)
@@ -58,7 +58,7 @@ def test_quality_at_equal_cost_is_read_where_the_shorter_run_ends(tmp_path):
     assert steps.pairs[0].second == pytest.approx(one.psnr(0.5))
 
 
-def test_a_run_that_never_reaches_the_target_stays_in_the_denominator(tmp_path):
+def test_a_run_that_never_reaches_the_target_still_counts_in_the_profile(tmp_path):
     runs = [RunFolder(seed=0), RunFolder(seed=1, final=20.0)]
     runs += [RunFolder(seed=n, views_per_step=2, steps=300, seconds=30.0) for n in range(3)]
     runs += [RunFolder(seed=2, status="failed")]
@@ -75,7 +75,7 @@ def test_a_run_that_never_reaches_the_target_stays_in_the_denominator(tmp_path):
     assert all(ratio == 1.0 for ratio in by_arm["views=2"])
 
 
-def test_the_usual_target_is_where_the_weakest_arm_ends(tmp_path):
+def test_the_default_target_is_the_final_quality_of_the_weakest_arm(tmp_path):
     runs = [RunFolder(seed=n, final=20.0 + n) for n in range(3)]
     runs += [RunFolder(seed=n, views_per_step=2, final=23.0 + n) for n in range(3)]
     found = comparison(tmp_path, *runs)
@@ -102,7 +102,7 @@ def test_runs_of_several_lengths_are_paired_by_length(tmp_path):
     assert len(found.points) == 4
 
 
-def test_a_budget_in_seconds_is_a_length_whatever_the_steps(tmp_path):
+def test_a_time_budget_counts_as_the_length_for_any_number_of_steps(tmp_path):
     runs = [
         RunFolder(seed=n, planned=70.0, steps=400 + 7 * n, views_per_step=k)
         for n in range(2)
@@ -115,7 +115,7 @@ def test_a_budget_in_seconds_is_a_length_whatever_the_steps(tmp_path):
 
 
 @pytest.mark.parametrize(("metric", "sign"), [("psnr", 1.0), ("lpips", -1.0)])
-def test_half_of_the_weakest_arm_reaches_the_usual_target(tmp_path, metric, sign):
+def test_at_least_half_of_the_weakest_arm_reaches_the_default_target(tmp_path, metric, sign):
     ends = {1: (20.0, 20.4, 20.6, 22.0), 2: (23.0, 24.0, 25.0, 26.0)}
     for views, finals in ends.items():
         for seed, final in enumerate(finals):
@@ -132,7 +132,7 @@ def test_half_of_the_weakest_arm_reaches_the_usual_target(tmp_path, metric, sign
     assert sum(sign * final >= sign * goal for final in finals) == 3
 
 
-def test_an_arm_of_two_runs_reaches_what_it_ends_with(tmp_path):
+def test_both_runs_of_the_weakest_arm_reach_its_lower_final_quality(tmp_path):
     runs = [RunFolder(seed=n, final=20.0 + n) for n in range(2)]
     runs += [RunFolder(seed=n, views_per_step=2, final=23.0 + n) for n in range(2)]
     found = comparison(tmp_path, *runs)
@@ -185,7 +185,7 @@ def test_a_short_run_does_not_replace_a_missing_long_run(tmp_path):
     }
 
 
-def test_each_scene_has_a_usual_length_of_its_own(tmp_path):
+def test_each_scene_has_its_own_default_length(tmp_path):
     runs = [(factor, seed, 600) for factor in (1.0, 2.0) for seed in range(2)]
     runs += [(factor, 0, 300, "park") for factor in (1.0, 2.0)] + [(1.0, 1, 600, "park")]
     found, main = arms_with(tmp_path, *runs)
@@ -194,7 +194,7 @@ def test_each_scene_has_a_usual_length_of_its_own(tmp_path):
     assert len(found.ends[0].pairs) == 3
 
 
-def test_an_arm_keeps_its_own_length_next_to_one_run_of_that_length(tmp_path):
+def test_an_arm_keeps_its_length_even_if_one_run_has_the_length_of_another_arm(tmp_path):
     # Two views in half the steps; and one run of one view that is as short.
     runs = [RunFolder(seed=n, steps=1200) for n in range(3)]
     runs += [RunFolder(seed=n, steps=600, views_per_step=2) for n in range(3)]
@@ -205,7 +205,7 @@ def test_an_arm_keeps_its_own_length_next_to_one_run_of_that_length(tmp_path):
 
 
 @pytest.mark.parametrize(("clock", "text"), [("wall", "70 s"), ("cpu", "70 s CPU")])
-def test_the_seconds_that_a_run_was_given_are_its_length(tmp_path, clock, text):
+def test_planned_seconds_are_shown_as_the_length_of_a_run(tmp_path, clock, text):
     settings = {"planned_seconds": 70.0, "clock": clock, "revisions": [[9, 4312]]}
     found = comparison(tmp_path, RunFolder(settings=settings, steps=4312))
     assert [run.length_text for run in found.runs] == [text]
@@ -231,7 +231,7 @@ def test_the_noise_of_a_scene_is_pooled_over_arms(tmp_path):
     assert "park" not in found.noise
 
 
-def test_a_run_without_a_finite_end_is_named_and_not_paired(tmp_path):
+def test_a_run_without_a_finite_final_metric_is_named_and_not_paired(tmp_path):
     runs = [RunFolder(seed=n, views_per_step=k) for n in range(2) for k in (1, 2)]
     found = comparison(
         tmp_path, *runs, RunFolder(seed=2), RunFolder(seed=2, views_per_step=2, final=nan)

@@ -78,7 +78,7 @@ def test_phases_are_shown_only_if_wall_seconds_are_compared(tmp_path):
     assert csv_tables(of_cpu, {})["phases.csv"] == []
 
 
-def test_an_interval_that_goes_on_beyond_the_axis_ends_in_an_arrowhead(tmp_path, monkeypatch):
+def test_an_interval_that_exceeds_the_axis_ends_in_an_arrowhead(tmp_path, monkeypatch):
     kept = []
     monkeypatch.setattr(differences, "drawn", lambda figure, *_: kept.append(figure))
     finals = {(1, 0): 21.0, (1, 1): 21.0, (2, 0): 20.0, (2, 1): 20.4}
@@ -147,14 +147,14 @@ def test_names_are_shown_and_not_executed(written):
     assert VIEW in texts
 
 
-def test_the_first_screen_says_what_won(written):
+def test_the_first_screen_names_the_winner_and_the_evidence(written):
     texts = " ".join("".join(Reader((written / "index.html").read_text()).texts).split())
     assert "views=2 is better than views=1 by 1.00 dB" in texts
     assert "2 of 2 pairs in favour of views=2, 1 scene" in texts
     assert "Noise floor" in texts
 
 
-def test_there_are_figures_for_a_paper(written):
+def test_figures_are_written_in_formats_for_papers(written):
     names = {path.name for path in (written / "figures").iterdir()}
     kinds = ["curves_seconds", "curves_cpu_seconds", "curves_views", "curves_steps", "differences"]
     kinds += ["regimes", "profile", "primitives", "phases"]
@@ -174,7 +174,7 @@ def test_every_written_file_is_in_the_list_of_owned_files(written):
     assert set(csv_tables(found, {})) == set(TABLES)
 
 
-def test_tables_hold_the_same_as_the_page(written):
+def test_tables_contain_the_same_numbers_as_the_page(written):
     [end] = [row for row in rows(written / "comparisons.csv") if row["where"] == "at the end"
              and row["figure"] == "psnr"]  # fmt: skip
     assert float(end["difference"]) == pytest.approx(1.0)
@@ -214,7 +214,7 @@ def test_only_a_comparison_is_replaced_and_the_same_runs_give_the_same_bytes(wri
     assert (other / "index.html").read_text() == "<html>somebody's</html>"
 
 
-def test_costs_are_those_of_the_scenes_that_all_arms_have(tmp_path):
+def test_costs_are_averaged_over_the_scenes_that_all_arms_have(tmp_path):
     for scene, primitives in (("city", 1000), ("beach", 9000)):
         for views in (1, 2) if scene == "city" else (1,):
             run = RunFolder(scene, views_per_step=views, primitives=primitives)
@@ -279,7 +279,7 @@ def test_names_create_no_html_elements_or_attributes(tmp_path, capsys):
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no Chromium")
-def test_a_browser_runs_nothing_of_a_name(tmp_path, capsys):
+def test_a_browser_executes_no_code_from_a_run_name(tmp_path, capsys):
     page_with(tmp_path, capsys, EVIL.replace("alert(1)", "document.title='run'"))
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000")
     page = (tmp_path / "out" / "index.html").as_uri()

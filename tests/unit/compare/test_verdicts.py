@@ -28,7 +28,7 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize("count", [4, 8, 12, 40])
-def test_the_iqm_is_scipys_where_quarters_are_whole(count):
+def test_the_interquartile_mean_equals_scipys_if_quarters_are_whole_numbers(count):
     values = RNG.standard_t(2, (3, count))
     assert iqm(values) == pytest.approx(trim_mean(values, 0.25, axis=1))
 
@@ -37,11 +37,11 @@ def test_the_iqm_is_scipys_where_quarters_are_whole(count):
     ("values", "expected"),
     [([5.0], 5.0), ([1.0, 2.0], 1.5), ([0.0, 3.0, 90.0], (0.25 * 0 + 3 + 0.25 * 90) / 1.5)],
 )
-def test_the_iqm_of_a_few(values, expected):
+def test_the_interquartile_mean_of_few_values_is_correct(values, expected):
     assert iqm(np.array(values)) == pytest.approx(expected)
 
 
-def test_below_ten_pairs_it_is_students_t():
+def test_below_ten_pairs_the_test_is_students_t():
     values = RNG.normal(0.1, 0.2, 7)
     found = estimate(values, ["a"] * 7, 0.1)
     peer = ttest_1samp(values, 0.0)
@@ -54,7 +54,7 @@ def test_below_ten_pairs_it_is_students_t():
     assert found.p_equivalent == pytest.approx(max(greater, less))
 
 
-def test_from_ten_pairs_on_it_is_a_bootstrap_wider_than_the_plain_one():
+def test_from_ten_pairs_on_the_interval_is_a_widened_bootstrap():
     values = RNG.normal(0.1, 0.2, 16)
     found = estimate(values, ["a"] * 16, 0.1)
     assert found.method == IQM
@@ -81,7 +81,7 @@ def test_a_difference_far_above_the_noise_stays_different_among_100_comparisons(
     assert verdicts([found] * 100) == [Verdict.DIFFERENT] * 100
 
 
-def test_p_values_fall_steadily_beyond_all_draws():
+def test_bootstrap_p_values_fall_steadily_beyond_all_resamples():
     law = Bootstrap.of(RNG.normal(0.0, 1.0, 12), ["a", "b", "c"] * 4)
     borders = np.linspace(1.0, 9.0, 33)
     above = [law.sf(border) for border in borders]
@@ -93,19 +93,19 @@ def test_p_values_fall_steadily_beyond_all_draws():
 
 
 @pytest.mark.parametrize(("value", "expected"), [(0.0, "equivalent"), (0.5, "different")])
-def test_many_pairs_without_noise_are_judged_as_a_few_are(value, expected):
+def test_many_pairs_without_noise_get_the_verdict_of_few_pairs(value, expected):
     family = [estimate([value] * pairs, ["a"] * pairs, 0.1) for pairs in (3, 12)]
     assert {str(verdict) for verdict in verdicts(family * 10)} == {expected}
 
 
-def test_the_interval_holds_its_estimate_though_one_run_diverged():
+def test_the_interval_contains_its_estimate_even_if_one_run_diverged():
     values = 0.05 * np.random.default_rng(3).standard_normal((40, 12))
     values[:, 0] -= 15.0
     found = [estimate(each, ["a"] * 12, 0.1) for each in values]
     assert all(each.wide[0] < each.center < each.wide[1] for each in found)
 
 
-def test_differences_between_scenes_are_no_noise():
+def test_differences_between_scenes_do_not_count_as_noise():
     scenes = [name for name in "abcd" for _ in range(3)]
     levels = np.repeat([0.1, 0.2, 0.3, 0.4], 3)
     values = levels + 0.01 * RNG.standard_normal(12)
@@ -120,7 +120,7 @@ def test_scenes_with_one_pair_are_resampled_together():
     assert estimate(values, scenes, 0.1).wide == estimate(values, ["a"] * 12, 0.1).wide
 
 
-def test_pairs_that_are_needed_are_those_of_the_table():
+def test_the_number_of_needed_pairs_agrees_with_the_table():
     # 0.1 dB of noise per run: half-widths 0.095 at 8 pairs and 0.104 at 7.
     assert pairs_needed(0.1 * sqrt(2.0), 0.1) == 8
     assert pairs_needed(100.0, 0.1) is None
@@ -128,7 +128,7 @@ def test_pairs_that_are_needed_are_those_of_the_table():
 
 @pytest.mark.parametrize("spread", [0.01, 0.05, 0.1, 0.2, 0.4])
 @pytest.mark.parametrize("scenes", [1, 4, 6])
-def test_more_pairs_are_needed_where_and_only_where_the_interval_is_too_wide(spread, scenes):
+def test_more_pairs_are_needed_exactly_if_the_interval_is_too_wide(spread, scenes):
     for seed in range(20):
         values = np.random.default_rng(seed).normal(0.0, spread, 12)
         found = estimate(values, [str(number % scenes) for number in range(12)], 0.1)
@@ -136,7 +136,7 @@ def test_more_pairs_are_needed_where_and_only_where_the_interval_is_too_wide(spr
         assert (found.needed > 12) == (half > 0.1)
 
 
-def test_the_verdict_on_few_comparisons_is_what_the_intervals_say():
+def test_the_verdict_on_few_comparisons_follows_the_intervals():
     # The border of the 95 % interval lies between two draws here, and zero does, too.
     values = [-0.01908, -0.018, 0.13949, 0.02263, 0.13912, -0.03991, 0.1013, 0.15068]
     values += [0.2282, 0.23885, -0.02011, -0.08109, 0.15728, 0.11603]
@@ -179,7 +179,7 @@ def test_one_pair_is_inconclusive_and_equal_runs_are_equivalent():
     ]
 
 
-def test_holm_is_holms():
+def test_holms_correction_agrees_with_known_values():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
     adjusted = holm([0.02, nan, 0.01])
@@ -215,11 +215,11 @@ def test_scenes_that_contradict_a_verdict_are_reported(levels, verdict, contradi
     assert opposed(found, Verdict.INCONCLUSIVE, 0.1) == ()
 
 
-def test_one_scene_contradicts_nothing():
+def test_a_single_scene_contradicts_no_verdict():
     assert estimate([0.1, 0.2, 0.3], ["a"] * 3, 0.1).by_scene == ()
 
 
-def test_runs_that_stand_for_two_arms_are_counted_once_in_the_noise(tmp_path):
+def test_runs_that_belong_to_two_arms_count_once_in_the_noise(tmp_path):
     plan = ["run,scene,configuration,seed"]
     for number, final in enumerate((20.0, 20.4, 21.0, 22.0)):
         seed, views = number % 2, 1 + number // 2

@@ -36,7 +36,7 @@ def test_different_lengths_of_arms_are_reported(tmp_path):
     assert told["The arms were given different lengths"] == "views=2 900 steps; views=1 300 steps"
 
 
-def test_lengths_that_depend_on_the_scene_only_are_not_reported(tmp_path):
+def test_lengths_that_differ_only_between_scenes_are_not_reported(tmp_path):
     for views in (1, 2):
         for seed in range(4):
             steps = 300 * (1 + seed % 2)

@@ -33,7 +33,7 @@ def coefficients(step=3, lr=1e-2, eps=1e-15):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-7, 1e-12, 1e12])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_agrees_with_torch(dtype, scale):
+def test_the_fused_kernel_agrees_with_torch(dtype, scale):
     params, state = tensors(0, dtype=dtype), AdamState()
     theirs = {name: tensor.clone().requires_grad_() for name, tensor in params.items()}
     groups = [{"params": [theirs[name]], "lr": RATES[name]} for name in theirs]
@@ -53,7 +53,7 @@ def test_agrees_with_torch(dtype, scale):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1e-26, 1e-18, 1e-15, 1.0, 1e18])
-def test_gradients_are_scaled_before_anything_else(size, dtype):
+def test_gradients_are_scaled_before_every_other_operation(size, dtype):
     one, other = AdamState(), AdamState()
     params = {name: torch.zeros(300, dtype=dtype) for name in "xy"}
     scaled = {name: tensor.clone() for name, tensor in params.items()}
@@ -69,7 +69,7 @@ def test_gradients_are_scaled_before_anything_else(size, dtype):
 
 
 @pytest.mark.parametrize("magnitude", [1e-45, 1e-32, 1e-22, 1e-19, 3e-18, 1e-10, 1.0, 1e15, 1e30])
-def test_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
+def test_the_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
     generator = torch.Generator().manual_seed(4)
     size = 70_003  # more than one chunk, and a remainder
     grad = magnitude * torch.randn(size, generator=generator)
@@ -87,7 +87,7 @@ def test_kernel_agrees_with_the_reference_at_every_magnitude(magnitude):
 
 @pytest.mark.parametrize("magnitude", [1e-12, 1e-6, 1.0, 1e15, 1e30])
 @pytest.mark.parametrize("scale", [1.0, 0.25])
-def test_the_update_of_a_gpu_agrees_with_the_reference(magnitude, scale):
+def test_the_gpu_update_agrees_with_the_reference(magnitude, scale):
     """Torch's fused Adam, which also runs here; ages need not be whole."""
     generator = torch.Generator().manual_seed(4)
     param = torch.randn(3000, generator=generator)
@@ -105,7 +105,7 @@ def test_the_update_of_a_gpu_agrees_with_the_reference(magnitude, scale):
 
 
 @pytest.mark.parametrize("bad", [torch.inf, -torch.inf, torch.nan])
-def test_a_gradient_that_is_not_finite_is_seen_in_the_parameters_of_a_gpu(bad):
+def test_a_non_finite_gradient_makes_gpu_parameters_non_finite(bad):
     """No step of a GPU looks for it, so that it must not become a large number."""
     tensors = [torch.ones(3), torch.zeros(3), torch.zeros(3)]
     update_on_gpu(tensors[0], torch.tensor([1.0, bad, 1.0]), *tensors[1:], coefficients(1.0))
@@ -113,7 +113,7 @@ def test_a_gradient_that_is_not_finite_is_seen_in_the_parameters_of_a_gpu(bad):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_memory_of_tensors_that_count_as_zero_is_not_read(dtype):
+def test_memory_of_moments_marked_as_zero_is_not_read(dtype):
     """Also where no gradient has moved anything, as in the second half."""
     grad = torch.cat([tensors(6)["means"].flatten(), torch.zeros(70_000)]).to(dtype)
     found = []
@@ -127,7 +127,7 @@ def test_memory_of_tensors_that_count_as_zero_is_not_read(dtype):
     assert torch.equal(*found)
 
 
-def test_no_gradient_leaves_everything_alone():
+def test_a_step_without_gradients_changes_nothing():
     params, state = tensors(5), AdamState()
     adam_step(params, tensors(6), state, RATES)
     before = {name: tensor.clone() for name, tensor in params.items()}
@@ -140,7 +140,7 @@ def test_no_gradient_leaves_everything_alone():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_zero_gradient_from_zero_moments_moves_nothing(dtype):
+def test_a_zero_gradient_with_zero_moments_changes_no_parameter(dtype):
     params, state = tensors(7, dtype=dtype), AdamState()
     before = {name: tensor.clone() for name, tensor in params.items()}
     for _ in range(3):
@@ -159,7 +159,7 @@ def test_a_small_gradient_never_moves_further_than_a_large_one(size):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_moments_of_an_unseen_primitive_end_in_zero_not_in_subnormals(dtype):
+def test_moments_of_an_unseen_primitive_decay_to_zero_without_subnormals(dtype):
     params, state = {"x": torch.ones(100, dtype=dtype)}, AdamState()
     adam_step(params, {"x": torch.full((100,), 1e-16, dtype=dtype)}, state, {"x": 1e-3})
     for _ in range(400):
@@ -169,14 +169,14 @@ def test_moments_of_an_unseen_primitive_end_in_zero_not_in_subnormals(dtype):
     assert normal.all()
 
 
-def test_a_huge_gradient_does_not_stop_its_parameter_for_good():
+def test_an_infinite_gradient_does_not_stop_its_parameter_permanently():
     params, state = {"x": torch.zeros(1)}, AdamState()
     adam_step(params, {"x": torch.tensor([torch.inf])}, state, {"x": 1e-2})
     assert params["x"].item() == pytest.approx(-1e-2)
     assert state.exp_avg_sq["x"].item() == pytest.approx(1e-3 * LARGEST**2, rel=1e-5)
 
 
-def test_nan_spreads_to_its_element_only():
+def test_a_nan_gradient_changes_only_its_own_element():
     params, state = {"x": torch.zeros(3)}, AdamState()
     adam_step(params, {"x": torch.tensor([1.0, torch.nan, 1.0])}, state, {"x": 1e-2})
     assert torch.isnan(params["x"]).tolist() == [False, True, False]
@@ -198,7 +198,7 @@ def test_bits_do_not_depend_on_the_number_of_threads():
     assert all(torch.equal(result, results[0]) for result in results)
 
 
-def test_strided_and_trained_tensors():
+def test_strided_and_contiguous_tensors_get_the_same_update():
     strided = torch.randn(3, 40, generator=torch.Generator().manual_seed(8)).T
     dense = strided.clone(memory_format=torch.contiguous_format).requires_grad_()
     grad = torch.ones(3, 40).T
@@ -207,7 +207,7 @@ def test_strided_and_trained_tensors():
     torch.testing.assert_close(strided, dense.detach())
 
 
-def test_a_graph_over_old_values_notices_the_step():
+def test_a_graph_that_saved_old_values_raises_after_the_step():
     param = torch.ones(3, requires_grad=True)
     loss = (param * param).sum()
     adam_step({"x": param}, {"x": torch.ones(3)}, AdamState(), {"x": 1e-2})
@@ -223,13 +223,13 @@ def test_a_graph_over_old_values_notices_the_step():
         (torch.ones(3), {"rule": AdamRule(betas=(0.9, 1.0))}),
     ],
 )
-def test_wrong_arguments_are_refused(grad, options):
+def test_invalid_arguments_are_refused(grad, options):
     with pytest.raises(ValueError, match="must"):
         adam_step({"x": torch.ones(3)}, {"x": grad}, AdamState(), {"x": 1e-2}, **options)
 
 
 @pytest.mark.parametrize("last", ["grad", "exp_avg", "exp_avg_sq"])
-def test_only_elements_with_nonzero_gradient_or_moments_move(last):
+def test_only_elements_with_nonzero_gradient_or_moments_change(last):
     """Runs of zeros are left out: every place of the first and last number that is not zero."""
     size = 3 * 2**13 + 5
     rule = coefficients()
@@ -251,7 +251,7 @@ def test_only_elements_with_nonzero_gradient_or_moments_move(last):
         assert (ours[3] != 0).any() or last == "exp_avg"
 
 
-def test_tensors_of_any_size_get_their_own_steps_in_one_call():
+def test_tensors_of_any_size_in_one_call_get_the_same_update_as_alone():
     rng = torch.Generator().manual_seed(6)
     sizes = {"small": 7, "one": 2**16, "empty": 0, "more": 2**16 + 1, "many": 3 * 2**16 + 5}
     together = {name: torch.randn(size, generator=rng) for name, size in sizes.items()}
@@ -272,7 +272,7 @@ def test_tensors_of_any_size_get_their_own_steps_in_one_call():
         assert torch.equal(state.exp_avg_sq[name], own[name].exp_avg_sq[name]), name
 
 
-def test_a_tensor_without_a_rate_leaves_all_as_they_were():
+def test_a_missing_learning_rate_leaves_all_tensors_unchanged():
     params, state = {"x": torch.ones(3), "y": torch.ones(3)}, AdamState()
     with pytest.raises(KeyError):
         adam_step(params, {"x": torch.ones(3), "y": torch.ones(3)}, state, {"x": 1e-2})

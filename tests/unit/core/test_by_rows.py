@@ -58,7 +58,7 @@ def same(one, other):
 @pytest.mark.parametrize(
     "rows", [[], [4], [0, 2, 7], [7, 2, 0], [1, 1, 3], [3, 1, 1]], ids=lambda rows: f"{rows}"
 )
-def test_rows_are_sorted_and_each_is_there_once(rows):
+def test_rows_are_sorted_and_unique(rows):
     values = torch.arange(2.0 * len(rows)).view(len(rows), 2)
     found = coalesced(sparse_rows(torch.tensor(rows, dtype=torch.int64), values, (8, 2)))
     expected = torch.zeros(8, 2).index_add(0, torch.tensor(rows, dtype=torch.int64), values)
@@ -84,7 +84,7 @@ def test_gramians_and_weighted_sums_have_the_bits_of_dense_gradients(seed, views
 
 
 @pytest.mark.parametrize("views", [2, 5])
-def test_sums_and_what_needs_all_elements_have_the_bits_of_dense_gradients(views):
+def test_sums_and_dense_operations_have_the_bits_of_dense_gradients(views):
     found = drawn(1, views)
     for take in (
         lambda gradients: gradients.total(),
@@ -104,7 +104,7 @@ def test_sums_and_what_needs_all_elements_have_the_bits_of_dense_gradients(views
 
 @pytest.mark.parametrize("views", [1, 2, 3])
 @pytest.mark.parametrize("mixed", [False, True])
-def test_running_sums_stay_by_rows_unless_a_view_is_dense(views, mixed):
+def test_running_sums_keep_sparse_rows_unless_a_view_is_dense(views, mixed):
     found = drawn(0, views)
     if mixed:
         found[-1]["b"] = dense(found[-1]["b"])
@@ -120,7 +120,7 @@ def test_running_sums_stay_by_rows_unless_a_view_is_dense(views, mixed):
     assert np.array_equal(ours.present(), plain.present())
 
 
-def test_the_rows_of_a_sum_are_those_of_its_views():
+def test_a_sum_has_the_rows_of_all_its_views():
     rng = np.random.default_rng(0)
     views = [{"a": None, "b": gradient(rng, 0.01, (2,))} for _ in range(2)]
     union = sorted({row for view in views for row in rows_of(view["b"]).tolist()})

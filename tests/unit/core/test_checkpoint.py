@@ -71,7 +71,7 @@ def assert_tensors_equal(found: dict[str, Tensor], expected: dict[str, Tensor]) 
         assert bits(found[name]) == bits(tensor), name
 
 
-def test_round_trip_keeps_every_bit(tmp_path: Path):
+def test_a_checkpoint_keeps_every_bit(tmp_path: Path):
     before = make_checkpoint()
     folder = save(tmp_path, before)
     assert folder == tmp_path / "checkpoints" / "step-000700"
@@ -89,7 +89,7 @@ def test_round_trip_keeps_every_bit(tmp_path: Path):
     assert repr(after.scalars) == repr(before.scalars)
 
 
-def test_generators_continue_with_the_same_numbers(tmp_path: Path):
+def test_restored_generators_continue_with_the_same_numbers(tmp_path: Path):
     generator = np.random.default_rng(5)
     generator.integers(0, 10, size=7)  # leaves half a word in the generator's buffer
     saved = replace(make_checkpoint(), generators={"g": generator.bit_generator.state})
@@ -100,7 +100,7 @@ def test_generators_continue_with_the_same_numbers(tmp_path: Path):
     assert np.array_equal(draws[1], restored.standard_normal(50))
 
 
-def test_loaded_tensors_are_independent_of_the_file_and_each_other(tmp_path: Path):
+def test_loaded_tensors_share_no_memory_with_the_file_or_each_other(tmp_path: Path):
     folder = save(tmp_path, make_checkpoint())
     after = load(folder)
     expected = after.plugins["near-far/x"].tensors["head"].clone()
@@ -117,13 +117,15 @@ def steps_in(run: Path) -> list[int]:
     ("keep", "expected"),
     [(Keep(), [400, 500]), (Keep(last=1), [500]), (Keep(last=2, every=200), [200, 400, 500])],
 )
-def test_keeps_the_last_and_the_milestones(tmp_path: Path, keep: Keep, expected: list[int]):
+def test_saving_keeps_the_last_checkpoints_and_the_milestones(
+    tmp_path: Path, keep: Keep, expected: list[int]
+):
     for step in range(100, 600, 100):
         save(tmp_path, make_checkpoint(step), keep)
     assert steps_in(tmp_path) == expected
 
 
-def test_latest_takes_run_folder_or_checkpoint(tmp_path: Path):
+def test_latest_accepts_a_run_folder_or_a_checkpoint(tmp_path: Path):
     older = save(tmp_path, make_checkpoint(900))
     newer = save(tmp_path, make_checkpoint(1_000_000))
     assert latest(tmp_path) == newer
@@ -131,7 +133,7 @@ def test_latest_takes_run_folder_or_checkpoint(tmp_path: Path):
     assert latest(older) == older
 
 
-def test_latest_skips_what_is_incomplete(tmp_path: Path):
+def test_latest_skips_incomplete_checkpoints(tmp_path: Path):
     good = save(tmp_path, make_checkpoint(100))
     (tmp_path / "checkpoints" / "step-000300").write_text("")
     broken = tmp_path / "checkpoints" / ".scratch-step-000400"
@@ -142,7 +144,7 @@ def test_latest_skips_what_is_incomplete(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["state.json", "tensors.safetensors"])
-def test_a_checkpoint_that_lost_a_file_is_not_passed_over(tmp_path: Path, name: str):
+def test_a_checkpoint_that_lost_a_file_is_reported_as_damaged(tmp_path: Path, name: str):
     save(tmp_path, make_checkpoint(100))
     (save(tmp_path, make_checkpoint(200)) / name).unlink()
     with pytest.raises(UserError, match="damaged checkpoint") as told:
@@ -151,18 +153,18 @@ def test_a_checkpoint_that_lost_a_file_is_not_passed_over(tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "checkpoints"])
-def test_no_checkpoint_is_explained(tmp_path: Path, name: str):
+def test_a_missing_checkpoint_is_refused_with_a_remedy(tmp_path: Path, name: str):
     with pytest.raises(UserError, match="no checkpoint to continue from"):
         latest(tmp_path / name)
 
 
-def test_a_ply_file_is_no_checkpoint(tmp_path: Path):
+def test_a_ply_file_is_not_accepted_as_a_checkpoint(tmp_path: Path):
     with pytest.raises(UserError, match="no optimizer state") as told:
         latest(tmp_path / "point_cloud.ply")
     assert "--init" in str(told.value)
 
 
-def test_resuming_earlier_forgets_what_came_later(tmp_path: Path):
+def test_resuming_an_earlier_step_deletes_later_checkpoints(tmp_path: Path):
     for step in (100, 200, 300):
         save(tmp_path, make_checkpoint(step), Keep(last=9))
     drop_later(tmp_path, 200)
@@ -181,7 +183,7 @@ def crash(path: Path, _packed: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize("step", [100, 200])
 @pytest.mark.parametrize(("failure", "error"), [(full_disk, UserError), (crash, KeyboardInterrupt)])
-def test_a_failed_save_leaves_the_earlier_checkpoint(
+def test_a_failed_save_keeps_the_earlier_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, failure, error
 ):
     before = make_checkpoint(100, seed=1)
@@ -194,7 +196,7 @@ def test_a_failed_save_leaves_the_earlier_checkpoint(
     assert_tensors_equal(after.parameters, before.parameters)
 
 
-def test_a_full_disk_is_explained_with_what_is_needed(
+def test_a_full_disk_is_reported_with_the_required_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("crossgrad_core.run.checkpoint.write_tensors", full_disk)
@@ -224,7 +226,7 @@ def test_on_a_full_disk_an_old_checkpoint_is_deleted_before_the_save(
     assert steps_in(tmp_path) == left
 
 
-def test_a_reader_takes_the_newer_checkpoint_if_its_own_is_deleted_meanwhile(
+def test_a_reader_loads_the_newer_checkpoint_if_the_older_is_deleted_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     save(tmp_path, make_checkpoint(100))
@@ -239,7 +241,7 @@ def test_a_reader_takes_the_newer_checkpoint_if_its_own_is_deleted_meanwhile(
     assert load_latest(tmp_path).step == 200
 
 
-def test_a_damaged_checkpoint_is_not_read_again_and_again(tmp_path: Path):
+def test_loading_a_damaged_checkpoint_raises_without_a_retry(tmp_path: Path):
     flip_byte(save(tmp_path, make_checkpoint(100)))
     with pytest.raises(UserError, match="SHA-256 differs"):
         load_latest(tmp_path)
@@ -260,7 +262,7 @@ def test_the_library_reports_a_full_disk_as_an_os_error(
     assert told.value.errno == errno.ENOSPC
 
 
-def test_a_failed_rename_puts_the_old_checkpoint_back(
+def test_a_failed_rename_restores_the_old_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     before = make_checkpoint(100, seed=1)
@@ -278,7 +280,7 @@ def test_a_failed_rename_puts_the_old_checkpoint_back(
     assert_tensors_equal(load(latest(tmp_path)).parameters, before.parameters)
 
 
-def test_leftovers_of_a_killed_run_are_cleared(tmp_path: Path):
+def test_temporary_files_of_a_killed_run_are_deleted(tmp_path: Path):
     leftover = tmp_path / "checkpoints" / ".scratch-step-000050"
     leftover.mkdir(parents=True)
     (leftover / "tensors.safetensors").write_bytes(b"half")
@@ -344,7 +346,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_damage_is_found_and_the_earlier_checkpoint_named(tmp_path: Path, name: str):
+def test_damage_is_reported_and_the_earlier_checkpoint_is_named(tmp_path: Path, name: str):
     damage, message = DAMAGES[name]
     older = save(tmp_path, make_checkpoint(100))
     newer = save(tmp_path, make_checkpoint(200))
@@ -361,7 +363,7 @@ def test_another_format_version_is_refused(tmp_path: Path):
         load(folder)
 
 
-def test_a_missing_checkpoint_is_explained(tmp_path: Path):
+def test_loading_a_missing_checkpoint_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="no such checkpoint"):
         load(tmp_path / "step-000001")
 

@@ -26,11 +26,11 @@ def _folder(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("sha256sum") is None, reason="no sha256sum")
-def test_sha256sum_reads_it(folder):
+def test_the_program_sha256sum_accepts_the_file(folder):
     subprocess.run(["sha256sum", "--check", "--strict", SUMS], cwd=folder, check=True)
 
 
-def test_a_file_that_changed_or_is_gone_is_named(folder):
+def test_a_changed_or_missing_file_is_named(folder):
     assert changed_files(folder) == []
     (folder / "a.txt").write_text("A.txt")
     (folder / "b" / "ż.txt").unlink()
@@ -54,20 +54,20 @@ def test_checksums_are_updated_for_files_that_a_command_replaces(folder):
     assert changed_files(folder) == ["b/d.txt", "b/ż.txt", "c.txt"]
 
 
-def test_a_folder_without_the_list_gets_none(tmp_path):
+def test_a_folder_without_checksums_gets_no_checksum_file(tmp_path):
     with relisted(tmp_path, "a.txt"):
         (tmp_path / "a.txt").touch()
     assert not (tmp_path / SUMS).exists()
 
 
 @pytest.mark.parametrize("line", ["0123  a.txt", "no line", "g" * 64 + "  a.txt"])
-def test_a_damaged_list_is_an_error(folder, line):
+def test_a_damaged_checksum_file_is_an_error(folder, line):
     (folder / SUMS).write_text(f"{line}\n")
     with pytest.raises(UserError, match=f"unreadable {SUMS}"):
         changed_files(folder)
 
 
-def test_a_file_that_another_program_changed_is_taken_with_a_warning(folder, caplog):
+def test_a_file_changed_by_another_program_is_used_with_a_warning(folder, caplog):
     warn_if_changed(folder / "a.txt")
     assert not caplog.text
     (folder / "a.txt").write_text("edited")

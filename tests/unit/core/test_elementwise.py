@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_the_bits_do_not_depend_on_the_threads(name):
+def test_the_bits_do_not_depend_on_the_number_of_threads(name):
     mine, _ = FUNCTIONS[name]
     generator = torch.Generator().manual_seed(0)
     for size in (BLOCK, 50_000, 100_000, 126_003):
@@ -29,7 +29,7 @@ def test_the_bits_do_not_depend_on_the_threads(name):
         assert torch.equal(*found)
 
 
-def test_the_bits_of_gradients_do_not_depend_on_the_threads():
+def test_the_bits_of_gradients_do_not_depend_on_the_number_of_threads():
     generator = torch.Generator().manual_seed(0)
     values, upstream = torch.randn(2, 126_003, generator=generator)
     found = []
@@ -41,7 +41,7 @@ def test_the_bits_of_gradients_do_not_depend_on_the_threads():
     assert torch.equal(*found)
 
 
-def test_gradients_of_gradients_pass_through_every_block():
+def test_second_order_gradients_pass_through_every_block():
     values = torch.linspace(-5.0, 5.0, BLOCK + 1, dtype=torch.float64).requires_grad_()
     (first,) = torch.autograd.grad(sigmoid(values).sum(), values, create_graph=True)
     (second,) = torch.autograd.grad(first.sum(), values)

@@ -65,7 +65,7 @@ def decibel(difference: float) -> float:
     return -20.0 * log10(difference / 255.0)
 
 
-def test_means_overall_and_per_regime():
+def test_means_are_computed_overall_and_per_regime():
     views = [
         make_view("far/1", "far", grey=110),
         make_view("near/1", "near", grey=120),
@@ -100,7 +100,7 @@ def test_masked_pixels_do_not_count():
     assert result.views[0]["psnr"] == pytest.approx(decibel(10), abs=1e-4)
 
 
-def test_a_view_without_a_single_pixel_counts_for_nothing():
+def test_a_fully_masked_view_does_not_count():
     nothing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     views = [make_view("a", "x", 110, nothing), make_view("b", "x", 110)]
     result = evaluate(views, flat(100), (*METRICS[:3], Constant()))
@@ -122,7 +122,7 @@ def test_no_held_out_views_give_null_with_the_reason():
     assert "no held-out views" in result.reasons["psnr"]
 
 
-def test_lpips_only_where_asked_for():
+def test_lpips_is_measured_only_if_requested():
     views = [make_view("a", "x", 100), make_view("b", "x", 120)]
 
     without = evaluate(views, flat(100), METRICS)
@@ -133,7 +133,7 @@ def test_lpips_only_where_asked_for():
     assert result.reasons == {}
 
 
-def test_panels_are_offered_what_was_compared():
+def test_panels_receive_the_compared_images():
     offered: list[Evaluated] = []
     views = [make_view("a", "x", 7), make_view("b", "x", 9)]
     result = evaluate(views, flat(100.4), METRICS, on_view=offered.append)
@@ -144,7 +144,7 @@ def test_panels_are_offered_what_was_compared():
     assert offered[1].compared.photo.unique().tolist() == [9]
 
 
-def test_an_image_too_small_for_one_metric_keeps_the_others():
+def test_an_image_too_small_for_one_metric_keeps_the_other_metrics():
     border = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     border[5:-5, 5:-5] = False  # scikit-image's SSIM leaves out just these five pixels
     result = evaluate([make_view("a", "x", 110, border)], flat(100), METRICS)
@@ -153,7 +153,7 @@ def test_an_image_too_small_for_one_metric_keeps_the_others():
     assert "scikit-image" in result.reasons["ssim_skimage"]
 
 
-def test_nothing_is_recorded_for_gradients():
+def test_evaluation_records_no_operations_for_gradients():
     parameter = torch.tensor(0.5, requires_grad=True)
 
     def render(_view: View) -> Tensor:
@@ -163,7 +163,7 @@ def test_nothing_is_recorded_for_gradients():
     assert evaluate([make_view("a", "x")], render, METRICS).overall["psnr"] is not None
 
 
-def test_means_leave_out_what_is_not_known():
+def test_means_omit_views_without_a_value():
     result = summarised(
         [
             of("a", "x", 20.0, 0.5, 0.5, None),
@@ -179,7 +179,7 @@ def test_means_leave_out_what_is_not_known():
     assert result.regimes["y"]["lpips"] is None
 
 
-def test_views_that_are_masked_as_a_whole_are_not_counted():
+def test_fully_masked_views_are_not_counted():
     figure = Figure("psnr", "PSNR")
     views = [
         ViewMetrics("a", "near", {"psnr": 20.0}),

@@ -20,7 +20,7 @@ from crossgrad_core.system.files import (
 )
 
 
-def test_replaces_the_whole_file(tmp_path: Path):
+def test_writing_replaces_the_whole_file(tmp_path: Path):
     path = tmp_path / "a.txt"
     write_atomically(path, b"old and long")
     write_atomically(path, b"new")
@@ -34,7 +34,7 @@ def interrupted_write(path: Path) -> None:
         raise KeyboardInterrupt
 
 
-def test_an_error_in_the_block_keeps_the_old_file(tmp_path: Path):
+def test_an_error_inside_the_block_keeps_the_old_file(tmp_path: Path):
     path = tmp_path / "a.txt"
     write_atomically(path, b"old")
     with pytest.raises(KeyboardInterrupt):
@@ -62,12 +62,12 @@ def test_disk_errors_become_user_errors(tmp_path: Path, number: int, message: st
     assert str(tmp_path / "x" / "y") in str(told.value)
 
 
-def test_other_system_errors_pass(tmp_path: Path):
+def test_other_system_errors_are_passed_on(tmp_path: Path):
     with pytest.raises(FileNotFoundError), disk_errors(tmp_path):
         (tmp_path / "a" / "b.txt").write_text("")
 
 
-def test_a_folder_in_place_of_a_file_stays(tmp_path: Path):
+def test_a_folder_with_the_name_of_the_file_is_not_replaced(tmp_path: Path):
     (tmp_path / "a.txt").mkdir()
     with pytest.raises(UserError, match="something else is in the way"):
         write_atomically(tmp_path / "a.txt", b"new")
@@ -78,15 +78,15 @@ def test_a_folder_in_place_of_a_file_stays(tmp_path: Path):
     ("count", "text"),
     [(0, "0.0 KiB"), (3 * 2**9, "1.5 KiB"), (3 * 2**19, "1.5 MiB"), (2**30, "1.0 GiB")],
 )
-def test_sizes_are_readable(count: int, text: str):
+def test_sizes_are_printed_readably(count: int, text: str):
     assert size_text(count) == text
 
 
-def test_free_space_of_a_folder_that_does_not_exist_yet(tmp_path: Path):
+def test_free_space_is_found_for_a_folder_that_does_not_exist_yet(tmp_path: Path):
     assert free_bytes(tmp_path / "a" / "b") > 0
 
 
-def test_partly_written_files_of_a_killed_process_are_cleared(tmp_path: Path):
+def test_temporary_files_of_a_killed_process_are_deleted(tmp_path: Path):
     with atomic_file(tmp_path / "a.png") as file:
         left = Path(file.name)
         assert is_leftover(left)
@@ -96,7 +96,7 @@ def test_partly_written_files_of_a_killed_process_are_cleared(tmp_path: Path):
     assert sorted(path.name for path in tmp_path.iterdir()) == [".my.tmp", "a.png"]
 
 
-def test_in_a_shared_folder_the_files_of_living_processes_stay(tmp_path):
+def test_temporary_files_of_living_processes_are_kept_in_a_shared_folder(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as dead:
         dead.wait()
     names = [f".a.png.{number}.tmp" for number in (dead.pid, os.getpid(), os.getppid())]
@@ -108,6 +108,6 @@ def test_in_a_shared_folder_the_files_of_living_processes_stay(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_that_is_too_long_is_an_error_of_the_user(tmp_path):
+def test_a_file_name_that_is_too_long_is_a_user_error(tmp_path):
     with pytest.raises(UserError, match="the path is too long"):
         write_atomically(tmp_path / ("a" * 250), b"")

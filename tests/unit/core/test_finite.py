@@ -21,7 +21,7 @@ BITS = st.one_of(
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(BITS, max_size=40), st.sampled_from([torch.float32, torch.float64]))
-def test_any_bits_are_judged_as_torch_does(bits, dtype):
+def test_float_values_of_any_bits_are_classified_as_by_torch(bits, dtype):
     values = torch.from_numpy(np.array(bits, np.uint32).view(np.float32)).to(dtype)
     finite, present = finite_and_present(values)
     assert finite == bool(torch.isfinite(values).all())
@@ -40,13 +40,13 @@ def test_one_bad_element_among_many_is_found(place, value, rows):
     assert finite_and_present(values.view(rows, 511).T) == (False, True)
 
 
-def test_none_and_empty_tensors_count_as_finite_and_absent():
+def test_missing_and_empty_tensors_count_as_finite_and_zero():
     assert finite_and_present(None) == (True, False)
     assert finite_and_present(torch.zeros(0, 3, requires_grad=True)) == (True, False)
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_many_tensors_are_judged_as_each_by_itself(seed):
+def test_checking_many_tensors_at_once_equals_checking_each_tensor(seed):
     """Of all kinds, sizes about those of the parts in which they are looked at, in any order."""
     rng = np.random.default_rng(seed)
     tensors = []

@@ -67,7 +67,7 @@ def naive_gramian(views, names):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 16])
 @pytest.mark.parametrize("granularity", ["block", "kind", "global"])
-def test_gramians_and_sums_against_the_obvious_way(granularity, count, dtype):
+def test_gramians_and_sums_agree_with_a_direct_computation(granularity, count, dtype):
     views = make_views(count, dtype)
     gradients = DenseGradients(views, BLOCKS)
     expected = np.stack([naive_gramian(views, names) for names in TENSORS[granularity]])
@@ -84,7 +84,7 @@ def test_gramians_and_sums_against_the_obvious_way(granularity, count, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
-def test_rows_of_primitives(count, dtype):
+def test_gramians_and_sums_per_primitive_agree_with_a_direct_computation(count, dtype):
     views = make_views(count, dtype)
     gradients = DenseGradients(views, BLOCKS)
     names, found = gradients.names("gaussian"), gradients.gramians("gaussian")
@@ -134,7 +134,7 @@ def test_accumulation_and_separate_gradients_give_the_same_bits(count, dtype):
                 assert torch.equal(found[name], expected)
 
 
-def test_a_non_finite_view_is_dropped_alike_by_both_ways():
+def test_a_non_finite_view_is_dropped_alike_by_accumulated_and_separate_gradients():
     views = make_views(3)
     views[1]["means"][4, 1] = float("nan")
     views[0]["mlp.1"][2] = float("inf")
@@ -151,7 +151,7 @@ def test_a_non_finite_view_is_dropped_alike_by_both_ways():
             assert torch.equal(found.gradients[name], gradient)
 
 
-def test_blocks_without_a_finite_view_are_left_out():
+def test_blocks_without_a_finite_view_get_no_gradient():
     views = make_views(2)
     for view in views:
         view["means"][0, 0] = float("inf")
@@ -181,7 +181,7 @@ def test_a_missing_gradient_counts_as_zero(granularity):
     assert aggregate(operator, DenseGradients(nowhere, BLOCKS)).gradients["opacities"] is None
 
 
-def test_events_are_counted():
+def test_events_of_an_aggregation_are_counted():
     """One block of each sort: conflicting, agreeing but disjoint, zero, not finite."""
     one = {"means": torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": torch.ones(50, 1)}
     two = {"means": -torch.ones(50, 3), "scales": torch.zeros(50, 3), "opacities": None}
@@ -193,7 +193,7 @@ def test_events_are_counted():
     assert torch.equal(found.gradients["scales"], one["scales"] + two["scales"])
 
 
-def test_a_product_of_zero_is_no_proof_of_disjoint_support():
+def test_a_product_that_underflows_to_zero_does_not_count_as_disjoint():
     one = {"means": torch.ones(50, 3)}
     two = {"means": torch.ones(50, 3)}
     two["means"][:, 0], two["means"][:, 1] = -1.0, 0.0
@@ -206,7 +206,7 @@ def test_a_product_of_zero_is_no_proof_of_disjoint_support():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_overlap_of_rows(dtype):
+def test_overlap_is_computed_per_primitive(dtype):
     one, two = torch.zeros(50, 3, dtype=dtype), torch.zeros(50, 3, dtype=dtype)
     one[:, 0] = 1
     two[::2, 0], two[::2, 1], one[::2, 1] = 1, -1, 1
@@ -217,7 +217,7 @@ def test_overlap_of_rows(dtype):
 
 
 @pytest.mark.parametrize("views", [2, 5])
-def test_threads_and_chunks_change_no_bit(views):
+def test_numbers_of_threads_and_chunks_change_no_bit(views):
     generator = torch.Generator().manual_seed(0)
     big = [{"means": torch.randn(100_003, 3, generator=generator)} for _ in range(views)]
     before = numba.get_num_threads()
@@ -257,7 +257,7 @@ def test_one_core_and_all_cores_give_the_same_bits():
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("views", [1, 2, 3, 5])
-def test_overwriting_gives_the_same_bits_and_can_be_done_once(granularity, views):
+def test_an_overwriting_sum_gives_the_same_bits_and_works_only_once(granularity, views):
     operator = Symmetric(granularity=granularity)
     kept = make_views(views)
     expected = aggregate(operator, DenseGradients(kept, BLOCKS))
@@ -271,7 +271,7 @@ def test_overwriting_gives_the_same_bits_and_can_be_done_once(granularity, views
         assert all(torch.equal(view[name], fresh[name]) for name in SHAPES)
 
 
-def test_gradients_of_any_layout():
+def test_gradients_may_have_any_memory_layout():
     views = make_views(2)
     turned = [{**v, "mlp.0": v["mlp.0"].T.contiguous().T, "means": v["means"]} for v in views]
     assert not turned[0]["mlp.0"].is_contiguous()
@@ -279,7 +279,7 @@ def test_gradients_of_any_layout():
     np.testing.assert_array_equal(one, other)
 
 
-def test_float64_far_outside_the_range_of_products():
+def test_float64_gradients_outside_the_range_of_products_are_handled():
     views = [{"means": torch.full((50, 3), 1e200, dtype=torch.float64)} for _ in range(2)]
     views[1]["means"][:, 0] *= -4
     gradients = DenseGradients(views, BLOCKS[:1])
@@ -292,7 +292,7 @@ def test_float64_far_outside_the_range_of_products():
     assert gradients.present("block").all()
 
 
-def test_no_gaussians_at_all():
+def test_aggregation_works_without_gaussians():
     views = [{"means": torch.zeros(0, 3)} for _ in range(2)]
     for granularity in GRANULARITIES:
         operator = Symmetric(granularity=granularity)
@@ -300,7 +300,7 @@ def test_no_gaussians_at_all():
         assert found.gradients["means"].shape == (0, 3)
 
 
-def test_elementwise_sees_the_views_that_count():
+def test_elementwise_operators_receive_only_finite_views():
     views = make_views(2)
     views[0]["means"][0, 0] = float("nan")
     seen = {}
@@ -322,7 +322,7 @@ def test_accumulated_gradients_are_refused_by_operators_that_need_single_views()
         aggregate(Symmetric(), gradients)
 
 
-def test_weights_that_are_not_finite_are_refused_with_the_operator_and_the_block():
+def test_non_finite_weights_are_refused_and_the_operator_is_named():
     class Divides(Symmetric):
         def transform(self, gramians, context, state, rng):
             return np.full(gramians.shape, np.nan), state
@@ -333,7 +333,7 @@ def test_weights_that_are_not_finite_are_refused_with_the_operator_and_the_block
 
 @pytest.mark.parametrize("granularity", GRANULARITIES)
 @pytest.mark.parametrize("name", ["symmetric", "cagrad", "gradvac", "confgate", "nash", "dispatch"])
-def test_operators_take_every_granularity(name, granularity):
+def test_operators_accept_every_granularity(name, granularity):
     operator = build("operators", name, {"granularity": granularity})
     found = aggregate(operator, DenseGradients(make_views(2), BLOCKS))
     for gradient in found.gradients.values():
@@ -343,7 +343,7 @@ def test_operators_take_every_granularity(name, granularity):
 @pytest.mark.parametrize("absent", [0, 1, 2])
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_the_mean_is_the_sum_over_all_views_to_the_bit(count, dtype, absent):
+def test_the_mean_is_the_sum_divided_by_all_views_to_the_bit(count, dtype, absent):
     """Divided once, after the sum; views without a gradient count."""
     views = make_views(count, dtype)
     views[min(absent, count - 1)]["means"] = None
@@ -362,7 +362,7 @@ def test_the_mean_is_the_sum_over_all_views_to_the_bit(count, dtype, absent):
             assert total is None or torch.equal(found[name], total / count), name
 
 
-def test_an_accumulated_sum_that_was_looked_at_survives_its_mean():
+def test_an_accumulated_sum_that_was_read_is_not_changed_by_its_mean():
     views = make_views(3)
     gradients = accumulation(views)
     total = {name: gradient.clone() for name, gradient in gradients.total().items()}
@@ -372,7 +372,7 @@ def test_an_accumulated_sum_that_was_looked_at_survives_its_mean():
         assert torch.equal(mean[name], expected / 3)
 
 
-def test_an_accumulated_sum_is_gone_once_it_was_divided():
+def test_an_accumulated_sum_cannot_be_read_after_it_was_divided():
     gradients = accumulation(make_views(2))
     mean = gradients.total(2)
     assert gradients.total(2) is mean
@@ -382,7 +382,7 @@ def test_an_accumulated_sum_is_gone_once_it_was_divided():
         gradients.add(make_views(1)[0])
 
 
-def test_aggregation_is_what_operators_do_by_default():
+def test_aggregate_equals_the_default_gramian_aggregation():
     gradients = DenseGradients(make_views(2), BLOCKS)
     found = aggregate(Symmetric(), gradients)
     context = AggregateContext(
@@ -457,7 +457,7 @@ def test_the_gradient_of_one_view_is_checked_again_only_after_a_write():
     assert not gradients.is_judged("means", total["means"])
 
 
-def test_sums_of_views_are_checked_again_because_they_may_overflow():
+def test_sums_of_several_views_are_checked_again_because_they_may_overflow():
     gradients = summed(make_views(2))
     assert not any(gradients.is_judged(name, g) for name, g in gradients.total(2).items())
     (view,) = make_views(1)
@@ -465,7 +465,7 @@ def test_sums_of_views_are_checked_again_because_they_may_overflow():
     assert joint.is_judged("means", joint.total(1)["means"])
 
 
-def test_rows_of_one_view_are_not_looked_at_twice():
+def test_sparse_rows_of_one_view_are_not_checked_twice():
     (view,) = make_views(1)
     rows, values = torch.tensor([3, 8]), torch.ones(2, 3)
     gradients = summed([{**view, "means": sparse_rows(rows, values, (50, 3))}])

@@ -65,7 +65,7 @@ def test_paths_that_are_not_regular_files_are_not_opened(odd):
         open_file(odd)
 
 
-def test_no_list_of_views_and_no_mark_of_the_scene_is_read_from_a_pipe(tmp_path):
+def test_scene_lists_and_scene_marker_files_are_not_read_from_a_pipe(tmp_path):
     for name in ("train_list.txt", "scene.json"):
         os.mkfifo(tmp_path / name)
     assert read_list(tmp_path / "train_list.txt", ()) is None
@@ -80,7 +80,7 @@ def test_a_symbolic_link_to_a_file_is_read_as_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["json", "csv", "exposure", "camera path"])
-def test_a_file_beyond_the_largest_is_not_even_read(name, tmp_path):
+def test_a_file_above_the_size_limit_is_not_read(name, tmp_path):
     path = tmp_path / "file"
     with path.open("wb") as file:
         file.truncate(1 << 42)  # takes no room
@@ -99,7 +99,7 @@ def test_a_huge_settings_file_is_refused_after_its_first_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.lock", "log.txt"])
-def test_nothing_is_written_through_a_link_in_the_folder_of_a_run(name, tmp_path):
+def test_files_in_a_run_folder_are_not_written_through_a_link(name, tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("not to be lost")
     run = tmp_path / "run"

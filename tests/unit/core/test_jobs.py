@@ -50,7 +50,7 @@ def taken(numbers, count, most):
     return found
 
 
-def test_a_thread_takes_its_own_jobs_first_and_then_those_that_others_have_left():
+def test_a_thread_takes_its_own_jobs_first_and_then_jobs_of_other_threads():
     first, second, third = jobs._jobs(3)
     assert list(taken(second, 10, 2)) == [3, 4]
     assert list(taken(third, 10, 5)) == [6, 7, 8, 9, 0]
@@ -60,7 +60,7 @@ def test_a_thread_takes_its_own_jobs_first_and_then_those_that_others_have_left(
 
 
 @pytest.mark.parametrize(("threads", "count"), [(1, 7), (4, 0), (4, 3), (5, 64)])
-def test_threads_that_come_in_any_order_take_every_job_once(threads, count):
+def test_threads_in_any_order_do_every_job_once(threads, count):
     draw = np.random.default_rng(threads * 100 + count)
     numbers = jobs._jobs(threads)
     found = [taken(numbers[draw.integers(threads)], count, 1)[0] for _ in range(count)]
@@ -69,7 +69,7 @@ def test_threads_that_come_in_any_order_take_every_job_once(threads, count):
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_an_error_of_a_helper_is_raised(threads):
+def test_an_error_of_a_helper_thread_is_raised(threads):
     both = threading.Barrier(threads)
 
     def fails(_numbers):
@@ -159,7 +159,7 @@ def test_abandoned_background_work_is_not_continued(threads):
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_helpers_keep_nothing_of_what_they_were_given(threads):
+def test_helper_threads_keep_no_reference_to_their_arguments(threads):
     marks = np.zeros(1000, np.int64)
     left = weakref.ref(marks)
     jobs.parallel(mark, marks)
@@ -173,7 +173,9 @@ def test_helpers_keep_nothing_of_what_they_were_given(threads):
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_helpers_end_before_the_interpreter_and_others_take_their_place(threads, monkeypatch):
+def test_helper_threads_end_before_the_interpreter_and_are_replaced_on_the_next_call(
+    threads, monkeypatch
+):
     at_exit = []
     monkeypatch.setattr(jobs.atexit, "register", at_exit.append)
     jobs._helpers.cache_clear()
@@ -197,7 +199,7 @@ linux = pytest.mark.skipif(
 
 @linux
 @pytest.mark.parametrize("threads", [2], indirect=True)
-def test_helpers_run_on_other_cores_than_their_caller(threads, monkeypatch):
+def test_helper_threads_run_on_other_cores_than_their_caller(threads, monkeypatch):
     allowed = os.sched_getaffinity(0)
     jobs._helpers.cache_clear()
     for core in sorted(allowed) * 2:
@@ -226,7 +228,7 @@ def test_a_thread_without_another_allowed_core_is_not_moved(monkeypatch):
 
 
 @linux
-def test_a_thread_that_has_ended_is_left_out():
+def test_a_thread_that_has_ended_is_skipped():
     ended = threading.Thread(target=lambda: None)
     ended.start()
     number = ended.native_id
@@ -235,7 +237,7 @@ def test_a_thread_that_has_ended_is_left_out():
 
 
 @pytest.mark.parametrize(("wish", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
-def test_idle_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, wish, found):
+def test_idle_threads_sleep_unless_the_environment_sets_a_wait_policy(monkeypatch, wish, found):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     if wish is not None:
         monkeypatch.setenv("OMP_WAIT_POLICY", wish)

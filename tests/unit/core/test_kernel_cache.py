@@ -63,7 +63,7 @@ def listening(caplog):
     caplog.set_level(logging.INFO, "crossgrad_core.numerics.kernel_cache")
 
 
-def test_a_kernel_is_compiled_once(package, caplog):
+def test_a_kernel_is_compiled_only_once(package, caplog):
     assert kernel(package)(1) == 2
     assert compiled(caplog) == ["compiling moved"]
     caplog.clear()
@@ -92,7 +92,7 @@ def flipped(content):
     ],
     ids=["empty", "garbage", "random", "cut", "bit", "longer"],
 )
-def test_a_damaged_file_counts_as_missing_and_is_written_anew(package, caplog, damage):
+def test_a_damaged_cache_file_counts_as_missing_and_is_rewritten(package, caplog, damage):
     kernel(package)(1)
     (file,) = files(package)
     whole = file.read_bytes()
@@ -105,7 +105,7 @@ def test_a_damaged_file_counts_as_missing_and_is_written_anew(package, caplog, d
     assert compiled(caplog) == []
 
 
-def test_a_folder_in_place_of_a_cache_file_is_a_warning_only(package, caplog):
+def test_a_folder_with_the_name_of_a_cache_file_gives_only_a_warning(package, caplog):
     kernel(package)(1)
     (file,) = files(package)
     file.unlink()
@@ -141,7 +141,7 @@ def test_the_cache_of_the_user_is_used_if_the_folder_of_the_kernel_is_read_only(
     assert not [record for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_without_any_place_kernels_run_and_one_note_says_what_to_do(
+def test_kernels_run_without_a_cache_folder_and_one_note_suggests_a_remedy(
     package, caplog, monkeypatch, tmp_path
 ):
     blocked(package / "__pycache__")
@@ -154,7 +154,7 @@ def test_without_any_place_kernels_run_and_one_note_says_what_to_do(
     assert compiled(caplog) == ["compiling moved"] * 2
 
 
-def test_a_full_disk_costs_the_cache_only(package, caplog, monkeypatch):
+def test_a_full_disk_only_disables_the_cache(package, caplog, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -174,7 +174,7 @@ print(moved(x), *[len(moved.stats.cache_misses)])
 """
 
 
-def test_two_processes_that_compile_at_once_leave_both_results(package):
+def test_two_processes_that_compile_at_once_save_both_kernels(package):
     program = BOTH.format(package=package.name)
     path = os.pathsep.join([str(package.parent), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": ""}
@@ -190,7 +190,7 @@ def test_two_processes_that_compile_at_once_leave_both_results(package):
     assert len(files(package)) == 2
 
 
-def test_every_kernel_of_ours_is_keyed_by_the_files_that_it_inlines():
+def test_the_cache_key_of_a_bundled_kernel_covers_the_files_that_it_inlines():
     from crossgrad_core.numerics import kernel_cache
     from crossgrad_plugins.losses.photometric.numba_kernels import fused
 
@@ -198,5 +198,5 @@ def test_every_kernel_of_ours_is_keyed_by_the_files_that_it_inlines():
     assert {"fused.py", "terms.py", "simd.py", "reference.py"} <= names
 
 
-def test_results_are_arrays_as_numba_makes_them(package):
+def test_cached_kernels_return_arrays_like_numba(package):
     assert np.array_equal(kernel(package)(np.arange(3)), [1, 2, 3])

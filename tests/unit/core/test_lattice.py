@@ -21,19 +21,19 @@ def cloud(rng, count=200, levels=5):
     return anchors, torch.from_numpy(rng.integers(0, levels, count))
 
 
-def test_packing_keeps_every_number():
+def test_packing_a_lattice_keeps_every_number():
     one = lattice()
     assert Lattice.of(one.packed()).packed().tolist() == one.packed().tolist()
     assert one.packed().dtype == torch.float64 and one.count == 5
 
 
 @pytest.mark.parametrize("fork", [2, 3])
-def test_cells_shrink_by_the_fork(fork):
+def test_cells_shrink_by_the_factor_fork_from_level_to_level(fork):
     cells = lattice(fork=fork).cells(torch.arange(5))
     assert cells.tolist() == pytest.approx([0.5 / fork**level for level in range(5)], rel=1e-15)
 
 
-def test_sites_are_the_nearest_and_positions_lead_back():
+def test_lattice_sites_are_the_nearest_ones_and_their_positions_map_back_to_the_sites():
     rng = np.random.default_rng(0)
     points, levels = cloud(rng)
     grid = lattice()
@@ -49,7 +49,7 @@ def test_sites_are_the_nearest_and_positions_lead_back():
 
 @pytest.mark.parametrize("fork", [2, 3])
 @pytest.mark.parametrize("rounding", ROUNDING)
-def test_an_anchor_is_seen_where_its_level_is_at_most_the_rounded_one(rounding, fork):
+def test_an_anchor_is_visible_if_its_level_is_at_most_the_rounded_level(rounding, fork):
     rng = np.random.default_rng(1)
     anchors, levels = cloud(rng)
     extra = torch.from_numpy(rng.uniform(0, 0.6, len(levels)))
@@ -69,7 +69,7 @@ def test_an_anchor_is_seen_where_its_level_is_at_most_the_rounded_one(rounding, 
     assert 0 < int(seen.sum()) < len(seen)
 
 
-def test_level_0_is_always_seen_and_a_camera_inside_an_anchor_sees_every_level():
+def test_level_0_is_always_visible_and_a_camera_inside_an_anchor_sees_every_level():
     grid, camera = lattice(lead=0.0), torch.zeros(3)
     levels = torch.arange(5)
     far = torch.full((5,), 1e30)
@@ -81,7 +81,7 @@ def test_level_0_is_always_seen_and_a_camera_inside_an_anchor_sees_every_level()
     assert not grid.detail(distances * 0, none).isnan().any()
 
 
-def test_shares_count_cameras():
+def test_visible_shares_count_the_cameras_that_see_an_anchor():
     rng = np.random.default_rng(2)
     anchors, levels = cloud(rng, 30)
     cameras = torch.from_numpy(rng.uniform(-6, 6, (7, 3)))
@@ -104,6 +104,6 @@ def test_keep_levels_drops_low_shares_and_never_a_share_of_one():
     assert everyone.keep_levels(shares).tolist() == [False, False, False, True]
 
 
-def test_shares_without_cameras_are_0():
+def test_visible_shares_without_cameras_are_zero():
     anchors, levels = torch.zeros(2, 3), torch.tensor([0, 1])
     assert lattice().shares(anchors, levels, torch.zeros(0, 3)).tolist() == [0.0, 0.0]

@@ -50,7 +50,7 @@ def refusal(**plugins):
     return caught.value
 
 
-def test_each_manager_is_fresh():
+def test_every_new_manager_is_empty():
     one, other = make_manager({"a": Densifier(1)}), make_manager({})
     assert one.get_plugin("a") is not None
     assert other.get_plugin("a") is None
@@ -77,7 +77,7 @@ def test_a_hook_with_another_prefix_is_refused():
     assert "the hook densify, which does not exist" in refusal(other=Other()).what
 
 
-def test_a_forgotten_mark_is_refused():
+def test_a_hook_method_without_its_decorator_is_refused():
     class Unmarked:
         def crossgrad_step_end(self, record):
             return None
@@ -87,7 +87,7 @@ def test_a_forgotten_mark_is_refused():
     assert "forgot @hookimpl?" in error.todo
 
 
-def test_a_method_that_only_looks_like_a_hook_is_refused():
+def test_a_class_method_that_only_looks_like_a_hook_is_refused():
     class Unmarked:
         @classmethod
         def crossgrad_step_ended(cls):
@@ -121,13 +121,13 @@ def test_wrong_arguments_are_refused_with_the_signature():
     assert "message" in error.found
 
 
-def test_two_answers_to_one_hook_are_refused_with_both_names():
+def test_a_hook_that_two_plugins_answer_is_refused_with_both_names():
     error = refusal(selected=Densifier(1), intruder=Densifier(2))
     assert "crossgrad_densify: selected, intruder" in error.what
     assert "wrapper=True" in error.todo
 
 
-def test_many_plugins_may_watch_an_event():
+def test_several_plugins_may_observe_an_event():
     class Watcher:
         @hookimpl
         def crossgrad_log(self, text):
@@ -137,13 +137,13 @@ def test_many_plugins_may_watch_an_event():
     assert len(manager.hook.crossgrad_log.get_hookimpls()) == 2
 
 
-def test_a_module_that_imports_us_is_no_misspelt_hook():
+def test_a_plugin_module_that_imports_crossgrad_core_is_accepted():
     module = types.ModuleType("a_plugin")
     exec("import crossgrad_core\ncrossgrad_version = '1'", module.__dict__)
     assert make_manager({"module": module}).get_plugin("module") is module
 
 
-def test_properties_are_not_evaluated():
+def test_properties_of_a_plugin_are_not_evaluated():
     class Careful(BaseModel):
         model_config = ConfigDict(frozen=True)
 
@@ -169,7 +169,7 @@ def test_later_wrappers_are_outer_wrappers():
 
 
 @pytest.mark.parametrize("answer", [DensifyResult(NO_EDIT), DensifyResult(Edit())])
-def test_a_hook_gives_its_answer(answer):
+def test_a_hook_call_returns_the_answer_of_its_plugin(answer):
     hook = make_manager({"densifier": Densifier(answer)}).hook.crossgrad_densify
     assert call_first_result(hook, None, DensifyResult) is answer
 
@@ -196,7 +196,7 @@ def test_a_sample_result_without_views_is_refused():
         call_first_result(hook, None, SampleResult)
 
 
-def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
+def test_a_wrapper_that_drops_the_answer_is_named_in_an_error():
     plugins = {"densifier": Densifier(DensifyResult(NO_EDIT)), "forgetful": Forgetful()}
     with pytest.raises(UserError, match="was not answered") as caught:
         call_first_result(make_manager(plugins).hook.crossgrad_densify, None, DensifyResult)
@@ -204,7 +204,7 @@ def test_a_wrapper_that_swallows_the_answer_is_an_error_that_names_it():
     assert "yield" in caught.value.todo
 
 
-def test_an_error_in_a_hook_names_its_plugin_and_passes_the_wrappers():
+def test_an_error_in_a_hook_names_its_plugin_and_passes_through_the_wrappers():
     class Failing:
         @hookimpl
         def crossgrad_densify(self, context):
@@ -234,7 +234,7 @@ def test_an_error_in_a_hook_names_its_plugin_and_passes_the_wrappers():
     assert "of plugin after, " in note
 
 
-def test_a_hook_without_plugins_is_an_error():
+def test_calling_a_hook_without_plugins_is_an_error():
     with pytest.raises(UserError, match="plugins none"):
         call_first_result(make_manager({}).hook.crossgrad_densify, None, DensifyResult)
 
@@ -294,7 +294,7 @@ def module():
     ],
     ids=lambda plugin: type(plugin).__name__,
 )  # fmt: skip
-def test_hooks_are_found_where_pluggy_finds_them(plugin):
+def test_hooks_are_recognised_exactly_as_by_pluggy(plugin):
     ours, plain = make_manager({}), pluggy.PluginManager(PROJECT)
     for name in dir(plugin):
         assert ours.parse_hookimpl_opts(plugin, name) == plain.parse_hookimpl_opts(plugin, name)

@@ -24,7 +24,7 @@ MASK = torch.rand(30, 40, generator=torch.Generator().manual_seed(2)) < 0.6
 NOTHING = torch.zeros(30, 40, dtype=torch.bool)
 
 
-def test_eight_bit_clamps_rounds_and_is_idempotent():
+def test_to_uint8_clamps_rounds_and_is_idempotent():
     image = torch.tensor([[[-1.0, 0.5, 2.0], [torch.nan, 0.1, 1.0]]])
     expected = torch.tensor([[[0, 128, 255], [0, 26, 255]]], dtype=torch.uint8)
     assert torch.equal(to_uint8(image), expected)
@@ -33,13 +33,13 @@ def test_eight_bit_clamps_rounds_and_is_idempotent():
 
 
 @pytest.mark.parametrize("step", [1, 7, 200])
-def test_psnr_of_a_constant_difference(step):
+def test_psnr_of_a_constant_difference_agrees_with_the_formula(step):
     image = torch.full((5, 6, 3), step, dtype=torch.uint8)
     expected = -20 * math.log10(step / 255)
     assert psnr(image, torch.zeros(5, 6, 3)) == pytest.approx(expected, rel=1e-12)
 
 
-def test_psnr_counts_kept_pixels_only():
+def test_psnr_counts_unmasked_pixels_only():
     spoiled = IMAGE.clone()
     spoiled[~MASK] = 0
     assert psnr(spoiled, TARGET, MASK) == psnr(IMAGE, TARGET, MASK)
@@ -48,7 +48,7 @@ def test_psnr_counts_kept_pixels_only():
     assert psnr(IMAGE, TARGET, MASK) == pytest.approx(expected, rel=1e-12)
 
 
-def test_equal_images():
+def test_equal_images_have_the_highest_value_of_every_metric():
     assert psnr(IMAGE, IMAGE) == PSNR_LIMIT
     assert ssim(IMAGE, IMAGE) == 1
     assert ssim_skimage(IMAGE, IMAGE) == pytest.approx(1)
@@ -61,17 +61,17 @@ def test_psnr_of_one_step_in_one_value_is_below_the_limit():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim, ssim_skimage])
-def test_nothing_kept_gives_no_value(metric):
+def test_a_fully_masked_image_has_no_metric_value(metric):
     assert metric(IMAGE, TARGET, NOTHING) is None
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim, ssim_skimage])
-def test_a_full_mask_is_no_mask(metric):
+def test_a_full_mask_equals_no_mask(metric):
     assert metric(IMAGE, TARGET, ~NOTHING) == metric(IMAGE, TARGET)
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim, ssim_skimage])
-def test_bytes_and_floats_are_the_same_image(metric):
+def test_uint8_and_float_images_have_the_same_metrics(metric):
     assert metric(IMAGE / 255, TARGET / 255) == metric(IMAGE, TARGET)
 
 
@@ -83,7 +83,7 @@ def test_ssim_is_the_mean_of_the_reference_map(mask):
     assert ssim(IMAGE, TARGET, mask) == pytest.approx(expected, abs=1e-6)
 
 
-def test_ssim_skimage_is_what_scikit_image_says():
+def test_ssim_skimage_agrees_with_scikit_image():
     expected = structural_similarity(
         IMAGE.numpy(),
         TARGET.numpy(),
@@ -112,7 +112,7 @@ def whole(image, target):
 
 
 @pytest.mark.parametrize("height", [128, 129, 133, 138, 139, 256, 261, 300])
-def test_ssim_skimage_in_strips_has_the_bits_of_the_whole(height):
+def test_ssim_skimage_in_strips_has_the_bits_of_the_whole_image(height):
     random = torch.Generator().manual_seed(height)
     image, target = torch.randint(0, 256, (2, height, 40, 3), generator=random, dtype=torch.uint8)
     full = whole(image, target)
@@ -128,7 +128,7 @@ def test_both_ssims_agree_away_from_the_border():
 
 
 @pytest.mark.parametrize("shape", [(10, 40), (40, 10), (1, 1)])
-def test_images_too_small_for_scikit_image(shape):
+def test_images_too_small_for_scikit_image_have_no_ssim_skimage(shape):
     image, target = levels(3, *shape), levels(4, *shape)
     assert ssim_skimage(image, target) is None
     assert ssim(image, target) is not None

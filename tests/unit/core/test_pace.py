@@ -36,7 +36,7 @@ def test_views_add_up_step_by_step(text, total):
 
 @pytest.mark.parametrize("text", PLANS)
 @pytest.mark.parametrize("views", [*range(30), 1000, 2401])
-def test_a_length_in_views_is_the_most_steps_that_draw_no_more(text, views):
+def test_a_length_in_views_becomes_the_largest_number_of_steps_within_it(text, views):
     plan = ViewsPerStepSpec.parsed(text)
     steps = plan.steps_of(views)
     assert plan.paced(steps).views(steps) <= views
@@ -62,7 +62,7 @@ def test_an_invalid_views_per_step_spec_is_refused(text):
 
 
 @pytest.mark.parametrize(("step", "start"), [(10, 40), (19, 40), (20, 40), (21, 20), (30, 20)])
-def test_a_coming_change_of_k_moves_with_the_length(step, start):
+def test_a_future_change_of_k_moves_with_the_length(step, start):
     plan = ViewsPerStepSpec.parsed("1..2@0.5")
     assert plan.paced(40).moved(plan.paced(80), step) == ViewsPerStep((0, start), (1, 2))
 

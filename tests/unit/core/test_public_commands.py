@@ -13,7 +13,7 @@ from crossgrad_core import commands
 from crossgrad_core.testing.commands import HEAVY
 
 
-def test_importing_it_is_quick():
+def test_importing_the_public_module_is_quick():
     program = "import sys, crossgrad_core.commands; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, check=True, text=True
@@ -22,7 +22,7 @@ def test_importing_it_is_quick():
 
 
 @pytest.mark.parametrize("name", commands.__all__)
-def test_each_name_is_there_with_a_docstring(name):
+def test_each_public_name_exists_and_has_a_docstring(name):
     thing = getattr(commands, name)
     assert name == "FAILED" or inspect.getdoc(thing)
 
@@ -35,7 +35,7 @@ def test_the_public_module_exports_its_documented_names_only():
         commands.Stopper  # noqa: B018
 
 
-def test_a_model_is_trained_without_a_folder_and_looked_at(tmp_path, monkeypatch):
+def test_a_model_can_be_trained_without_a_folder_and_then_rendered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene_folder = write_tiny_scene(tmp_path / "scene", views=4)
     settings = {"scene": scene_folder, "rasterizer": {"name": "torch"}}
@@ -61,7 +61,7 @@ def test_a_model_is_trained_without_a_folder_and_looked_at(tmp_path, monkeypatch
     assert all(tensor.grad is None for tensor in model.parameters.values())
 
 
-def test_progress_is_shown_at_most_once_in_a_pause(capsys):
+def test_progress_is_shown_at_most_once_per_interval(capsys):
     every, seldom = commands.Progress(), commands.Progress(60.0)
     for text in ("one", "two"):
         every.tell(text)
@@ -70,7 +70,7 @@ def test_progress_is_shown_at_most_once_in_a_pause(capsys):
     assert not seldom.due
 
 
-def test_a_table_has_every_column_and_no_nan(tmp_path):
+def test_a_table_contains_every_column_and_no_nan(tmp_path):
     rows = [{"a": 1, "b": 1 / 3}, {"a": "x,y", "c": float("nan"), "b": float("inf")}]
     commands.write_table(tmp_path / "t.csv", rows)
     assert (tmp_path / "t.csv").read_text() == 'a,b,c\n1,0.333333333,\n"x,y",inf,\n'

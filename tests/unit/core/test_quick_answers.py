@@ -45,14 +45,14 @@ def test_quick_answers_of_rasterizers_agree_with_their_classes(device):
         assert quick_answer(entry)(device) == load("rasterizers", name).speed(device)
 
 
-def test_the_quick_answer_of_a_reader_does_not_import_it(install, tmp_path):
+def test_the_quick_answer_of_a_reader_does_not_import_the_reader(install, tmp_path):
     install(ACCEPTS)
     assert not accepts("made-up", tmp_path)
     (tmp_path / "made-up.txt").touch()
     assert accepts("made-up", tmp_path)
 
 
-def test_an_answer_that_fails_leaves_the_reader_out(install, tmp_path, caplog):
+def test_a_reader_whose_quick_answer_fails_is_left_out(install, tmp_path, caplog):
     install(FAILS)
     assert not accepts("made-up", tmp_path)
     assert "reader made-up left out: RuntimeError: no answer" in caplog.text
@@ -65,7 +65,9 @@ def test_a_quick_answer_of_another_package_is_ignored(install):
     assert quick_answer(replace(entry, distribution="another")) is None
 
 
-def test_a_rasterizer_that_answers_and_cannot_be_imported_is_left_out(tmp_path, monkeypatch):
+def test_a_rasterizer_with_a_quick_answer_that_cannot_be_imported_is_left_out(
+    tmp_path, monkeypatch
+):
     plugins = {
         "rasterizers": {"made-up": "made_up_rasterizer:Rasterizer"},
         "rasterizers.speed": {"made-up": "made_up_speed:speed"},

@@ -110,7 +110,7 @@ def refusal(slot, name, options=None):
     return caught.value
 
 
-def test_every_slot_lists_our_components():
+def test_every_slot_lists_its_bundled_components():
     for slot in GROUPS:
         ours = [
             each for each in registry.entries(slot).values() if each.distribution == "crossgrad"
@@ -119,7 +119,7 @@ def test_every_slot_lists_our_components():
         assert all(each.slot == slot and ":" in each.value for each in ours)
 
 
-def test_entries_are_sorted_and_carry_their_origin(install):
+def test_entries_are_sorted_and_name_their_package(install):
     install("made-up", {"observers": {"zz": "m:A", "aa": "m:B"}}, version="2.5")
     names = list(registry.entries("observers"))
     assert names == sorted(names)
@@ -128,7 +128,7 @@ def test_entries_are_sorted_and_carry_their_origin(install):
     assert entry.origin == "m:B, from made-up 2.5"
 
 
-def test_a_distribution_that_comes_later_is_seen(install):
+def test_a_package_installed_later_is_found(install):
     assert "later" not in registry.entries("observers")
     install("made-up", {"observers": {"later": "m:A"}})
     assert "later" in registry.entries("observers")
@@ -139,12 +139,12 @@ def test_listing_imports_no_plugin(good):
     assert "made_up" not in sys.modules
 
 
-def test_an_unknown_slot_is_our_own_mistake():
+def test_an_unknown_slot_is_a_programming_error():
     with pytest.raises(KeyError):
         registry.entries("operator")
 
 
-def test_a_good_plugin_is_built_with_its_options(good):
+def test_a_valid_plugin_is_built_with_its_options(good):
     component = registry.build("groupings", "good", {"share": 0.25})
     assert isinstance(component, Grouping)
     assert component.model_dump() == {"share": 0.25, "seed": 3}
@@ -158,11 +158,11 @@ def test_an_unknown_name_is_refused_with_a_suggestion(good):
     assert "did you mean 'good'?" in error.todo
 
 
-def test_a_name_of_another_slot_is_recognised():
+def test_the_error_for_a_name_of_another_slot_names_this_slot():
     assert "radial is a grouping" in refusal("operators", "radial").todo
 
 
-def test_a_name_that_two_packages_offer_is_refused_with_both(good, install):
+def test_a_name_that_two_packages_offer_is_refused_with_both_packages(good, install):
     install("other-made-up", {"groupings": {"good": "elsewhere:Good"}}, version="3.0")
     error = refusal("groupings", "good")
     assert "2 installed packages offer a grouping named 'good'" in error.what
@@ -170,7 +170,7 @@ def test_a_name_that_two_packages_offer_is_refused_with_both(good, install):
     assert "other-made-up 3.0" in error.found
 
 
-def test_for_a_name_clash_with_crossgrad_the_other_package_has_to_rename(install):
+def test_a_name_clash_with_crossgrad_asks_the_other_package_to_rename(install):
     install("made-up", {"samplers": {"random": "elsewhere:Good"}})
     error = refusal("samplers", "random")
     assert "rename it in made-up" in error.todo
@@ -182,7 +182,7 @@ def test_components_of_other_packages_are_listed_with_their_versions(good):
     assert registry.from_elsewhere({"groupings": ["radial"]}) == ()
 
 
-def test_of_two_packages_in_one_folder_the_one_whose_module_failed_is_named(install):
+def test_the_failed_package_is_named_correctly_if_two_packages_share_a_folder(install):
     source = GOOD + "\ndef fail():\n    raise ValueError('no')\n"
     modules = {"made_up_of_two/a": GOOD, "made_up_of_two/b": source}
     install("a-made-up", {"groupings": {"a": "made_up_of_two.a:Good"}}, modules)
@@ -194,7 +194,7 @@ def test_of_two_packages_in_one_folder_the_one_whose_module_failed_is_named(inst
     assert told is not None and "b-made-up" in told.what
 
 
-def test_of_two_copies_of_a_package_the_one_on_the_path_first_counts(install):
+def test_the_first_copy_of_a_package_on_the_path_is_used(install):
     install("made-up", {"observers": {"copy": "old:A"}}, version="1.0")
     install("made_up", {"observers": {"copy": "new:A"}}, version="1.1")
     assert registry.find("observers", "copy").value == "new:A"
@@ -215,12 +215,12 @@ def test_a_plugin_that_cannot_be_imported_is_named(good, name, original):
     assert isinstance(error.__cause__, Exception)
 
 
-def test_a_broken_plugin_breaks_only_runs_that_ask_for_it(good):
+def test_a_broken_plugin_stops_only_runs_that_use_it(good):
     refusal("groupings", "lost")
     assert registry.build("groupings", "good", {})
 
 
-def test_an_error_of_many_lines_is_reported_in_one(install):
+def test_an_import_error_of_several_lines_is_reported_in_one_line(install):
     source = 'raise RuntimeError("first\\n  second")'
     install("made-up", {"observers": {"noisy": "made_up_noisy:A"}}, {"made_up_noisy": source})
     assert refusal("observers", "noisy").found == "RuntimeError: first second"
@@ -238,7 +238,7 @@ def test_a_user_error_raised_at_import_of_a_plugin_is_passed_on(install):
 @pytest.mark.parametrize(
     ("name", "found"), [("seven", "7"), ("unfinished", "Unfinished without the methods fit")]
 )
-def test_what_is_no_component_is_refused(good, name, found):
+def test_an_object_that_is_not_a_component_is_refused(good, name, found):
     error = refusal("groupings", name)
     assert error.expected == "a complete subclass of crossgrad_core.plugin.Grouping"
     assert error.found == found
@@ -252,7 +252,7 @@ def test_what_is_no_component_is_refused(good, name, found):
         ("without", "fit(self, scene, rng)"),
     ],
 )
-def test_methods_that_cannot_be_called_like_those_of_their_slot_are_refused(good, name, found):
+def test_methods_with_incompatible_signatures_are_refused(good, name, found):
     error = refusal("groupings", name)
     assert error.found == found
     assert error.expected.startswith("fit(self, scene: ")
@@ -284,7 +284,7 @@ def test_an_unknown_option_is_refused_with_a_suggestion(good):
     assert "crossgrad plugins show good" in error.todo
 
 
-def test_a_value_out_of_bounds_is_refused_with_what_was_found(good):
+def test_a_value_out_of_bounds_is_refused_and_the_value_is_shown(good):
     error = refusal("groupings", "good", {"share": 1.5})
     assert error.what == "option share of grouping good is not valid"
     assert error.expected == "less than 1"
@@ -314,7 +314,7 @@ def test_a_package_for_another_version_of_crossgrad_is_refused(install, requires
         "crossgrad<0.1; extra == 'old'", "numpy<1",
     ],
 )  # fmt: skip
-def test_a_package_for_this_version_of_crossgrad_is_taken(install, requires):
+def test_a_package_for_this_version_of_crossgrad_is_accepted(install, requires):
     install("made-up", {"groupings": {"good": "made_up:Good"}}, {"made_up": GOOD}, "1.4", requires)
     assert registry.build("groupings", "good", {})
 
@@ -329,7 +329,7 @@ def test_a_package_for_this_version_of_crossgrad_is_taken(install, requires):
         ("opperators", "crossgrad.operators"),
     ],
 )
-def test_a_misspelt_group_is_named_with_the_right_one(install, group, meant):
+def test_a_misspelt_entry_point_group_is_named_with_a_suggestion(install, group, meant):
     install("made-up", {group: {"lost": "made_up:Good"}, "observers": {"seen": "made_up:Good"}})
     (stray,) = [each for each in strays() if each.distribution == "made-up"]
     assert (stray.name, stray.group, stray.meant) == ("lost", f"crossgrad.{group}", meant)
@@ -341,7 +341,7 @@ def test_a_misspelt_group_is_named_with_the_right_one(install, group, meant):
     assert f"write {meant}" in error.todo
 
 
-def test_groups_of_other_programs_are_none_of_ours():
+def test_entry_point_groups_of_other_programs_are_ignored():
     assert list(strays()) == []
 
 
@@ -351,11 +351,11 @@ def test_a_missing_option_is_named(good):
     assert error.found == "nothing"
 
 
-def test_further_wrong_options_are_named_as_well(good):
+def test_several_wrong_options_are_all_named(good):
     error = refusal("groupings", "good", {"share": 1.5, "seed": -1})
     assert "also wrong: seed" in error.todo
 
 
-def test_options_of_observers_are_found_below_their_name():
+def test_errors_about_observer_options_name_the_observer():
     error = refusal("observers", "progress", {"intervall": 3})
     assert error.where == "observers.progress.intervall"

@@ -59,7 +59,7 @@ def check(gradients, granularity, block, views, names, rows=slice(None)):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 @pytest.mark.parametrize("granularity", GROUPS)
-def test_gramian_and_remainder_have_twice_the_digits(granularity, dtype):
+def test_gramian_and_rounding_residual_have_twice_the_digits(granularity, dtype):
     views = views_of(3, dtype)
     gradients = DenseGradients(views, BLOCKS)
     for block, names in enumerate(GROUPS[granularity]):
@@ -76,7 +76,7 @@ def test_gramians_of_single_primitives_have_twice_the_digits(dtype):
     check(gradients, "gaussian", 12, views, ["mlp.0", "mlp.1"])
 
 
-def test_gradients_whose_squares_leave_float64_keep_their_digits():
+def test_gradients_whose_squares_overflow_float64_keep_their_digits():
     views = views_of(2, torch.float64, scale=1e160)
     gradients = DenseGradients(views, BLOCKS)
     gramian, rest = gradients.gramians("global")[0], gradients.rounding_residuals("global")[0]
@@ -97,7 +97,7 @@ def test_views_that_are_left_out_have_zero_rounding_residuals():
     assert rest[1].any()
 
 
-def test_the_unit_is_that_of_the_narrowest_rounding():
+def test_the_rounding_unit_comes_from_the_least_precise_gradient_type():
     def unit(*types):
         views = [{"means": torch.ones(2, 3, dtype=kind)} for kind in types]
         return DenseGradients(views, BLOCKS).unit
@@ -119,7 +119,7 @@ def operated(a, a_low, b, b_low):
     )
 
 
-def test_double_double_arithmetic():
+def test_double_double_arithmetic_agrees_with_exact_fractions():
     rng = np.random.default_rng(2)
     tolerance = Fraction(2) ** -100
     for _ in range(300):

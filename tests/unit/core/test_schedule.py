@@ -22,7 +22,7 @@ from crossgrad_core.training.schedules import schedule_of
 from crossgrad_core.training.setup import learns_in
 
 
-def test_published_schedule_at_reference_length():
+def test_the_published_schedule_holds_at_the_reference_length():
     absolute = Schedule.for_run(30_000, "absolute")
     assert Schedule.for_run(30_000) == replace(absolute, mode="scaled")
 
@@ -36,7 +36,7 @@ def test_short_runs_are_scaled_with_floors_and_have_no_reset():
     assert not any(schedule.resets(step) for step in range(1, 2001))
 
 
-def test_densification_steps_of_the_published_schedule():
+def test_the_published_schedule_has_the_known_densification_steps():
     schedule = Schedule.for_run(30_000)
     steps = [step for step in range(1, 30_001) if schedule.densifies(step)]
     assert (steps[0], steps[-1], len(steps)) == (600, 14_900, 144)
@@ -49,7 +49,7 @@ def test_sh_degree_grows_by_one_per_interval(step, degree):
 
 
 @pytest.mark.parametrize("every", range(1, 20))
-def test_sparse_updates_come_once_in_n_steps_and_meet_all_turns_of_a_sampler(every):
+def test_sparse_updates_happen_once_in_n_steps_and_reach_all_views_of_a_cycle(every):
     learns = np.array([learns_in(step, every) for step in range(1, 100 * every + 1)])
     assert (learns.reshape(100, every).sum(axis=1) == 1).all()
     for turns in (2, 3, 4, 8):
@@ -59,7 +59,7 @@ def test_sparse_updates_come_once_in_n_steps_and_meet_all_turns_of_a_sampler(eve
 
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
 @pytest.mark.parametrize("total", [400, 600, 900, 1200, 1201, 1202, 2000, 30_000, 45_000])
-def test_edits_are_counted_without_looking_at_every_step(total, mode):
+def test_edits_are_counted_without_a_loop_over_the_steps(total, mode):
     schedule = Schedule.for_run(total, mode)
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     assert schedule.grows == bool(edits)
@@ -68,7 +68,7 @@ def test_edits_are_counted_without_looking_at_every_step(total, mode):
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
-def test_a_new_length_moves_the_ends_that_are_ahead_and_no_interval():
+def test_a_new_length_moves_future_ends_and_no_interval():
     schedule = Schedule.for_run(20_000)
     longer = schedule.with_length(Schedule.for_run(40_000), 3000)
     assert (longer.total, longer.lr_until, longer.densify_until) == (40_000, 40_000, 20_000)
@@ -84,20 +84,20 @@ def test_density_control_that_has_ended_does_not_start_again(step, until):
     assert again.densify_until == until
 
 
-def test_large_gaussians_are_never_pruned_without_a_reset_whatever_the_length():
+def test_large_gaussians_are_never_pruned_without_a_reset_at_any_length():
     schedule = Schedule.for_run(9000).with_length(Schedule.for_run(12_000), 100)
     assert schedule.reset_every is None
     assert not any(schedule.prunes_large(step) for step in range(12_001))
 
 
 @pytest.mark.parametrize(("total", "mode"), [(20_000, "scaled"), (2500, "absolute")])
-def test_large_gaussians_are_pruned_after_the_first_reset_whatever_the_length(total, mode):
+def test_large_gaussians_are_pruned_after_the_first_reset_at_any_length(total, mode):
     schedule = Schedule.for_run(total, mode).with_length(Schedule.for_run(40_000, mode), 100)
     first = next(step for step in range(1, 40_001) if schedule.resets(step))
     assert not schedule.prunes_large(first) and schedule.prunes_large(first + 1)
 
 
-def test_sh_bands_wait_and_then_reach_the_degree_of_the_plain_schedule():
+def test_delayed_sh_bands_reach_the_degree_of_the_plain_schedule():
     plain = Schedule.for_run(2000)
     waiting = replace(plain, sh_wait=250)
     assert [waiting.sh_degree(step) for step in (0, 100, 249, 250, 299, 300)] == [0, 0, 0, 2, 2, 3]
@@ -118,7 +118,7 @@ def test_active_sh_bands_stay_active_when_the_length_changes(step, wait):
     assert later.sh_degree(step) == schedule.sh_degree(step)
 
 
-def test_the_coarse_phase_never_gets_longer():
+def test_a_longer_run_does_not_lengthen_the_coarse_phase():
     schedule = Schedule.for_run(1000)
     assert schedule.with_length(Schedule.for_run(2000), 100).coarse_until == 250
     assert schedule.with_length(Schedule.for_run(800), 100).coarse_until == 200
@@ -145,7 +145,7 @@ def view_counts(schedule, happens=Schedule.densifies):
     return [schedule.pace.views(step) for step in steps if happens(schedule, step)]
 
 
-def test_the_published_schedule_is_the_same_in_views():
+def test_the_published_schedule_is_the_same_in_views_and_in_steps():
     steps, views = (Schedule.for_run(30_000, counting=each) for each in (Counting(), in_views()))
     assert view_counts(views) == view_counts(steps) and len(view_counts(views)) == 144
     resets = view_counts(views, Schedule.resets)
@@ -158,7 +158,7 @@ def test_the_published_schedule_is_the_same_in_views():
 
 @pytest.mark.parametrize("views", [600, 2400, 12_000])
 @pytest.mark.parametrize("densifier", ["adc", "mcmc", "multiview", "revising", "anchor", "octree"])
-def test_one_view_and_two_have_the_same_events_after_as_many_views(views, densifier):
+def test_runs_with_one_and_two_views_per_step_have_events_after_the_same_views(views, densifier):
     window = build("densifiers", densifier, {}).window
     one = window(Schedule.for_run(views, counting=in_views("1")))
     two = window(Schedule.for_run(views // 2, counting=in_views("2")))
@@ -179,7 +179,7 @@ def test_one_view_and_two_have_the_same_events_after_as_many_views(views, densif
 @pytest.mark.parametrize("text", ["1", "2", "3", "1..2@0.5", "4..1@0.2"])
 @pytest.mark.parametrize("steps", [100, 601, 1200, 2500])
 @pytest.mark.parametrize("photos", [1, 24, 112, 3000])
-def test_long_enough_runs_have_six_edits_one_pass_apart(text, steps, photos):
+def test_long_enough_runs_have_at_least_six_edits_one_pass_apart(text, steps, photos):
     schedule = Schedule.for_run(steps, counting=in_views(text, photos))
     counts = view_counts(schedule)
     assert len(counts) == schedule.edits() >= FEWEST_EDITS
@@ -194,13 +194,13 @@ def test_long_enough_runs_have_six_edits_one_pass_apart(text, steps, photos):
 
 
 @pytest.mark.parametrize("photos", [250, 3000])
-def test_more_photos_than_edits_have_room_for_leave_the_warm_up_as_it_is(photos):
+def test_the_warm_up_is_unchanged_if_there_are_more_photos_than_views_between_edits(photos):
     schedule = Schedule.for_run(1250, counting=in_views("2", photos))
     assert schedule.densify_from == SHORTEST_WARM_UP
     assert schedule.edits() == FEWEST_EDITS
 
 
-def test_edits_for_a_budget_depend_on_the_length_in_both_directions():
+def test_edits_of_a_budget_depend_on_the_new_length_in_both_directions():
     setup = assemble(RunConfig(steps=700, views=1), sample_scene(), "none")
 
     def schedule(views):
@@ -214,7 +214,7 @@ def test_edits_for_a_budget_depend_on_the_length_in_both_directions():
     assert long.with_length(short, 100).min_refinements == 0
 
 
-def test_without_min_refinements_the_floors_count_in_views():
+def test_floors_count_in_views_without_min_refinements():
     def default(steps, photos=24):
         return Schedule.for_run(
             steps, counting=Counting("views", ViewsPerStepSpec.parsed("2"), photos)
@@ -231,13 +231,13 @@ def test_without_min_refinements_the_floors_count_in_views():
     ("total", "k", "edits"),
     [(1, 2, 0), (17, 1, 0), (18, 1, 1), (10, 2, 1), (97, 1, 5), (98, 1, 6), (49, 2, 6)],
 )
-def test_a_run_of_a_few_steps_has_as_many_edits_as_it_has_steps_for(total, k, edits):
+def test_a_run_of_a_few_steps_has_as_many_edits_as_its_steps_allow(total, k, edits):
     assert Schedule.for_run(total, counting=in_views(str(k))).edits() == edits
 
 
 @pytest.mark.parametrize("text", ["1", "2", "5", "1..2@0.5", "3..1@0.4"])
 @pytest.mark.parametrize("total", [30, 61, 400, 1201])
-def test_edits_in_views_are_counted_without_looking_at_every_step(text, total):
+def test_edits_in_views_are_counted_without_a_loop_over_the_steps(text, total):
     schedule = Schedule.for_run(total, counting=in_views(text))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     assert edits[:1] == [schedule.first_edit]
@@ -246,7 +246,7 @@ def test_edits_in_views_are_counted_without_looking_at_every_step(text, total):
         assert schedule.edits(after) == sum(step > after for step in edits)
 
 
-def test_a_flat_schedule_is_that_of_the_reference_length_in_a_longer_run():
+def test_a_flat_schedule_of_a_longer_run_equals_the_schedule_at_its_reference_length():
     short = Schedule.for_run(1200, counting=in_views())
     flat = Schedule.for_run(2400, "absolute", in_views(schedule_length=1200))
     stretched = Schedule.for_run(2400, counting=in_views())
@@ -274,7 +274,7 @@ def test_a_flat_schedule_in_steps_has_the_floors_of_a_short_run():
     assert view_counts(flat) == view_counts(short) == [600, 700, 800, 900]
 
 
-def test_absolute_without_a_reference_keeps_the_published_numbers_whatever_the_photos():
+def test_an_absolute_schedule_without_a_reference_length_has_the_published_numbers():
     steps = Schedule.for_run(20_000, "absolute")
     views = Schedule.for_run(20_000, "absolute", in_views(photos=3000))
     assert view_counts(views) == view_counts(steps) == list(range(600, 15_000, 100))
@@ -283,7 +283,9 @@ def test_absolute_without_a_reference_keeps_the_published_numbers_whatever_the_p
 @pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
 @pytest.mark.parametrize(("planned", "actual"), [(3000, 900), (900, 3000), (3000, 400), (300, 480)])
 @pytest.mark.parametrize("after", [1, 20, 200])
-def test_a_run_whose_length_follows_the_clock_keeps_its_edits(text, planned, actual, after):
+def test_a_run_whose_length_follows_the_clock_keeps_the_minimum_number_of_edits(
+    text, planned, actual, after
+):
     counting = in_views(text, photos=24)
     schedule = Schedule.for_run(planned, counting=counting)
     done = [step for step in range(1, after + 1) if schedule.densifies(step)]
@@ -322,7 +324,7 @@ def test_repeated_changes_of_length_keep_past_events_and_reschedule_later_ones(t
             return
 
 
-def test_times_that_the_user_set_stay_whatever_the_length():
+def test_densification_times_set_by_the_user_do_not_change_with_the_length():
     counting = in_views("2")
     config = RunConfig(steps=600, densify_from=30, densify_every=40, densify_until=400)
     config, *_ = with_decisions(config, sample_scene())

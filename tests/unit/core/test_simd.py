@@ -94,7 +94,7 @@ def test_vectors_of_four_values_are_split():
     assert target[-1] == -1
 
 
-def test_parts_of_vectors():
+def test_vectors_can_be_split_into_parts():
     source = np.arange(WIDE, dtype=np.float32)
     target = np.empty(5 * WIDE, np.float32)
     _parts(source, target)
@@ -106,7 +106,7 @@ def test_parts_of_vectors():
 
 
 @pytest.mark.parametrize("extreme", [0.0, 1e-40, 3e38, np.inf, np.nan])
-def test_both_widths_give_the_same_bits(extreme):
+def test_vectors_of_both_widths_give_the_same_bits(extreme):
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, WIDE)).astype(np.float32)
     a[3] = b[12] = extreme

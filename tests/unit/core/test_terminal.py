@@ -32,16 +32,16 @@ def terminal(monkeypatch):
 
 
 @pytest.mark.parametrize(("columns", "live"), [(80, True), (1, True), (0, False)])
-def test_a_terminal_without_columns_has_no_room_for_a_bar(terminal, columns, live):
+def test_a_terminal_without_columns_gets_no_progress_bar(terminal, columns, live):
     with terminal(columns) as stream:
         assert is_live(stream) is live
 
 
-def test_a_dumb_terminal_cannot_overwrite(terminal, monkeypatch):
+def test_a_dumb_terminal_gets_no_progress_bar(terminal, monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     with terminal(80) as stream:
         assert not is_live(stream)
 
 
-def test_a_file_is_no_terminal():
+def test_a_file_is_not_a_terminal():
     assert not is_live(io.StringIO())

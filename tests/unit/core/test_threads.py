@@ -25,7 +25,7 @@ def _restored():
 
 
 @pytest.mark.parametrize("n", range(1, numba.config.NUMBA_NUM_THREADS + 1))
-def test_sets_both_libraries(n):
+def test_configure_threads_sets_numba_and_torch(n):
     assert configure_threads(n) == n
     assert numba.get_num_threads() == n
     assert torch.get_num_threads() == n
@@ -44,7 +44,7 @@ def test_an_impossible_number_of_threads_is_refused(n):
     ("numba_value", "omp_value", "expected"),
     [("1", "", 1), ("", "1", 1), ("1", "9", 1), ("", "1,1", None), ("", "", None)],
 )
-def test_default_comes_from_the_environment_or_the_cores(
+def test_the_default_number_of_threads_comes_from_the_environment_or_the_cores(
     monkeypatch, numba_value, omp_value, expected
 ):
     monkeypatch.setenv("NUMBA_NUM_THREADS", numba_value)
@@ -65,7 +65,7 @@ def test_a_container_quota_limits_the_cores(monkeypatch, tmp_path, content, core
 
 
 @pytest.mark.parametrize("content", ["max 100000", "", None])
-def test_no_quota_means_the_affinity(monkeypatch, tmp_path, content):
+def test_the_affinity_limits_the_cores_without_a_container_quota(monkeypatch, tmp_path, content):
     limit = tmp_path / "cpu.max"
     if content is not None:
         limit.write_text(content)
@@ -76,7 +76,7 @@ def test_no_quota_means_the_affinity(monkeypatch, tmp_path, content):
 
 @pytest.mark.parametrize("variable", ["NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER_PRIORITY"])
 @pytest.mark.parametrize(("wish", "first"), [(None, "omp"), ("whatever", "workqueue")])
-def test_openmp_is_preferred_unless_the_environment_says_otherwise(
+def test_openmp_is_preferred_unless_the_environment_selects_another_layer(
     monkeypatch, variable, wish, first
 ):
     monkeypatch.delenv("NUMBA_THREADING_LAYER", raising=False)
@@ -123,7 +123,7 @@ print(faults)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
-def test_memory_that_was_freed_is_used_again_without_faults():
+def test_freed_memory_is_reused_without_page_faults():
     command = [sys.executable, "-c", PROGRAM]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     # 48 MiB are 12,288 pages.
@@ -159,7 +159,7 @@ print(asks(arrays[20]), asks(arrays[-1]))
     not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="a system without large pages"
 )
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
-def test_arrays_of_the_heap_ask_for_large_pages():
+def test_large_heap_arrays_request_huge_pages():
     command = [sys.executable, "-c", LARGE_PAGES]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert shown.strip() == "True True"

@@ -40,13 +40,13 @@ def test_gather_expresses_remove_duplicate_and_append():
     assert new["mlp.weight"] is old["mlp.weight"]
 
 
-def test_fresh_rows_have_zero_moments_and_others_keep_theirs():
+def test_new_rows_have_zero_moments_and_other_rows_keep_their_moments():
     moment = torch.tensor([1.0, 2.0, 3.0, 4.0])
     edit = Edit(source=torch.tensor([3, 0, 0]), fresh=torch.tensor([False, False, True]))
     assert apply_to_moment(edit, "means", moment).tolist() == [4.0, 1.0, 0.0]
 
 
-def test_overwritten_rows_lose_their_moments_unless_kept():
+def test_overwritten_rows_lose_their_moments_unless_requested_otherwise():
     moment = torch.tensor([1.0, 2.0, 3.0])
     rows = Rows(torch.zeros(1), rows=torch.tensor([1]))
     assert apply_to_moment(Edit(values={"o": rows}), "o", moment).tolist() == [1.0, 0.0, 3.0]
@@ -54,13 +54,13 @@ def test_overwritten_rows_lose_their_moments_unless_kept():
     assert apply_to_moment(Edit(values={"o": kept}), "o", moment).tolist() == [1.0, 2.0, 3.0]
 
 
-def test_fresh_rows_need_no_gather():
+def test_new_rows_can_be_added_without_a_gather():
     edit = Edit(fresh=torch.tensor([False, True, False]))
     assert not edit.is_empty
     assert apply_to_moment(edit, "means", torch.tensor([1.0, 2.0, 3.0])).tolist() == [1.0, 0.0, 3.0]
 
 
-def test_overwriting_without_gather_leaves_the_old_tensor_untouched():
+def test_overwriting_rows_without_a_gather_does_not_change_the_old_tensor():
     old = parameters()
     edit = Edit(values={"means": Rows(torch.full((4, 2), 9.0))})
     new = apply_to_parameters(edit, BLOCKS, old)
@@ -77,7 +77,7 @@ def test_per_primitive_state_follows_the_edit():
     assert moved.values == {"a": 1}
 
 
-def test_the_state_that_all_runs_begin_with_cannot_be_changed():
+def test_the_shared_empty_state_cannot_be_changed():
     for part in (EMPTY_STATE.values, EMPTY_STATE.tensors, EMPTY_STATE.per_primitive):
         with pytest.raises(TypeError):
             part["steps"] = 1

@@ -38,30 +38,30 @@ def explained(model, values):
     return as_user_error(caught.value, model, subject="a run", todo="read the help")
 
 
-def test_an_unknown_key_deep_inside_suggests_keys_from_there():
+def test_an_unknown_nested_key_suggests_the_keys_at_its_position():
     error = explained(Outer, {"inner": {"sise": 2}})
     assert error.where == "inner.sise"
     assert error.expected == "one of size"
     assert error.todo == "did you mean 'size'?; read the help"
 
 
-def test_a_model_without_options_says_so():
+def test_an_unknown_option_of_a_model_without_options_is_reported_so():
     assert explained(Empty, {"a": 1}).expected == "no options; it has none"
 
 
-def test_words_of_a_validator_are_kept():
+def test_the_message_of_a_validator_is_kept():
     error = explained(Outer, {"color": "red"})
     assert error.expected == "must be black"
     assert error.found == "'red' (str)"
 
 
-def test_a_value_that_is_no_group_of_settings_is_reported_with_its_type():
+def test_a_value_in_place_of_a_settings_group_is_reported_with_its_type():
     error = explained(Outer, {"inner": 3})
     assert error.where == "inner"
     assert error.found == "3 (int)"
 
 
-def test_an_error_of_the_whole_names_the_whole():
+def test_an_error_of_the_whole_configuration_names_the_configuration():
     assert explained(Outer, "text").what == "a run is not valid"
 
 
@@ -79,7 +79,7 @@ class Unions(BaseModel):
     inner: Inner | None = None
 
 
-def test_a_value_that_fits_no_branch_of_a_union_is_reported_once_with_what_each_would_take():
+def test_a_value_that_fits_no_type_of_a_union_is_reported_once_with_all_types():
     error = explained(Unions, {"count": 0})
     assert error.where == "count"
     assert error.what == "option count of a run is not valid"
@@ -87,13 +87,13 @@ def test_a_value_that_fits_no_branch_of_a_union_is_reported_once_with_what_each_
     assert error.todo == "read the help"
 
 
-def test_a_place_inside_a_branch_is_reported_without_the_branch():
+def test_the_path_of_an_error_inside_a_union_omits_the_union_type():
     error = explained(Unions, {"up": (0, "x", 0), "count": "many"})
     assert error.where == "count"
     assert error.todo == "also wrong: up, up.1; read the help"
 
 
-def test_an_unknown_key_in_a_branch_suggests_the_keys_of_that_branch():
+def test_an_unknown_key_inside_a_union_suggests_the_keys_of_its_type():
     error = explained(Unions, {"parts": [{"inner": {"sise": 1}}]})
     assert error.where == "parts.0.inner"
     assert error.expected == "one of size"

@@ -46,7 +46,7 @@ def test_yaml_values_survive_a_round_trip(settings):
 
 
 @given(st.dictionaries(WORDS, WORDS, max_size=4))
-def test_other_tools_read_the_same_words(settings):
+def test_pyyaml_reads_the_written_values_alike(settings):
     assert yaml.safe_load(write_yaml(settings)) == settings
 
 
@@ -83,11 +83,11 @@ def test_an_alias_bomb_is_refused_at_once():
         ("a: \x07", ""),
     ],
 )
-def test_yaml_values_that_are_not_settings_are_refused_with_their_place(text, words):
+def test_yaml_values_that_are_not_settings_are_refused_with_their_position(text, words):
     refused(text, words)
 
 
-def test_values_behind_aliases_are_copies():
+def test_values_of_yaml_aliases_are_copies():
     found = read_yaml("a: &x {b: [1]}\nc: *x\nd: *x")
     assert found == {"a": {"b": [1]}, "c": {"b": [1]}, "d": {"b": [1]}}
     assert isinstance(found, dict)
@@ -95,12 +95,12 @@ def test_values_behind_aliases_are_copies():
     assert found["c"]["b"] is not found["d"]["b"]
 
 
-def test_tags_of_plain_values_are_understood():
+def test_yaml_tags_of_plain_values_are_accepted():
     text = "a: !!str 5\nb: !!int 7\nc: !!float 3\nd: !!null ''\ne: !!bool true"
     assert read_yaml(text) == {"a": "5", "b": 7, "c": 3.0, "d": None, "e": True}
 
 
-def test_a_text_of_the_largest_size_is_quick():
+def test_a_text_of_the_largest_allowed_size_is_read_quickly():
     text = "# a comment\n" * 20_000
     start = time.process_time()
     assert read_yaml(text) is None
@@ -115,7 +115,7 @@ def test_a_text_of_the_largest_size_is_quick():
         (b"a: [", "not valid YAML"),
     ],
 )
-def test_a_broken_file_is_one_error(tmp_path, content, words):
+def test_a_broken_file_gives_one_error(tmp_path, content, words):
     path = tmp_path / "run.yaml"
     path.write_bytes(content)
     with pytest.raises(UserError, match=words) as caught:
@@ -123,7 +123,7 @@ def test_a_broken_file_is_one_error(tmp_path, content, words):
     assert (caught.value.where, caught.value.todo) == (str(path), "mend it")
 
 
-def test_a_byte_order_mark_and_the_line_ends_of_windows_are_no_settings(tmp_path):
+def test_a_byte_order_mark_and_windows_line_ends_are_accepted(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_bytes(b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
     assert read_mapping(path, "the file", "mend it") == {"a": 1, "b": 2}

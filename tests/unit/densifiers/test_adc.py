@@ -63,7 +63,7 @@ def context(views, *, step, params=None, room=100, rng=0, backbone=None):
 MOVING, STILL = [1e-5, 0.0], [1e-7, 0.0]
 
 
-def test_statistic_is_the_mean_ndc_norm_over_visible_renders():
+def test_the_gradient_statistic_is_the_mean_ndc_norm_over_visible_renders():
     adc = AdaptiveDensityControl()
     gradient = [[3e-6, 8e-6], [1.0, 1.0]]
     views = [record(gradient, [1, 0]), record([[0.0, 0.0], [0.0, 0.0]], [1, 0])]
@@ -74,7 +74,7 @@ def test_statistic_is_the_mean_ndc_norm_over_visible_renders():
     assert state.per_primitive["renders"].tolist() == [2.0, 0.0]
 
 
-def test_statistics_of_decoded_gaussians_go_to_their_primitives():
+def test_statistics_of_decoded_gaussians_are_added_to_their_primitives():
     view = record([[1e-5, 0.0]] * 3, [1, 1, 1], origin=torch.tensor([1, 1, 0]))
     params = parameters((0.1, 0.1), (0.5, 0.5))
     _, state = AdaptiveDensityControl().densify(
@@ -83,7 +83,7 @@ def test_statistics_of_decoded_gaussians_go_to_their_primitives():
     assert state.per_primitive["renders"].tolist() == [1.0, 2.0]
 
 
-def test_small_ones_are_cloned_large_ones_split_and_statistics_reset():
+def test_small_gaussians_are_cloned_large_ones_are_split_and_statistics_reset():
     view = record([MOVING, MOVING, STILL, STILL], [1, 1, 1, 1])
     params = parameters()
     ctx = context([view], step=600, params=params)
@@ -97,7 +97,7 @@ def test_small_ones_are_cloned_large_ones_split_and_statistics_reset():
     assert float(state.per_primitive["renders"].sum()) == 0
 
 
-def test_children_are_drawn_from_their_parent():
+def test_children_of_a_split_are_sampled_from_their_parent():
     """mean + R (s n) with n standard normal, on a turned and stretched parent."""
     rng = np.random.default_rng(5)
     params = parameters()
@@ -130,7 +130,7 @@ def test_transparent_gaussians_are_pruned_and_large_ones_only_after_a_reset():
     assert late.source.tolist() == [2]
 
 
-def test_with_little_room_the_largest_gradients_grow_and_the_rest_is_counted():
+def test_the_largest_gradients_grow_first_near_the_limit_and_skipped_ones_are_counted():
     view = record([[1e-5, 0], [3e-5, 0], [2e-5, 0], STILL], [1] * 4)
     ctx = context([view], step=600, params=parameters((0.005,) * 4), room=1)
     edit, _ = AdaptiveDensityControl().densify(ctx, PluginState())
@@ -138,7 +138,7 @@ def test_with_little_room_the_largest_gradients_grow_and_the_rest_is_counted():
     assert edit.counts["held_back"] == 2
 
 
-def test_reset_caps_opacity_and_forgets_its_moments():
+def test_a_reset_caps_opacities_and_clears_their_moments():
     params = parameters(opacities=(0.5, 0.006, 0.5, 0.5))
     view = record([STILL] * 4, [1] * 4)
     edit, _ = AdaptiveDensityControl().densify(
@@ -170,7 +170,7 @@ def test_a_reset_with_an_edit_caps_the_opacity_rendered_after_the_edit():
     assert drawn.max().item() == pytest.approx(0.01, rel=1e-5)
 
 
-def test_a_reset_without_an_edit_caps_what_is_drawn_with_the_filter_as_it_is():
+def test_a_reset_without_an_edit_caps_the_opacity_rendered_with_the_current_filter():
     backbone = MipSplatting()
     params = backbone.create(sample_scene(), np.random.default_rng(0))
     rows = len(params["means"])
@@ -186,7 +186,7 @@ def test_a_reset_without_an_edit_caps_what_is_drawn_with_the_filter_as_it_is():
     assert drawn.max().item() == pytest.approx(0.01, rel=1e-5)
 
 
-def test_nothing_happens_between_the_edits_and_after_the_end():
+def test_nothing_changes_between_the_edits_and_after_the_end():
     adc = AdaptiveDensityControl()
     view = record([MOVING] * 4, [1] * 4)
     assert adc.densify(context([view], step=601), PluginState())[0] == NO_EDIT

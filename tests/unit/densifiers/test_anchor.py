@@ -135,7 +135,7 @@ def table(sums, shape):
     return full
 
 
-def test_statistics_are_sums_over_the_views():
+def test_anchor_statistics_are_sums_over_the_views():
     parameters = model()
     count = len(parameters["anchors"])
     records = drawn_records(count, 7)
@@ -152,21 +152,21 @@ def test_statistics_are_sums_over_the_views():
 
 
 @pytest.mark.parametrize(("step", "gathers"), [(500, False), (501, True), (14_999, True)])
-def test_statistics_start_after_a_sixtieth_of_the_run(step, gathers):
+def test_anchor_statistics_start_after_a_sixtieth_of_the_run(step, gathers):
     parameters = model()
     records = drawn_records(len(parameters["anchors"]), 1)
     _, state = AnchorControl().densify(context(parameters, records, step=step), PluginState())
     assert bool(state.per_primitive) == gathers
 
 
-def test_nothing_is_kept_after_the_last_edit():
+def test_statistics_are_discarded_after_the_last_edit():
     parameters = model()
     records = drawn_records(len(parameters["anchors"]), 1)
     edit, state = AnchorControl().densify(context(parameters, records, step=15_000), PluginState())
     assert edit == NO_EDIT and not state.per_primitive
 
 
-def test_the_window_is_that_of_the_anchors_without_resets():
+def test_the_densification_window_is_the_published_one_of_anchors_without_resets():
     assert (SCHEDULE.densify_from, SCHEDULE.densify_until) == (1500, 15_000)
     assert SCHEDULE.reset_every is None
     assert not SCHEDULE.densifies(1500) and SCHEDULE.densifies(1600)
@@ -176,7 +176,7 @@ def test_the_window_is_that_of_the_anchors_without_resets():
     ("total", "mode", "every"),
     [(300, "scaled", 50), (2000, "scaled", 50), (60_000, "scaled", 200), (2000, "absolute", 100)],
 )
-def test_short_runs_grow_twice_as_often_as_the_published_ones(total, mode, every):
+def test_short_runs_edit_twice_as_often_as_published(total, mode, every):
     assert AnchorControl().window(Schedule.for_run(total, mode)).densify_every == every
 
 
@@ -235,7 +235,7 @@ def slow_growth(parameters, state, rng):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_growing_is_that_of_the_rules(seed):
+def test_growth_agrees_with_the_published_rules(seed):
     parameters = model(seed=seed)
     state = state_of(parameters, seed)
     edit, _ = AnchorControl(prune_opacity=0.0).densify(context(parameters, rng=seed), state)
@@ -265,7 +265,7 @@ def test_growing_is_that_of_the_rules(seed):
             np.testing.assert_allclose(found[level][place], features, rtol=1e-6)
 
 
-def test_a_level_is_skipped_while_none_before_it_has_grown():
+def test_a_level_does_not_grow_while_no_level_before_it_has_grown():
     parameters = model()
     state = state_of(parameters)
     # All stay in the one cell of 16 voxels that is taken, but not in their own voxels.
@@ -279,7 +279,7 @@ def test_a_level_is_skipped_while_none_before_it_has_grown():
 
 
 @pytest.mark.parametrize("room", [0, 1, 7])
-def test_with_little_room_the_largest_gradients_grow(room):
+def test_the_largest_gradients_grow_first_near_the_limit(room):
     parameters = model()
     state = state_of(parameters)
     whole = slow_growth(parameters, state, np.random.default_rng(0))
@@ -316,7 +316,7 @@ def test_transparent_anchors_are_pruned_after_enough_views():
 
 
 @pytest.mark.parametrize("share", [0.5, 1.5])
-def test_a_share_of_the_views_is_judged_as_all_of_them_are(share):
+def test_statistics_from_a_share_of_the_views_give_the_same_growth_and_pruning(share):
     parameters = model()
     whole = state_of(parameters)
     part = PluginState(per_primitive={n: share * sums for n, sums in whole.per_primitive.items()})
@@ -331,7 +331,7 @@ def test_a_share_of_the_views_is_judged_as_all_of_them_are(share):
         assert torch.equal(left.per_primitive[name], share * sums)
 
 
-def test_an_anchor_that_never_draws_is_removed():
+def test_an_anchor_that_never_contributes_is_removed():
     parameters = model()
     count = len(parameters["anchors"])
     state = PluginState()
@@ -342,7 +342,9 @@ def test_an_anchor_that_never_draws_is_removed():
 
 
 @pytest.mark.parametrize(("total", "renders", "views"), [(30_000, 40, 80), (6000, 20, 40)])
-def test_statistics_of_judged_offsets_restart_and_the_others_continue(total, renders, views):
+def test_statistics_of_judged_offsets_restart_and_the_remaining_ones_continue(
+    total, renders, views
+):
     parameters = model()
     state = state_of(parameters)
     schedule = AnchorControl().window(Schedule.for_run(total))
@@ -362,7 +364,7 @@ def test_statistics_of_judged_offsets_restart_and_the_others_continue(total, ren
     assert edit.source is None
 
 
-def test_rows_of_statistics_moments_and_parameters_stay_together():
+def test_rows_of_statistics_moments_and_parameters_are_edited_alike():
     parameters = model()
     count = len(parameters["anchors"])
     state = state_of(parameters)
@@ -383,7 +385,7 @@ def test_rows_of_statistics_moments_and_parameters_stay_together():
         assert not tensor[count - pruned :].any()
 
 
-def test_sizes_are_capped_at_an_edit_without_losing_moments():
+def test_sizes_are_capped_at_an_edit_and_keep_their_moments():
     parameters = model()
     parameters["scales"][:, 5] = 0.2
     parameters["scales"][:, 1] = 0.3
@@ -398,7 +400,7 @@ def test_sizes_are_capped_at_an_edit_without_losing_moments():
     assert torch.equal(apply_to_moment(edit, "scales", moments), moments)
 
 
-def test_no_anchors_left_is_no_error():
+def test_an_empty_model_is_not_an_error():
     parameters = {n: t[:0] if t.dim() else t for n, t in model().items()}
     edit, state = AnchorControl().densify(
         context(parameters, [record(0, set(), [], [], ([], [], []))]), PluginState()
@@ -407,7 +409,7 @@ def test_no_anchors_left_is_no_error():
     assert all(len(tensor) == 0 for tensor in state.per_primitive.values())
 
 
-def test_equal_cells_have_equal_numbers_and_no_others():
+def test_exactly_the_equal_cells_have_equal_numbers():
     rng = np.random.default_rng(0)
     cells = rng.integers(-3, 4, (500, 3)) * np.array([1, 2**30, -(2**35)])
     found = numbered(torch.from_numpy(cells)).tolist()
@@ -428,21 +430,21 @@ def test_free_cells_are_the_unoccupied_cells_without_duplicates():
         assert wanted[first[place[row]]].tolist() == wanted[row].tolist()
 
 
-def test_positions_out_of_reach_are_known():
+def test_positions_outside_the_integer_range_of_cells_are_marked():
     positions = torch.tensor([[0.0, 0.0, 0.0], [1e30, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
     cells = cells_of(positions, 0.5)
     assert in_reach(cells).tolist() == [True, False, False]
     assert int(cells.abs().max()) == FARTHEST
 
 
-def test_offsets_beyond_all_reach_do_not_grow():
+def test_offsets_outside_the_range_of_cells_do_not_grow():
     parameters = model()
     parameters["offsets"][:] = 1e30
     edit, _ = AnchorControl(prune_opacity=0.0).densify(context(parameters), state_of(parameters))
     assert edit.source is None
 
 
-def test_views_without_slots_are_a_bug_of_the_backbone():
+def test_views_without_slots_are_reported_as_an_error_of_the_backbone():
     parameters = model()
     (view,) = drawn_records(len(parameters["anchors"]), 1)
     view = replace(view, gaussians=replace(view.gaussians, slot=None))

@@ -104,7 +104,7 @@ def observed(views, number):
     return {name: tensor.double().numpy() for name, tensor in state.per_primitive.items()}
 
 
-def test_statistics_are_means_of_what_the_pixels_give():
+def test_dc4gs_statistics_are_means_over_the_pixels():
     views = [pixels_of(40, seed) for seed in (1, 2, 3)]
     totals = observed([record(lists) for lists in views], 40)
     for i in range(40):
@@ -120,7 +120,7 @@ def test_statistics_are_means_of_what_the_pixels_give():
             assert totals["planes"][i, plane] == pytest.approx(sum(sides), rel=1e-4, abs=1e-9)
 
 
-def test_equal_pixel_gradients_have_no_inconsistency_and_opposite_ones_do():
+def test_opposite_pixel_gradients_are_inconsistent_and_equal_ones_are_not():
     same = np.array([[0.5, 1e-5, 0.0], [-0.5, 3e-5, 0.0]])
     opposite = np.array([[0.5, 1e-5, 0.0], [-0.5, -3e-5, 0.0]])
     nothing = np.zeros((0, 3))
@@ -131,7 +131,7 @@ def test_equal_pixel_gradients_have_no_inconsistency_and_opposite_ones_do():
     assert totals["renders"].tolist() == [1, 1, 1]
 
 
-def test_statistics_of_decoded_gaussians_go_to_their_primitives():
+def test_statistics_of_decoded_gaussians_are_added_to_their_primitives():
     lists = pixels_of(8, 4)
     origin = torch.tensor([3, 1, 1, 0, 3, 2, 0, 1])
     split = observed([record(lists, origin=origin)], 4)
@@ -143,7 +143,7 @@ def test_statistics_of_decoded_gaussians_go_to_their_primitives():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_position_is_the_least_value_of_the_fitted_polynomial(seed):
+def test_the_split_position_is_the_minimum_of_the_fitted_polynomial(seed):
     rng = np.random.default_rng(seed)
     scores = np.abs(rng.normal(size=(50, 5))) * 10 ** rng.uniform(-6, 2, (50, 1))
     nodes = np.arange(1, 6) / 6
@@ -156,7 +156,7 @@ def test_the_position_is_the_least_value_of_the_fitted_polynomial(seed):
         assert np.polyval(fit, position) == pytest.approx(least, abs=1e-8 * np.abs(each).max())
 
 
-def test_known_polynomials_and_no_preference():
+def test_split_positions_of_known_polynomials_are_correct():
     nodes = torch.arange(1, 6, dtype=torch.float64) / 6
     minimum = torch.tensor([0.2, 0.5, 0.61, 0.9], dtype=torch.float64)[:, None]
     scores = (nodes - minimum) ** 2 + 0.3 * (nodes - minimum) ** 4
@@ -203,7 +203,7 @@ def test_children_are_placed_on_both_sides_of_the_splitting_plane():
                 assert np.array_equal(fresh[name][child], old[name][i])
 
 
-def test_small_ones_are_cloned_by_the_mean_gradient_large_ones_split_by_directions():
+def test_small_gaussians_are_cloned_by_mean_gradient_and_large_ones_split_by_directions():
     # Gradient 1e-4 px^-1 in x is 1e-2 in NDC.
     pulled = np.array([[0.1, 1e-4, 0.0], [0.2, 1e-4, 0.0]])
     view = record([pulled, parting(0.0), pulled, parting(0.0)])
@@ -215,7 +215,7 @@ def test_small_ones_are_cloned_by_the_mean_gradient_large_ones_split_by_directio
     assert edit.counts["cloned"] == 1 and edit.counts["split"] == 1
 
 
-def test_the_threshold_is_met_by_the_mean_over_views():
+def test_the_mean_over_views_is_compared_with_the_threshold():
     # (1 - 0) ga = 2e-5 * 100 * 30 in the first view, nothing in the second.
     views = [record([parting(0.0, 2e-5)]), record([parting(9.0, 2e-5)])]
     for threshold, grows in ((0.029, True), (0.031, False)):
@@ -239,7 +239,7 @@ def test_extreme_parents_have_finite_children(logit, log_scale):
     assert edit.source.shape[0] == 4
 
 
-def test_with_little_room_the_largest_excess_over_the_threshold_grows():
+def test_the_largest_excess_over_the_threshold_grows_first_near_the_limit():
     view = record([parting(0.0, size) for size in (1e-4, 3e-4, 2e-4)])
     edit, _ = DirectionalConsistency().densify(
         context([view], parameters(3), room=1), PluginState()
@@ -248,7 +248,7 @@ def test_with_little_room_the_largest_excess_over_the_threshold_grows():
     assert edit.counts["held_back"] == 2
 
 
-def test_nothing_is_gathered_after_the_end():
+def test_no_statistics_are_collected_after_the_end():
     view = record([parting(0.0)])
     edit, state = DirectionalConsistency().densify(
         context([view], parameters(1), step=15_000), PluginState()
@@ -272,7 +272,7 @@ def setup_of(rasterizer, **options):
 
 
 @pytest.mark.parametrize("rasterizer", ["numba", "torch"])
-def test_a_run_splits_and_asks_for_directions_only_while_it_needs_them(rasterizer):
+def test_a_run_splits_and_requests_directions_only_while_needed(rasterizer):
     options = {"split_scale": 1e-3, "split_threshold": 1e-6, "grad_threshold": 1e-6}
     setup = setup_of(rasterizer, **options)
     asked = []

@@ -61,7 +61,7 @@ def test_absgrad_is_the_default_in_short_runs_of_plain_gaussians(case):
     assert len(told) == (expected == "absgrad")
 
 
-def test_a_scene_of_fewer_photos_has_the_published_one(monkeypatch):
+def test_a_scene_with_few_photos_uses_the_published_densifier(monkeypatch):
     monkeypatch.undo()
     assert chosen.MANY_PHOTOS == 100
     scene = sample_scene()

@@ -73,7 +73,7 @@ def test_erroneous_pixels_are_relative_to_the_view(seed, size, threshold, scale,
     assert np.array_equal(found[sure], expected[sure])
 
 
-def test_pixels_that_are_masked_out_are_never_looked_at():
+def test_masked_pixels_are_never_marked():
     image = torch.full((4, 5, 3), torch.nan)
     mask = torch.zeros(4, 5, dtype=torch.bool)
     mask[1, 1:4] = True
@@ -87,7 +87,7 @@ def replace_mask(view, mask):
     return SimpleNamespace(image=view.image, photo=view.photo, mask=mask)
 
 
-def test_where_all_pixels_err_alike_none_is_marked():
+def test_no_pixel_is_marked_if_all_errors_are_equal():
     image = torch.full((3, 3, 3), 0.25)
     view = SimpleNamespace(image=image, photo=torch.zeros(3, 3, 3, dtype=torch.uint8), mask=None)
     assert not erroneous(view, 0.0).any()
@@ -97,7 +97,7 @@ def test_where_all_pixels_err_alike_none_is_marked():
 
 
 @pytest.mark.parametrize("number", [1, 2, 5, 10, 100])
-def test_views_are_drawn_evenly_from_all_groups(number):
+def test_views_are_sampled_evenly_from_all_groups(number):
     columns = [0] * 7 + [1] * 2 + [2] * 30
     seen = set()
     for seed in range(200):
@@ -132,7 +132,7 @@ def brute_counts(ctx, index, threshold=0.1, mask=None):
 @pytest.mark.parametrize("rasterizer", ["torch", "numba"])
 @pytest.mark.parametrize("backbone", [Vanilla(), Bright()], ids=["one", "two per primitive"])
 @pytest.mark.parametrize("masked", [False, True])
-def test_counts_are_those_of_brute_force(rasterizer, backbone, masked):
+def test_error_counts_agree_with_brute_force(rasterizer, backbone, masked):
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[2:14, 3:20] = True
     scene = sample_scene()
@@ -157,7 +157,7 @@ def test_counts_are_those_of_brute_force(rasterizer, backbone, masked):
 
 
 @pytest.mark.parametrize("regimes", [False, True])
-def test_the_running_count_is_that_of_the_views_that_were_rendered(regimes):
+def test_the_running_count_covers_exactly_the_rendered_views(regimes):
     ctx = context(step=601)
     method = MultiViewDensityControl(count="running", share=1.0, regimes=regimes)
     state = PluginState()
@@ -194,7 +194,7 @@ def test_counting_uses_a_share_of_the_steps_and_always_the_step_of_the_edit():
     assert float(method.counted(at_edit, state).per_primitive[VISITS].max()) == visits + 1
 
 
-def test_pixels_are_those_of_the_full_photo_at_any_scale():
+def test_marked_pixels_count_in_full_photo_pixels_at_any_render_scale():
     """A quarter of the pixels count four times each."""
     ctx = context(rasterizer="numba")
     record = recorded(ctx, 4, 0.5)
@@ -206,7 +206,7 @@ def test_pixels_are_those_of_the_full_photo_at_any_scale():
     assert torch.equal(state.per_primitive[MARKED][:, 0], 4.0 * counts)
 
 
-def test_renders_are_as_large_as_those_of_the_step():
+def test_extra_renders_have_the_scale_and_background_of_the_step():
     ctx = context(rasterizer="numba")
     asked = []
 
@@ -269,7 +269,7 @@ def brute_places(rank, grows):
 
 
 @given(seed=st.integers(0, 2**16), rows=st.integers(0, 12), regimes=st.integers(1, 3))
-def test_the_regimes_take_turns(seed, rows, regimes):
+def test_regimes_alternate_in_the_growth_order(seed, rows, regimes):
     rng = np.random.default_rng(seed)
     rank = rng.integers(0, 5, (rows, regimes)).astype(np.float32)
     grows = rng.random((rows, regimes)) < 0.6
@@ -278,7 +278,7 @@ def test_the_regimes_take_turns(seed, rows, regimes):
     assert found.tolist() == brute_places(rank, grows).tolist()
 
 
-def test_screens_without_a_count_are_the_rasterizer_s_fault():
+def test_rasterizer_output_without_a_pixel_count_is_reported_as_a_fault_of_the_rasterizer():
     ctx = context()
     record = replace(recorded(ctx, 0), screen=Screen(torch.ones(40, dtype=torch.int32)))
     method = MultiViewDensityControl(count="running", share=1.0)

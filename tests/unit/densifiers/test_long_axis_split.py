@@ -81,7 +81,7 @@ def covariances(tensors):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_two_children_have_mean_spread_and_mass_of_their_parent(seed):
+def test_two_children_have_the_mean_spread_and_mass_of_their_parent(seed):
     params = parameters(seed)
     edit, new = grown(AdaptiveDensityControl(division="axis"), params)
     assert dict(edit.counts) == {"cloned": 0, "split": 3, "pruned": 0}
@@ -99,7 +99,7 @@ def test_two_children_have_mean_spread_and_mass_of_their_parent(seed):
     assert mass.reshape(2, 3).sum(dim=0).numpy() == pytest.approx(before.numpy(), rel=1e-5)
 
 
-def test_children_lie_on_the_longest_axis():
+def test_children_are_placed_on_the_longest_axis():
     params = parameters()
     with torch.no_grad():
         params["quats"][:] = torch.tensor([1.0, 0, 0, 0])
@@ -112,7 +112,7 @@ def test_children_lie_on_the_longest_axis():
 
 
 @pytest.mark.parametrize("logit", [-40.0, -15.0, 15.0, 40.0])
-def test_extreme_opacities_stay_finite(logit):
+def test_children_of_extreme_opacity_stay_finite(logit):
     params = parameters()
     with torch.no_grad():
         params["opacities"][:] = logit
@@ -127,7 +127,9 @@ def test_extreme_opacities_stay_finite(logit):
     ("options", "sides"),
     [({}, False), ({"division": "axis"}, True), ({"division": "drawn"}, False)],
 )
-def test_published_children_unless_the_run_says_so(method, options, sides):
+def test_children_are_placed_as_published_unless_the_run_selects_the_axis_split(
+    method, options, sides
+):
     params = parameters()
     edit, new = grown(method(**options), params)
     kept = len(new["means"]) - int(edit.fresh.sum())
@@ -136,7 +138,7 @@ def test_published_children_unless_the_run_says_so(method, options, sides):
     assert edit.counts["cloned"] == (0 if sides else drawn.counts["cloned"])
 
 
-def test_the_strongest_are_split_where_room_is_short():
+def test_the_strongest_gaussians_are_split_first_near_the_limit():
     edit, new = grown(AdaptiveDensityControl(division="axis"), parameters(), room=1)
     assert edit.source.tolist() == [0, 1, 2, 2]
     assert edit.counts["held_back"] == 2

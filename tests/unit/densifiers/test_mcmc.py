@@ -77,7 +77,7 @@ def mixed(n=60, dead=20, seed=1):
     return rng.permutation(opacities).tolist()
 
 
-def test_dead_ones_move_onto_live_ones_and_all_copies_share():
+def test_dead_gaussians_move_onto_live_ones_and_all_copies_share_the_opacity():
     opacities = mixed()
     params = parameters(opacities)
     edit, _ = MarkovChainMonteCarlo(growth=0).densify(densify_context(params), EMPTY_STATE)
@@ -99,7 +99,7 @@ def test_dead_ones_move_onto_live_ones_and_all_copies_share():
         assert shrunk.tolist() == pytest.approx([log(scale.item())] * 3, abs=1e-6)
 
 
-def test_growth_adds_five_percent_and_leaves_no_moment_where_it_touched():
+def test_growth_adds_five_percent_and_clears_the_moments_of_changed_rows():
     params = parameters([0.5] * 100)
     edit, _ = MarkovChainMonteCarlo().densify(densify_context(params), EMPTY_STATE)
     source = edit.source.tolist()
@@ -115,7 +115,7 @@ def test_growth_adds_five_percent_and_leaves_no_moment_where_it_touched():
     [(10**6, 10**6, 10, None), (203, 10**6, 3, None), (150, 10**6, 0, None), (10**6, 4, 4, 6),
      (10**6, 0, 0, 10), (203, 2, 2, 1)],
 )  # fmt: skip
-def test_cap_and_room_bound_the_growth(cap, room, added, held_back):
+def test_the_cap_and_the_primitive_limit_bound_the_growth(cap, room, added, held_back):
     params = parameters([0.5] * 200)
     densifier = MarkovChainMonteCarlo(cap=cap)
     edit, _ = densifier.densify(densify_context(params, room=room), EMPTY_STATE)
@@ -126,7 +126,7 @@ def test_cap_and_room_bound_the_growth(cap, room, added, held_back):
     assert edit.counts.get("held_back") == held_back
 
 
-def test_sources_are_drawn_in_proportion_to_their_opacity():
+def test_source_gaussians_are_sampled_in_proportion_to_their_opacity():
     weights = torch.tensor([0.0, 0.1, 0.3, 0.6, 0.0], dtype=torch.float64)
     counts = np.bincount(drawn(weights, 20_000, np.random.default_rng(0)).numpy(), minlength=5)
     expected = 20_000 * weights.numpy()
@@ -146,7 +146,7 @@ def test_extreme_opacities_give_finite_values(logit):
     assert new["means"].shape[0] == 60
 
 
-def test_no_edit_if_all_gaussians_are_dead_or_at_other_steps():
+def test_no_edit_happens_if_all_gaussians_are_dead_or_at_other_steps():
     params = parameters([0.5] * 30)
     with torch.no_grad():
         params["opacities"][:] = -1e4
@@ -164,7 +164,7 @@ def test_edits_run_from_500_to_25_000_of_30_000_without_resets(mode, total):
     assert window.densifies(600) and window.densifies(24_900) and not window.densifies(25_000)
 
 
-def test_a_run_starts_half_opaque_and_small():
+def test_a_run_starts_with_half_opaque_and_small_gaussians():
     before = parameters([0.1] * 5)
     after = MarkovChainMonteCarlo().started(before)
     assert torch.sigmoid(after["opacities"]).tolist() == pytest.approx([0.5] * 5)
@@ -175,7 +175,7 @@ def test_a_run_starts_half_opaque_and_small():
     assert all(torch.equal(kept[name], before[name]) for name in before)
 
 
-def test_noise_is_the_formula_row_by_row():
+def test_noise_agrees_with_the_formula_row_by_row():
     opacities = [0.001, 0.005, 0.02, 0.05, 0.1]
     params = parameters(opacities)
     answer = after_step(params, rng=5)
@@ -216,7 +216,7 @@ def test_noise_of_extreme_gaussians_is_finite(scale, opacity):
         assert answer.edit.values["means"].values.isfinite().all()
 
 
-def test_noise_moves_means_only_and_repeats():
+def test_noise_changes_means_only_and_is_repeatable():
     params = parameters([0.01] * 6)
     one, other = after_step(params, rng=3).edit, after_step(params, rng=3).edit
     assert set(one.values) == {"means"} and one.source is None
@@ -231,7 +231,7 @@ def regularize_context(params, gaussians=None):
     )
 
 
-def test_regularisers_are_means_and_come_once_per_step():
+def test_regularizers_are_means_and_apply_once_per_step():
     params = parameters([0.2, 0.7])
     densifier = MarkovChainMonteCarlo(opacity_weight=0.03, scale_weight=0.5)
     loss = densifier.crossgrad_regularize(regularize_context(params)).loss
@@ -264,7 +264,7 @@ def trained(setup, steps=6):
     return state.parameters, records
 
 
-def test_its_hooks_fire_in_a_run():
+def test_hooks_of_the_mcmc_densifier_take_effect_in_a_run():
     # The scene has 40 points: growth by half, so that there is some.
     quiet = {"noise": 0.0, "opacity_weight": 0.0, "scale_weight": 0.0, "growth": 0.5}
     silent = setup_of(**quiet)

@@ -35,7 +35,7 @@ from crossgrad_plugins.rasterizers.numba_kernels.arrays import TileLists
 # --- candidates of a pruning
 
 
-def test_candidates_are_drawn_one_after_the_other_by_weight():
+def test_candidates_are_sampled_by_weight_without_replacement():
     """The order of three of them, against the product of the shares of what is left."""
     score = torch.tensor([0.0, 0.9, 0.5, 0.5])
     weight = 1 / (1 - score[:3].double().numpy())
@@ -58,7 +58,7 @@ def test_candidates_are_drawn_one_after_the_other_by_weight():
 
 
 @given(number=st.integers(0, 30), share=st.floats(0.01, 1.0), seed=st.integers(0, 99))
-def test_a_share_of_the_candidates_goes_rounded_up(number, share, seed):
+def test_the_share_of_sampled_candidates_is_rounded_up(number, share, seed):
     rng = np.random.default_rng(seed)
     candidates = torch.zeros(40, dtype=torch.bool)
     candidates[rng.permutation(40)[:number]] = True
@@ -68,7 +68,7 @@ def test_a_share_of_the_candidates_goes_rounded_up(number, share, seed):
     assert not (drawn & ~candidates).any()
 
 
-def test_the_largest_error_always_goes_first():
+def test_the_candidate_with_the_largest_error_is_always_sampled():
     score = torch.tensor([0.99, 1.0, 0.5, 0.0])
     for seed in range(50):
         drawn = some_of(torch.ones(4, dtype=torch.bool), score, 0.25, np.random.default_rng(seed))
@@ -139,7 +139,7 @@ def test_growth_agrees_with_the_published_rule(data, rows):
     assert grown == expected
 
 
-def test_where_room_is_short_the_largest_error_per_visit_goes_first():
+def test_the_largest_error_per_visit_grows_first_near_the_limit():
     state = planted([90, 80, 99, 100], [1.0] * 4, [1.0] * 4, error=[5.0, 9.0, 7.0, 1.0])
     params = few([1e-4] * 4, [0.5] * 4)
     edit, _ = Planted().densify(replace(context(params=params), room=2), state)
@@ -147,7 +147,7 @@ def test_where_room_is_short_the_largest_error_per_visit_goes_first():
     assert edit.counts["held_back"] == 2
 
 
-def test_half_of_the_pruning_candidates_is_removed_and_the_rest_capped():
+def test_half_of_the_pruning_candidates_are_removed_and_the_remaining_ones_capped():
     params = few([1e-4] * 7, [0.001, 0.002, 0.003, 0.004, 0.9, 0.79, 0.81])
     state = planted([0] * 7, [0.0] * 7, [0.0] * 7, error=[0.0, 1.0, 0.9999, 0.0, 0.0, 0.0, 0.0])
     edit, _ = Planted().densify(context(params=params), state)
@@ -160,7 +160,7 @@ def test_half_of_the_pruning_candidates_is_removed_and_the_rest_capped():
     assert moments.tolist() == [1, 1, 0, 1, 0]  # What is not capped keeps its moments.
 
 
-def test_the_cap_counts_what_the_filter_of_the_backbone_leaves():
+def test_the_opacity_cap_applies_after_the_filter_of_the_backbone():
     backbone = MipSplatting()
     params = parameters_of(backbone)
     with torch.no_grad():
@@ -177,14 +177,14 @@ def test_the_cap_counts_what_the_filter_of_the_backbone_leaves():
     assert float(drawn.detach().max()) <= 0.8 + 1e-5
 
 
-def test_no_cap_and_full_pruning_are_those_of_adc():
+def test_disabled_cap_and_full_pruning_agree_with_adc():
     params = few([1e-4] * 4, [0.001, 0.002, 0.9, 0.5])
     state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
     edit, _ = Planted(cap_opacity=1, prune_share=1).densify(context(params=params), state)
     assert edit.source.tolist() == [2, 3] and not edit.values
 
 
-def test_opacities_are_reset_as_published_and_a_reset_wins_over_the_cap():
+def test_opacities_are_reset_as_published_and_a_reset_overrides_the_cap():
     params = few([1e-4] * 4, [0.5, 0.6, 0.9, 0.95])
     state = planted([0] * 4, [0.0] * 4, [0.0] * 4)
     edit, _ = Planted().densify(context(params=params, step=3000), state)
@@ -194,7 +194,7 @@ def test_opacities_are_reset_as_published_and_a_reset_wins_over_the_cap():
 
 
 @pytest.mark.parametrize(("total", "every"), [(30_000, 500), (12_000, 200), (3_000, 100)])
-def test_edits_are_as_far_apart_as_published(total, every):
+def test_the_interval_between_edits_is_the_published_one(total, every):
     schedule = Schedule.for_run(total)
     window = MultiViewDensityControl().window(schedule)
     assert (window.densify_from, window.densify_every) == (500, every)
@@ -204,7 +204,7 @@ def test_edits_are_as_far_apart_as_published(total, every):
 
 
 @pytest.mark.parametrize("total", [98, 240, 700])
-def test_short_runs_have_edits_where_they_are_asked_for(total):
+def test_short_runs_edit_only_if_min_refinements_requests_edits(total):
     counting = Counting("views", ViewsPerStepSpec((1,)), 12, min_refinements=6)
     window = MultiViewDensityControl().window(Schedule.for_run(total, counting=counting))
     assert window.edits() >= 6
@@ -221,7 +221,7 @@ def late(step, state, schedule=None, **options):
     return MultiViewDensityControl(**options).densify(ctx, state)
 
 
-def test_late_prunings_come_once_at_their_shares_of_the_run():
+def test_late_prunings_happen_once_at_their_shares_of_the_run():
     state, times = EMPTY_STATE, []
     for step in (15_000, 17_999, 18_000, 18_001, 20_999, 21_000, 24_000, 26_999, 27_000, 30_000):
         edit, state = late(step, state)
@@ -231,7 +231,7 @@ def test_late_prunings_come_once_at_their_shares_of_the_run():
     assert state.values == {"late": 4}
 
 
-def test_late_prunings_remove_what_is_faint_or_errs_the_most():
+def test_late_prunings_remove_faint_gaussians_and_gaussians_with_the_largest_error():
     ctx = context(step=18_000, rasterizer="numba")
     edit, _ = MultiViewDensityControl(views=VIEWS).densify(ctx, EMPTY_STATE)
     seen = MultiViewDensityControl(views=VIEWS)
@@ -243,14 +243,14 @@ def test_late_prunings_remove_what_is_faint_or_errs_the_most():
     assert float(score[opacities >= 0.1].max()) > 0.9
 
 
-def test_late_prunings_may_be_left_out_and_are_in_runs_without_density_control():
+def test_late_prunings_can_be_disabled_and_never_run_without_density_control():
     assert late(18_000, EMPTY_STATE, late_prunings=())[0].is_empty
     short = Schedule.for_run(600)
     assert not short.grows
     assert late(590, EMPTY_STATE, short)[0].is_empty
 
 
-def test_a_run_that_becomes_shorter_prunes_once_for_all_that_it_passed():
+def test_a_run_that_becomes_shorter_prunes_once_for_all_missed_prunings():
     longer = Schedule.for_run(30_000)
     _, state = late(17_000, EMPTY_STATE, longer)
     shorter = replace(longer, length=20_000, total=20_000)
@@ -260,7 +260,7 @@ def test_a_run_that_becomes_shorter_prunes_once_for_all_that_it_passed():
     assert edit.is_empty and state.values == {"late": 3}
 
 
-def test_options_that_do_nothing_are_named():
+def test_unused_options_are_named():
     idle = lambda **options: set(MultiViewDensityControl(**options).unused_options(None))  # noqa: E731
     assert idle() == {"share"}
     assert idle(count="running") == set()
@@ -303,7 +303,7 @@ def counted(method, ctx):
 
 
 @pytest.mark.parametrize("count", ["render", "running"])
-def test_gaussians_with_wrong_pixels_grow_and_others_do_not(count):
+def test_exactly_the_gaussians_with_wrong_pixels_grow(count):
     """Photos that are wrong where one Gaussian is blended: it grows, what never meets it not."""
     backbone = Vanilla()
     params = backbone.create(sample_scene(), np.random.default_rng(0))
@@ -335,7 +335,7 @@ def test_gaussians_with_wrong_pixels_grow_and_others_do_not(count):
 
 
 @pytest.mark.parametrize("count", ["render", "running"])
-def test_the_errors_of_one_regime_are_not_averaged_away(count):
+def test_errors_of_one_regime_are_not_averaged_with_other_regimes(count):
     """Near photos are wrong, far ones in one pixel: the mean of all says less than near ones."""
     params = parameters_of(backbone := Vanilla())
 
@@ -386,20 +386,20 @@ RUNS = [
 
 
 @pytest.mark.parametrize(("views", "count", "backbone"), RUNS)
-def test_runs_grow_for_any_k_and_every_backbone_of_gaussians(views, count, backbone):
+def test_runs_grow_for_any_k_and_every_gaussian_backbone(views, count, backbone):
     _, state, records = run_of(views, backbone, count=count, regimes=views > 1, **EAGER)
     edits = [r.counts.get("cloned", 0) + r.counts.get("split", 0) > 0 for r in records]
     assert edits == [step % 3 == 0 for step in range(1, 10)]
     assert all(tensor.isfinite().all() for tensor in state.parameters.values())
 
 
-def test_renders_are_counted_and_the_running_variant_needs_none():
+def test_extra_renders_are_counted_and_the_running_variant_needs_none():
     for count, more in (("render", 10 * 3), ("running", 0)):
         _, state, _ = run_of(count=count, views=1, **EAGER)
         assert state.counters.views == 9 + min(more, VIEWS * 3)
 
 
-def test_nothing_of_a_view_outlives_its_step():
+def test_no_per_view_data_is_kept_after_its_step():
     """The count keeps a view's tile lists alive: those of one step at most."""
     setup, state, _ = run_of(2, count="running", share=1.0, steps=4, **EAGER)
     gc.collect()
@@ -414,7 +414,7 @@ def test_nothing_of_a_view_outlives_its_step():
     assert sum(tensor.nbytes for tensor in held.values()) <= 6 * 4 * primitives
 
 
-def test_a_rasterizer_without_the_count_is_refused():
+def test_a_rasterizer_without_pixel_counts_is_refused():
     selection = assemble(
         RunConfig(steps=10, densifier=ComponentChoice(name="multiview")), sample_scene(), "none"
     ).selection
@@ -427,7 +427,7 @@ def test_a_rasterizer_without_the_count_is_refused():
     assert any("needs the screen statistics count" in reason for reason in reasons)
 
 
-def test_a_plan_takes_its_scores_from_the_parents():
+def test_children_take_their_scores_from_their_parent():
     """Pruning looks at children, too; they have their parent's share in the error."""
     plan = Plan(torch.tensor([0, 1, 1]), torch.tensor([False, True, True]), torch.zeros(3).bool())
     params = few([1e-4, 1e-4], [0.5, 0.001])

@@ -53,7 +53,9 @@ RUNS = [
 
 
 @pytest.mark.parametrize(("backbone", "of", "count", "views"), RUNS)
-def test_nothing_grows_behind_a_closed_gate_and_much_behind_an_open_one(backbone, of, count, views):
+def test_no_gaussian_grows_with_a_closed_gate_and_many_grow_with_an_open_gate(
+    backbone, of, count, views
+):
     _, _, closed = run_of(backbone, of, views, count=count, importance=1e9)
     _, _, opened = run_of(backbone, of, views, count=count, importance=0)
     assert closed == 0 < opened
@@ -88,7 +90,7 @@ def grown(edit):
     return set(edit.source[edit.fresh].tolist())
 
 
-def test_an_anchor_grows_only_where_it_may():
+def test_an_anchor_grows_only_if_the_gate_allows_growth():
     backbone = build("backbones", "scaffold", {"voxel_size": 1e-5})
     options = {name: value for name, value in ANCHOR.items() if name != "name"}
     parameters = created(backbone)
@@ -116,7 +118,7 @@ def test_a_growth_request_excludes_rows_that_may_not_grow():
 
 
 @pytest.mark.parametrize("name", ["mcmc", "none", "multiview", "multiview-gate"])
-def test_a_densifier_that_can_only_stand_alone_is_refused_in_the_gate(name):
+def test_a_densifier_that_cannot_be_nested_is_refused_in_the_gate(name):
     with pytest.raises(UserError) as refused:
         build("densifiers", "multiview-gate", {"of": name})
     assert "can only stand alone" in str(refused.value)
@@ -141,7 +143,7 @@ def test_the_options_of_the_inner_densifier_are_kept_in_the_configuration():
     assert MultiViewGate(of="absgrad").needs == {"count", "abs_gradient"}
 
 
-def test_options_that_do_nothing_are_refused():
+def test_options_without_an_effect_are_refused():
     for options, named in (
         ({"share": 0.5}, "densifier.share"),
         ({"count": "running", "views": 3}, "densifier.views"),
@@ -166,7 +168,7 @@ class Heedless(AdaptiveDensityControl):
         return Edit(source, torch.arange(len(source)) >= len(rows)), state
 
 
-def test_a_densifier_that_does_not_look_at_the_gate_is_found_out():
+def test_a_densifier_that_ignores_the_gate_is_reported():
     run = DensifierRun.of(MultiViewGate(of=Heedless(), importance=1e9))
     run.take_step(599)
     with pytest.raises(UserError, match="grows what it may not"):

@@ -90,7 +90,7 @@ def slow_growth(tensors, asked, levels):
 
 @pytest.mark.parametrize("levels", [1, 2, 3, 5])
 @pytest.mark.parametrize("seed", range(3))
-def test_new_anchors_are_those_of_a_loop_over_offsets(levels, seed):
+def test_new_anchors_agree_with_a_loop_over_offsets(levels, seed):
     rng = np.random.default_rng(seed)
     tensors, asked = parameters(rng, 40, levels=levels), request(rng, 40)
     expected = slow_growth(tensors, asked, levels)
@@ -109,7 +109,7 @@ def test_new_anchors_are_those_of_a_loop_over_offsets(levels, seed):
     assert not new.further["extra_levels"].any()
 
 
-def test_without_eligible_offsets_nothing_grows():
+def test_no_anchor_grows_without_eligible_offsets():
     rng = np.random.default_rng(0)
     asked = replace(request(rng), eligible=torch.zeros(12, 3, dtype=torch.bool))
     assert len(grown(parameters(rng), asked, THRESHOLDS, NEAR_CAMERA)) == 0
@@ -126,7 +126,7 @@ def test_candidates_that_too_few_cameras_see_do_not_grow():
     assert grown(tensors, asked, THRESHOLDS, close).further["levels"].any()
 
 
-def test_an_offset_far_outside_the_scene_grows_nothing():
+def test_an_offset_far_outside_the_scene_does_not_grow():
     tensors = parameters(np.random.default_rng(2), 2)
     tensors["offsets"][0] = 1e38
     tensors["scales"][1] = 200.0
@@ -195,7 +195,7 @@ def fresh(seed=0):
     return backbone, tensors
 
 
-def test_edits_keep_every_anchor_on_a_site_of_its_own():
+def test_edits_keep_every_anchor_on_a_separate_lattice_site():
     backbone, tensors = fresh()
     control, state = OctreeControl(success_threshold=0), PluginState()
     rng = np.random.default_rng(1)
@@ -230,7 +230,7 @@ def check_sites(tensors):
     assert int(tensors["levels"].max()) < int(tensors["lattice"][5])
 
 
-def test_the_strongest_grow_where_room_is_short():
+def test_the_strongest_candidates_grow_first_near_the_limit():
     backbone, tensors = fresh()
     control = OctreeControl(success_threshold=0, extra_level=0.0)
     gradient = torch.linspace(1e-4, 9e-4, tensors["offsets"].shape[0] * 3)
@@ -242,7 +242,7 @@ def test_the_strongest_grow_where_room_is_short():
     assert none.source is None and none.counts["held_back"] == everything.counts["grown"]
 
 
-def test_new_anchors_start_as_large_as_their_cells():
+def test_new_anchors_start_with_the_size_of_their_cells():
     backbone, tensors = fresh()
     edit, _ = OctreeControl(success_threshold=0).densify(
         context(tensors, backbone, gradient=9e-4), PluginState()
@@ -254,7 +254,7 @@ def test_new_anchors_start_as_large_as_their_cells():
 
 
 @pytest.mark.parametrize(("total", "mode"), [(40_000, "scaled"), (30_000, "absolute")])
-def test_published_times_at_the_published_length_and_on_request(total, mode):
+def test_schedule_times_are_the_published_ones_at_the_published_length_or_on_request(total, mode):
     schedule = OctreeControl().window(Schedule.for_run(total, mode))
     assert schedule.lr_until == 40_000
     edits = [step for step in range(1, 40_001) if schedule.densifies(step)]
@@ -263,14 +263,14 @@ def test_published_times_at_the_published_length_and_on_request(total, mode):
 
 
 @pytest.mark.parametrize("total", [300, 2000, 10_000, 400_000])
-def test_times_stretch_with_the_run(total):
+def test_schedule_times_scale_with_the_run(total):
     schedule = OctreeControl().window(Schedule.for_run(total))
     edits = [step for step in range(1, total + 1) if schedule.densifies(step)]
     assert edits[0] > total * 1500 / 40_000 - 1 and edits[-1] < total * 25_000 / 40_000
     assert edits[1:] == [] or edits[1] - edits[0] == max(50, math.floor(total / 400))
 
 
-def test_statistics_stop_with_growth():
+def test_statistics_end_with_growth():
     backbone, tensors = fresh()
     edit, state = OctreeControl().densify(context(tensors, backbone, step=25_000), PluginState())
     assert edit.is_empty and not state.per_primitive

@@ -123,21 +123,21 @@ def expected_source(params, clones, splits):
 
 
 @pytest.mark.parametrize("threshold", [0.37, 0.8])
-def test_pixel_weighs_by_pixels_and_scales_by_depth(threshold):
+def test_pixel_statistics_weight_by_pixels_and_scale_by_depth(threshold):
     densifier = PixelDensityControl(depth_threshold=threshold)
     params, records, edit = grown(densifier, np.random.default_rng(1))
     grows = pixel_statistic(records, threshold) >= 2e-4
     assert edit.source.tolist() == expected_source(params, grows, grows)
 
 
-def test_pixel_adds_up_the_gaussians_of_one_primitive():
+def test_pixel_statistics_add_up_over_the_gaussians_of_one_primitive():
     origin = torch.arange(2 * PRIMITIVES) % (PRIMITIVES - 3)
     params, records, edit = grown(PixelDensityControl(), np.random.default_rng(2), origin=origin)
     grows = pixel_statistic(records) >= 2e-4
     assert edit.source.tolist() == expected_source(params, grows, grows)
 
 
-def test_pixel_without_pixels_nothing_grows():
+def test_no_gaussian_grows_without_pixels():
     rng = np.random.default_rng(3)
     params = parameters(rng)
     view = record(rng, params["means"])
@@ -148,7 +148,7 @@ def test_pixel_without_pixels_nothing_grows():
 
 
 @pytest.mark.parametrize("criterion", ["abs", "gsplat", "quantile"])
-def test_absgrad_criteria(criterion):
+def test_absgrad_criteria_agree_with_a_loop(criterion):
     densifier = AbsGradDensityControl(criterion=criterion)
     params, records, edit = grown(densifier, np.random.default_rng(4))
     g, ga = mean_statistics(records, order=1 if criterion == "quantile" else 2)
@@ -168,7 +168,7 @@ def by_quantile(g, ga):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6])
-def test_quantile_criterion_grows_nothing_where_nothing_moves(scale):
+def test_the_quantile_criterion_grows_nothing_without_gradients(scale):
     rng = np.random.default_rng(5)
     params = parameters(rng)
     view = record(rng, params["means"])
@@ -179,7 +179,7 @@ def test_quantile_criterion_grows_nothing_where_nothing_moves(scale):
     assert edit.counts == {}
 
 
-def test_quantile_criterion_leaves_out_what_was_never_seen():
+def test_the_quantile_criterion_omits_gaussians_that_were_never_visible():
     rng = np.random.default_rng(6)
     params = parameters(rng)
     view = record(rng, params["means"])
@@ -194,7 +194,7 @@ def test_quantile_criterion_leaves_out_what_was_never_seen():
 
 @pytest.mark.parametrize("share", [0.0, 0.37, 0.5, 1.0])
 @pytest.mark.parametrize("number", [1, 2, 11])
-def test_quantile_is_that_of_numpy(number, share):
+def test_the_quantile_agrees_with_numpy(number, share):
     values = np.random.default_rng(7).normal(size=number)
     found = float(quantile(torch.from_numpy(values), share))
     assert found == pytest.approx(np.quantile(values, share), abs=1e-12)

@@ -30,7 +30,7 @@ def numbers(*values):
 
 
 @pytest.mark.parametrize("copies", COPIES)
-def test_agrees_with_the_published_sums(copies):
+def test_shared_opacities_and_scales_agree_with_the_published_sums(copies):
     # In float64 these sums lose all digits from about 40 opaque copies on.
     expected = np.array([published(o, copies) for o in OPACITIES])
     opacity, n = numbers(*OPACITIES), torch.full((len(OPACITIES),), copies)
@@ -58,7 +58,7 @@ def test_relocated_copies_together_have_the_opacity_of_the_original(opacity, cop
     assert together.sum() == pytest.approx(alone.sum(), rel=1e-9)
 
 
-def test_rows_that_occur_once_stay_and_shares_are_by_number():
+def test_rows_that_occur_once_are_unchanged_and_shares_depend_on_the_number_of_copies():
     pool = Pool.of(numbers(0.9, 0.5, 0.3)).copied(torch.tensor([0, 1, 0, 0]), 0.005)
     assert pool.source.tolist() == [0, 1, 0, 0]
     assert pool.touched.tolist() == [True, False, True, True]
@@ -67,7 +67,7 @@ def test_rows_that_occur_once_stay_and_shares_are_by_number():
     assert pool.scale.tolist() == pytest.approx([scale, 1.0, scale, scale])
 
 
-def test_copies_of_copies_share_twice():
+def test_copies_of_copies_share_the_opacity_twice():
     once = Pool.of(numbers(0.9, 0.5)).copied(torch.tensor([0, 0]), 0.005)
     twice = once.copied(torch.tensor([0, 1, 1]), 0.005)
     first, first_scale = published(0.9, 2)

@@ -49,7 +49,7 @@ BACKBONES = {
 
 @pytest.mark.parametrize("name", OPTIONS)
 @pytest.mark.parametrize("stop", [3, 4])
-def test_a_checkpoint_changes_nothing(tmp_path, name, stop, edits_in):
+def test_resuming_from_a_checkpoint_changes_no_bit(tmp_path, name, stop, edits_in):
     config = RunConfig(
         steps=10,
         initializer=ComponentChoice(name="points"),
@@ -87,7 +87,7 @@ def assert_same(one, other):
         assert torch.equal(tensor, other[name]), name
 
 
-def test_what_plugins_remember_follows_the_run_to_its_device(tmp_path):
+def test_plugin_states_follow_the_run_to_its_device(tmp_path):
     """The device `meta` holds no numbers, and no machine lacks it."""
     config = RunConfig(steps=10, schedule_unit="steps", densify_from=1, densify_until=9)
     setup = assemble(config, sample_scene(), "none")

@@ -128,7 +128,9 @@ def share_of(ctx, index, kind, mask=None):
 @pytest.mark.parametrize("kind", ["ssim", "l1"])
 @pytest.mark.parametrize("backbone", [Vanilla(), Bright()], ids=["harmonics", "two per primitive"])
 @pytest.mark.parametrize("rasterizer", ["torch", "numba"])
-def test_the_share_is_weight_times_error_and_the_largest_over_views(kind, backbone, rasterizer):
+def test_the_error_share_is_the_largest_over_views_of_weight_times_error(
+    kind, backbone, rasterizer
+):
     ctx = context(backbone=backbone, rasterizer=rasterizer)
     expected = np.max([share_of(ctx, index, kind) for index in (0, 3, 7)], axis=0)
     assert (expected > 0).sum() > 20
@@ -151,7 +153,7 @@ def test_masked_pixels_have_no_error(kind):
 
 
 @pytest.mark.parametrize(("number", "most"), [(5, 32), (32, 32), (33, 32), (1000, 32), (7, 1)])
-def test_views_are_spread_evenly(number, most):
+def test_sampled_views_are_spread_evenly_over_the_photos(number, most):
     drawn = [spread_views(number, most, np.random.default_rng(seed)) for seed in range(50)]
     for views in drawn:
         assert len(set(views)) == len(views) == min(number, most)
@@ -166,7 +168,7 @@ def edit_of(ctx, **options):
     return RevisingDensification(**options).densify(ctx, EMPTY_STATE)[0]
 
 
-def test_the_largest_shares_grow_within_the_budget():
+def test_the_largest_error_shares_grow_within_the_growth_limit():
     ctx = context()
     shares = np.max([share_of(ctx, index, "ssim") for index in range(VIEWS)], axis=0)
     edit = edit_of(ctx, growth_budget=0.2, prune_opacity=0.0)
@@ -179,13 +181,13 @@ def test_the_largest_shares_grow_within_the_budget():
     assert few.source.shape[0] == 43
 
 
-def test_room_wins_over_the_budget():
+def test_the_primitive_limit_overrides_the_growth_limit():
     edit = edit_of(context(room=3), growth_budget=0.2, prune_opacity=0.0)
     assert edit.source.shape[0] == 43
     assert edit.counts["held_back"] == 5
 
 
-def test_clones_and_children_share_their_opacity_and_all_lose_a_little():
+def test_clones_and_children_share_their_opacity_and_all_opacities_decrease_a_little():
     ctx = context()
     middle = torch.exp(ctx.parameters["scales"].detach()).amax(1).median().item()
     edit = edit_of(ctx, growth_budget=0.5, prune_opacity=0.0, split_scale=middle)
@@ -204,7 +206,7 @@ def test_clones_and_children_share_their_opacity_and_all_lose_a_little():
 
 
 @pytest.mark.parametrize("logit", [-1e4, -200.0, -90.0, -16.0, -15.0, -1.0, 0.0, 5.0, 40.0, 1e4])
-def test_halved_opacities_in_many_digits(logit):
+def test_halved_opacities_agree_with_a_high_precision_computation(logit):
     with mp.workdps(200):
         transparent = mp.sqrt(1 / (1 + mp.exp(mp.mpf(max(min(logit, 1e3), -1e3)))))
         if abs(logit) < 1e3:
@@ -216,7 +218,7 @@ def test_halved_opacities_in_many_digits(logit):
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-def test_lowered_opacities_are_finite_and_nothing_rises():
+def test_decreased_opacities_are_finite_and_none_increases():
     logits = torch.tensor([-1e4, -20.0, -7.0, -6.0, 0.0, 20.0, 1e4])
     lowered = lowered_logits(logits, 0.001)
     assert lowered.isfinite().all() and (lowered <= logits).all()
@@ -233,20 +235,20 @@ def test_density_control_ends_at_27_000_without_resets(mode, total):
     assert resetting.reset_every == schedule.reset_every is not None
 
 
-def test_with_resets_no_opacity_is_lowered_between_them():
+def test_with_resets_opacities_do_not_decrease_between_the_resets():
     ctx = context(step=600)
     edit = edit_of(ctx, opacity_decrease=0, growth_budget=0.01, prune_opacity=0.0)
     assert edit.source is None and not edit.values
 
 
-def test_nothing_happens_between_edits():
+def test_nothing_changes_between_edits():
     assert edit_of(context(step=601)) == NO_EDIT
     window = RevisingDensification().window(Schedule.for_run(30_000))
     last, over = (replace(context(step=step), schedule=window) for step in (26_900, 27_000))
     assert edit_of(last) != NO_EDIT and edit_of(over) == NO_EDIT
 
 
-def test_a_run_grows_and_lowers_opacities():
+def test_a_run_grows_and_decreases_opacities():
     config = RunConfig(
         steps=10, densify_from=1, densify_until=9, densify_every=2, schedule_unit="steps",
         densifier=ComponentChoice(name="revising", growth_budget=0.1, error_threshold=0.01),
@@ -272,7 +274,7 @@ class Slow:
         return self._image()
 
 
-def test_decoding_photos_for_an_edit_counts_as_loading():
+def test_decoding_photos_for_an_edit_counts_as_loading_time():
     scene = sample_scene()
     views = tuple(replace(view, photo=Slow(view.photo)) for view in scene.views)
     config = RunConfig(
@@ -288,7 +290,7 @@ def test_decoding_photos_for_an_edit_counts_as_loading():
     assert state.clock.load - before >= (1 + VIEWS) * Slow.SECONDS
 
 
-def test_an_edit_that_grows_nothing_and_prunes_nothing_lowers_opacities_all_the_same():
+def test_an_edit_without_growth_and_pruning_still_decreases_opacities():
     ctx = context()
     before = ctx.parameters["opacities"].detach()
     kept = RevisingDensification(error_threshold=1e9, prune_opacity=0.0)

@@ -84,7 +84,7 @@ def observed(densifier, scale):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_statistics_do_not_depend_on_the_scale(name):
+def test_statistics_do_not_depend_on_the_render_scale(name):
     full = observed(name, 1.0)
     if not full:
         pytest.skip("gathers no statistics of views")
@@ -99,7 +99,7 @@ def test_statistics_do_not_depend_on_the_scale(name):
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.25])
-def test_a_share_in_the_error_is_one_of_the_full_photo(scale):
+def test_error_shares_refer_to_the_full_photo_at_any_render_scale(scale):
     start = lambda schedule: schedule.first_edit - 1  # noqa: E731
     (_, (full,)), (_, (small,)) = (stepped("revising", each, start, 1) for each in (1.0, scale))
     assert full.counts["cloned"] + full.counts["split"] > 0

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
 @pytest.mark.parametrize("name", entries("densifiers"))
-def test_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
+def test_training_gives_the_same_bits_on_any_number_of_threads(name, large_scene, edits_in):
     config = RunConfig(
         steps=9,
         schedule_unit="steps",

@@ -14,7 +14,7 @@ def gramians(*blocks):
     return np.stack([np.array(rows) @ np.array(rows).T for rows in blocks])
 
 
-def test_the_conflict_rate_is_given_in_both_definitions():
+def test_the_conflict_rate_is_reported_in_both_definitions():
     found = conflict(
         gramians(
             [[1.0], [1.0], [-1.0], [2.0]],
@@ -37,7 +37,7 @@ def test_zero_and_disjoint_gradients_are_not_counted_as_agreement():
     assert found.per_block.tolist() == [1.0]
 
 
-def test_orthogonal_gradients_that_overlap_do_count():
+def test_orthogonal_gradients_with_overlap_are_counted():
     rows = [[1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0]]
     overlap = np.ones((1, 4, 4), dtype=bool)
     found = conflict(gramians(rows), NEAR, overlap)
@@ -45,19 +45,19 @@ def test_orthogonal_gradients_that_overlap_do_count():
     assert found.per_block.tolist() == [0.0]
 
 
-def test_no_counted_pair_has_no_rate():
+def test_the_conflict_rate_is_undefined_without_counted_pairs():
     found = conflict(np.zeros((2, 4, 4)), NEAR)
     assert np.isnan(found.per_block).all()
     assert np.isnan(found.per_pair)
 
 
-def test_the_ratio_is_one_of_means():
+def test_the_gradient_ratio_is_a_ratio_of_means():
     ratio = gradient_ratio(np.array([4.0, 36.0, 1.0, 9.0]), NEAR)
     assert ratio.of_means == pytest.approx((2 + 6) / (1 + 3))
     assert ratio.median == pytest.approx(2.0)
 
 
-def test_zero_gradients_count_in_the_means_and_have_no_pairs():
+def test_zero_gradients_count_in_the_means_and_form_no_pairs():
     ratio = gradient_ratio(np.array([4.0, 0.0, 1.0, 9.0]), NEAR)
     assert ratio.of_means == pytest.approx((2 + 0) / (1 + 3))
     assert ratio.median == pytest.approx(np.sqrt(2 * 2 / 3))
@@ -84,7 +84,7 @@ def test_an_exact_power_law_is_found_exactly(exponent):
     assert found.views == 9
 
 
-def test_the_exponent_s_interval_covers_under_unequal_scatter():
+def test_the_interval_of_the_exponent_has_its_coverage_under_unequal_scatter():
     rng = np.random.default_rng(0)
     distances = np.geomspace(1.0, 9.0, 24)
     held = 0
@@ -108,7 +108,7 @@ def test_without_a_fitted_line_the_exponent_is_nan(squared, distances):
     assert np.isnan([found.value, found.interval.low, found.interval.high]).all()
 
 
-def test_zero_gradients_and_distances_are_left_out():
+def test_zero_gradients_and_zero_distances_are_left_out():
     distances = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0])
     squared = np.array([5.0, 1.0, 0.25, 0.0625, 0.015625, 0.0])
     found = distance_exponent(squared, distances)
@@ -132,7 +132,7 @@ def test_conflict_that_grows_with_the_difference_of_distances_is_found():
     assert found.rates[-1] == 1.0
 
 
-def test_conflict_without_reference_to_distances_is_not():
+def test_conflict_independent_of_distances_is_not_reported():
     rng = np.random.default_rng(1)
     values = []
     for _ in range(40):
@@ -152,7 +152,7 @@ def test_constant_conflict_has_no_correlation(gramian):
 
 
 @pytest.mark.parametrize("views", [4, 6, 8])
-def test_a_relabelling_that_is_as_good_counts_however_its_sum_rounds(views):
+def test_an_equally_good_permutation_counts_despite_rounding_of_its_sum(views):
     # One pair conflicts, the nearest camera with the farthest one: no other is as far apart.
     pairs, values = views * (views - 1) / 2, []
     for seed in range(20):
@@ -167,7 +167,7 @@ def test_a_relabelling_that_is_as_good_counts_however_its_sum_rounds(views):
     assert np.mean(values) == pytest.approx(share, abs=3 * np.sqrt(share / 499 / 20) + 1 / 500)
 
 
-def test_pairs_that_are_equally_far_apart_have_one_rank():
+def test_pairs_with_equal_distances_have_equal_ranks():
     # Two rings whose radii differ by rounding, in conflict between them.
     radii = np.repeat([1.0, 3.0], 8) * (1 + 1e-15 * np.random.default_rng(0).normal(size=16))
     sides = np.repeat([1.0, -1.0], 8)

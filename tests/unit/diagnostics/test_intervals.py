@@ -34,7 +34,7 @@ SLACK = 3 * (0.95 * 0.05 / REPETITIONS) ** 0.5
         ("finite", 30, (12, 12), 0.1),
     ],
 )
-def test_intervals_hold_the_truth_as_often_as_they_say(kind, dimension, sizes, ratio):
+def test_intervals_contain_the_true_value_with_the_stated_coverage(kind, dimension, sizes, ratio):
     held = COVERAGE(kind, dimension, sizes, ratio, REPETITIONS)
     assert (held > 0.95 - SLACK).all()
 
@@ -55,7 +55,9 @@ def test_intervals_are_not_too_wide():
 @pytest.mark.parametrize(
     ("kind", "dimension", "lowest"), [("normal", 30, 0.92), ("radial5", 30, 0.88)]
 )
-def test_acceptance_in_a_thousand_repetitions(kind, dimension, lowest, sizes):
+def test_coverage_over_a_thousand_repetitions_is_within_the_accepted_range(
+    kind, dimension, lowest, sizes
+):
     within, between, _ = COVERAGE(kind, dimension, sizes, 1.0, 1000)
     assert lowest <= within <= 0.98
     assert lowest <= between <= 0.98
@@ -71,12 +73,14 @@ def test_acceptance_in_a_thousand_repetitions(kind, dimension, lowest, sizes):
         pytest.param("student3", 3, 1.0, 2, 0.88, id="ratio without a fourth moment"),
     ],
 )
-def test_the_hard_cases_are_inside(kind, dimension, ratio, figure, lowest):
+def test_coverage_of_the_hard_cases_is_within_the_accepted_range(
+    kind, dimension, ratio, figure, lowest
+):
     assert lowest <= COVERAGE(kind, dimension, (12, 12), ratio, 500)[figure] <= 0.98
 
 
 @pytest.mark.parametrize("isotropic", [True, False])
-def test_variance_along_the_true_gap(isotropic):
+def test_the_variance_assumed_at_the_true_gap_agrees_with_normal_theory(isotropic):
     """The variance that the pivot assumes at the true gap, on average, against that of normals."""
     rng = np.random.default_rng(1)
     scales = np.ones(30) if isotropic else 1.0 / np.sqrt(1.0 + np.arange(30))
@@ -123,24 +127,24 @@ def test_intervals_scale_with_the_squared_gradients(scale):
     np.testing.assert_allclose(ends(scale * rows, near), expected, rtol=1e-5)
 
 
-def test_a_common_part_of_all_gradients_does_not_matter():
+def test_a_constant_added_to_all_gradients_does_not_change_the_intervals():
     rows, near = sample()
     np.testing.assert_allclose(ends(rows + 100.0, near), ends(rows, near), rtol=1e-5)
 
 
-def test_a_rotation_of_the_gradients_does_not_matter():
+def test_a_rotation_of_the_gradients_does_not_change_the_intervals():
     rows, near = sample()
     rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(20, 20)))[0]
     np.testing.assert_allclose(ends(rows @ rotation, near), ends(rows, near), rtol=1e-5)
 
 
-def test_the_same_generator_gives_the_same_ends():
+def test_intervals_contain_their_estimates():
     rows, near = sample()
     assert (ends(rows, near) == ends(rows, near)).all()
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_estimates_lie_inside_where_they_can(seed):
+def test_estimates_are_inside_their_intervals_if_possible(seed):
     rows, near = sample(seed)
     gramian, groups = rows @ rows.T, Groups(near)
     figures = variance_split(gramian, groups)
@@ -150,7 +154,7 @@ def test_estimates_lie_inside_where_they_can(seed):
     assert found.between.low >= 0.0
 
 
-def test_the_interval_excludes_zero_for_a_wide_gap_only():
+def test_only_a_wide_gap_has_an_interval_above_zero():
     rows, near = sample(shift=3.0)
     assert ends(rows, near)[1, 0] > 0.0
     rows, near = sample(shift=0.0)
@@ -179,7 +183,7 @@ def test_probing_every_camera_gives_intervals_of_width_zero():
     assert found.ratio.low == pytest.approx(figures.ratio)
 
 
-def test_probing_most_cameras_leaves_little_doubt():
+def test_probing_most_cameras_narrows_the_intervals():
     rows, near = sample()
     width = np.ptp(ends(rows, near), axis=1)
     assert (np.ptp(ends(rows, near, cameras=(10, 8)), axis=1) < 0.6 * width).all()
@@ -193,19 +197,19 @@ def test_probing_most_cameras_leaves_little_doubt():
         pytest.param(np.random.default_rng(0).normal(size=(6, 3)), id="three views per group"),
     ],
 )
-def test_without_variance_or_views_the_ends_are_unknown(rows):
+def test_interval_ends_are_unknown_without_variance_or_views(rows):
     near = np.arange(len(rows)) < len(rows) // 2
     assert np.isnan(ends(rows, near)).all()
 
 
-def test_every_resample_has_three_cameras_and_the_right_size():
+def test_every_resample_has_at_least_three_distinct_cameras_and_the_right_size():
     counts = multiplicities(4, 500, np.random.default_rng(0))
     assert (counts[0] == 1.0).all()
     assert (counts.sum(axis=1) == 4.0).all()
     assert (np.count_nonzero(counts, axis=1) >= 3).all()
 
 
-def test_resampled_figures_are_those_of_the_resampled_gradients():
+def test_resampled_values_agree_with_values_of_the_resampled_gradients():
     rows, near = sample()
     groups = Groups(near)
     parts = GroupedGramian.of(rows @ rows.T, groups)

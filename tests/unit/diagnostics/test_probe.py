@@ -57,7 +57,7 @@ def gradients(model, view):
     return {name: tensor.grad for name, tensor in leaves.items()}
 
 
-def test_gramians_hold_the_dot_products_of_each_view_s_own_gradient(model):
+def test_gramians_contain_the_dot_products_of_the_gradients_of_each_view(model):
     found = measure(model, VIEWS, np.random.default_rng(0))
     each = [gradients(model, view) for view in VIEWS]
     assert found.views == VIEWS
@@ -69,7 +69,7 @@ def test_gramians_hold_the_dot_products_of_each_view_s_own_gradient(model):
 
 
 @pytest.mark.parametrize("rule", [AdamRule(), AdamRule((0.9, 0.98)), AdamRule.for_views(4, 0.7)])
-def test_adam_s_metric_divides_by_the_root_that_the_next_step_would_have(model, rule):
+def test_adams_metric_divides_by_the_root_that_the_next_step_would_use(model, rule):
     model, beta2 = replace(model, rule=rule), rule.betas[1]
     found = measure(model, VIEWS, np.random.default_rng(0))
     each = [gradients(model, view) for view in VIEWS]
@@ -81,12 +81,12 @@ def test_adam_s_metric_divides_by_the_root_that_the_next_step_would_have(model, 
         np.testing.assert_allclose(found.adam[place], rows @ rows.T, rtol=1e-3, atol=1e-8)
 
 
-def test_before_the_first_step_there_is_no_adam_metric(model):
+def test_the_adam_metric_is_missing_before_the_first_step(model):
     model.adam.exp_avg_sq.clear()
     assert measure(model, VIEWS, np.random.default_rng(0)).adam is None
 
 
-def test_the_model_is_left_as_it_is(model):
+def test_a_probe_does_not_change_the_model(model):
     before = {name: tensor.detach().clone() for name, tensor in model.parameters.items()}
     moments = {name: tensor.clone() for name, tensor in model.adam.exp_avg_sq.items()}
     measure(model, VIEWS, np.random.default_rng(0))
@@ -107,7 +107,7 @@ def made_up(monkeypatch, model, change=lambda view, gradients: gradients):
     monkeypatch.setattr(probe, "view_gradients", gradient)
 
 
-def test_a_random_subset_of_primitives_is_right_on_average(model, monkeypatch):
+def test_a_random_subset_of_primitives_is_unbiased(model, monkeypatch):
     made_up(monkeypatch, model)
     whole = measure(model, VIEWS, np.random.default_rng(0))
     row = sum(model.parameters[n][:1].nbytes for n in model.parameters)
@@ -123,7 +123,7 @@ def test_a_random_subset_of_primitives_is_right_on_average(model, monkeypatch):
         np.testing.assert_allclose(mean / scale, full / scale, atol=0.15)
 
 
-def test_a_view_whose_gradient_is_not_finite_is_left_out(model, monkeypatch):
+def test_a_view_with_a_non_finite_gradient_is_left_out(model, monkeypatch):
     def spoil(view, made):
         if view == 2:
             made["scales"][0, 0] = float("nan")
@@ -139,7 +139,7 @@ def test_a_view_whose_gradient_is_not_finite_is_left_out(model, monkeypatch):
     assert (full[:, 0, 0] > 0.0).all()
 
 
-def test_a_view_that_touches_nothing_has_zero_dot_products(model, monkeypatch):
+def test_a_view_without_a_gradient_has_zero_dot_products(model, monkeypatch):
     made_up(monkeypatch, model, lambda view, made: {} if view == 5 else made)
     found = measure(model, VIEWS, np.random.default_rng(0))
     assert (found.plain[:, 2] == 0.0).all()
@@ -151,7 +151,7 @@ def plan(per_group=12, seed=0, grouping="radial"):
     return plan_probe(sample_scene(), grouping, labels, per_group, seed)
 
 
-def test_a_plan_draws_as_many_near_as_far_views():
+def test_a_probe_plan_samples_equally_many_near_and_far_views():
     found = plan(3)
     assert len(found.views) == 6
     assert found.near(found.views).sum() == 3
@@ -159,7 +159,7 @@ def test_a_plan_draws_as_many_near_as_far_views():
     assert len({plan(3, seed).views for seed in range(8)}) > 1
 
 
-def test_a_plan_tells_near_from_far_whatever_the_labels_are_called():
+def test_a_probe_plan_distinguishes_near_from_far_for_any_label_names():
     scene = sample_scene()
     labels = tuple("b" if view.regime == "near" else "a" for view in scene.train_views)
     found = plan_probe(scene, "lists", labels, 12, 0)
@@ -169,7 +169,7 @@ def test_a_plan_tells_near_from_far_whatever_the_labels_are_called():
 @pytest.mark.parametrize(
     "labels", [("all",) * 9, ("near",) * 8 + ("far",)], ids=["one group", "one view"]
 )
-def test_a_plan_needs_two_groups_of_two(labels):
+def test_a_probe_plan_needs_two_groups_of_two_views(labels):
     with pytest.raises(UserError, match="two"):
         plan_probe(sample_scene(), "lists", labels, 12, 0)
 
@@ -186,7 +186,7 @@ def test_the_table_has_a_row_per_metric_and_block(model):
     assert whole["sigma_w2"] == pytest.approx(parts)
 
 
-def test_the_table_is_the_same_each_time(model):
+def test_the_table_is_the_same_on_every_call(model):
     def rows():
         measurement = measure(model, plan().views, np.random.default_rng(0))
         return table(measurement, plan(), distances_of(model.scene), 0)
@@ -206,7 +206,7 @@ def test_one_probe_is_evaluated_for_every_grouping(model):
     assert first["rho"] == own["rho"]
 
 
-def test_cameras_are_described_with_their_number():
+def test_camera_quantities_are_reported_with_their_number():
     rows = camera_rows(sample_scene())
     assert [str(row["quantity"]).split(" ")[0] for row in rows] == ["height", "log", "log"]
     assert {row["views"] for row in rows} == {len(sample_scene().train)}
@@ -219,17 +219,17 @@ def test_cameras_are_described_with_their_number():
     ("every", "total", "expected"),
     [(5, 20, [5, 10, 15, 20]), (5, 22, [5, 10, 15, 22]), (7, 20, [7, 20]), (30, 20, [20])],
 )
-def test_probes_are_evenly_spaced_and_the_last_is_at_the_end(every, total, expected):
+def test_probes_are_evenly_spaced_and_the_last_one_is_at_the_end(every, total, expected):
     watch = Watch(plan(), every, total, 0)
     assert [step for step in range(1, total + 1) if watch.due(step)] == expected
 
 
-def test_a_watch_that_saw_nothing_has_no_report():
+def test_a_watch_without_a_probe_cannot_write_a_report():
     with pytest.raises(UserError, match="never probed"):
         Watch(plan(), 5, 20, 0).report(sample_scene(), "nothing")
 
 
-def test_tables_survive_the_file(tmp_path):
+def test_probe_tables_are_read_back_as_written(tmp_path):
     rows = [{"step": 1, "b": 0.25, "c": "x"}, {"step": 2, "b": float("inf"), "d": "y"}]
     write_table(tmp_path / "t.csv", rows)
     found = read_probes(tmp_path / "t.csv")
@@ -239,13 +239,13 @@ def test_tables_survive_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("line", ["1,2,3", "1", "x,2", ",2", '1,"2', "\0"])
-def test_a_damaged_table_of_probes_is_one_error(line, tmp_path):
+def test_a_damaged_table_of_probes_gives_one_error(line, tmp_path):
     (tmp_path / "t.csv").write_text(f"step,a\n{line}\n")
     with pytest.raises(UserError, match=r"table of probes cannot be read(?s:.*)to do"):
         read_probes(tmp_path / "t.csv")
 
 
-def test_a_report_is_drawn_whatever_is_missing(model, monkeypatch, tmp_path):
+def test_a_report_is_drawn_even_if_values_are_missing(model, monkeypatch, tmp_path):
     made_up(monkeypatch, model, lambda view, made: {"means": made["means"]} if view else {})
     watch = Watch(plan(2), 1, sample_phase().step, 0)
     watch.crossgrad_model_ready(model)

@@ -34,7 +34,7 @@ def plain_variance(rows):
 
 @pytest.mark.parametrize("drawn", [(2, 2), (2, 4), (4, 3)])
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (5 / 11, 6 / 11), (0.8, 0.2)])
-def test_probes_without_replacement_are_right_on_average(drawn, shares):
+def test_estimates_from_probes_without_replacement_are_unbiased(drawn, shares):
     near, far = population()
     found = [
         split(near[list(i)], far[list(j)], cameras=(len(near), len(far)), shares=shares)
@@ -49,7 +49,7 @@ def test_probes_without_replacement_are_right_on_average(drawn, shares):
     assert np.mean([each.between for each in found]) == pytest.approx(p * q * gap)
 
 
-def test_independent_probes_are_right_on_average():
+def test_estimates_from_independent_probes_are_unbiased():
     # Every equally likely outcome of independent draws from a law on three points, two per group.
     points = np.array([[0.0, 1.0], [3.0, 1.0], [0.0, -5.0]])
     shift = np.array([1.0, 2.0])
@@ -61,7 +61,7 @@ def test_independent_probes_are_right_on_average():
     assert np.mean([each.between for each in found]) == pytest.approx((shift**2).sum() / 4)
 
 
-def test_a_probe_of_all_cameras_gives_the_paper_s_figures():
+def test_a_probe_of_all_cameras_gives_the_numbers_of_the_paper():
     near, far = population()
     found = split(near, far, cameras=(len(near), len(far)))
     assert found.within == pytest.approx((plain_variance(near) + plain_variance(far)) / 2)
@@ -70,7 +70,7 @@ def test_a_probe_of_all_cameras_gives_the_paper_s_figures():
     assert found.ratio == pytest.approx(found.between / found.within)
 
 
-def test_the_paper_s_proposition_holds_for_these_figures():
+def test_the_proposition_of_the_paper_holds_for_the_estimates():
     near, far = population()[0], population()[1][:NEAR_CAMERAS]
     found = split(near, far, cameras=(NEAR_CAMERAS, NEAR_CAMERAS))
     both = np.concatenate([near, far])
@@ -91,21 +91,21 @@ def test_the_order_of_the_views_does_not_matter():
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_figures_scale_with_the_squared_gradients(scale):
+def test_estimates_scale_with_the_squared_gradients(scale):
     near, far = population()
     found, scaled = split(near, far), split(scale * near, scale * far)
     assert scaled.within == pytest.approx(scale**2 * found.within)
     assert scaled.between == pytest.approx(scale**2 * found.between)
 
 
-def test_a_common_part_of_all_gradients_does_not_matter():
+def test_a_constant_added_to_all_gradients_does_not_change_the_estimates():
     near, far = population()
     moved = split(near + 1e3, far + 1e3)
     assert moved.within == pytest.approx(split(near, far).within)
     assert moved.between == pytest.approx(split(near, far).between)
 
 
-def test_figures_of_several_probes_add_up():
+def test_estimates_of_several_probes_are_added():
     near, far = population()
     other = population(seed=5)
     rows, others = np.concatenate([near, far]), np.concatenate(other)
@@ -114,7 +114,7 @@ def test_figures_of_several_probes_add_up():
     assert total.between == pytest.approx(split(near, far).between + split(*other).between)
 
 
-def test_between_is_not_clipped():
+def test_the_estimate_of_sigma_b_is_not_clipped_at_zero():
     rng = np.random.default_rng(0)
     found = [split(*rng.normal(size=(2, 3, 8))).between for _ in range(200)]
     assert min(found) < 0 < max(found)
@@ -133,7 +133,7 @@ def test_a_group_with_one_view_is_a_user_error(sizes):
 
 
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (0.7, 0.3)])
-def test_the_noise_scale_is_variance_over_squared_mean(shares):
+def test_the_noise_scale_is_variance_divided_by_the_squared_mean(shares):
     near, far = population()
     rows = np.concatenate([near, far])
     census = groups(len(near), len(far), cameras=(len(near), len(far)), shares=shares)
@@ -145,7 +145,7 @@ def test_the_noise_scale_is_variance_over_squared_mean(shares):
     assert noise_scale(rows @ rows.T, census) == pytest.approx(expected)
 
 
-def test_the_noise_scale_s_signal_is_unbiased():
+def test_the_signal_estimate_of_the_noise_scale_is_unbiased():
     # Far from zero, so that no outcome's signal is negative and can be read off the noise scale.
     near, far = (rows + 50.0 for rows in population())
     signals = []
@@ -158,7 +158,7 @@ def test_the_noise_scale_s_signal_is_unbiased():
     assert np.mean(signals) == pytest.approx(mean @ mean)
 
 
-def test_no_signal_is_an_infinite_noise_scale_and_no_variance_is_none():
+def test_a_zero_mean_gives_an_infinite_noise_scale_and_zero_variance_gives_nan():
     opposed = np.array([[1.0], [-1.0], [1.0], [-1.0]])
     assert noise_scale(opposed @ opposed.T, groups(2, 2)) == float("inf")
     equal = np.ones((4, 1))

@@ -91,14 +91,14 @@ def assert_same(a: SplatCloud, b: SplatCloud) -> None:
             assert left == right, field.name
 
 
-def test_round_trip_is_exact(tmp_path: Path):
+def test_writing_and_reading_a_ply_keeps_every_value(tmp_path: Path):
     cloud = replace(make_cloud(), render_mode="mip")
     assert write_ply(tmp_path / "a.ply", cloud) == ()
     assert_same(read_ply(tmp_path / "a.ply"), cloud)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_header_has_the_inria_order(tmp_path: Path):
+def test_the_header_has_the_property_order_of_inria(tmp_path: Path):
     write_ply(tmp_path / "a.ply", make_cloud(3), comments=["step 700\nelement vertex 9", "größe"])
     header, columns = minimal_read(tmp_path / "a.ply")
     assert header[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -116,7 +116,7 @@ def test_header_has_the_inria_order(tmp_path: Path):
     assert not any(columns[name].any() for name in ("nx", "ny", "nz"))
 
 
-def test_f_rest_is_channel_major(tmp_path: Path):
+def test_f_rest_is_stored_channel_by_channel(tmp_path: Path):
     cloud = make_cloud(1)
     rest = np.zeros((1, 15, 3), dtype=np.float32)
     rest[0, :, 0], rest[0, :, 1], rest[0, :, 2] = range(100, 115), range(200, 215), range(300, 315)
@@ -164,7 +164,7 @@ def test_utm_positions_keep_their_precision(tmp_path: Path):
         ((12.3456789, 0.0, -0.00004), 5000.0, (12.3457, 0.0, 0.0)),
     ],
 )
-def test_offset_only_where_float32_is_too_coarse(
+def test_an_offset_is_written_only_if_float32_is_too_coarse(
     offset: tuple[float, ...], scale: float, expected: tuple[float, ...]
 ):
     found = position_offset(Similarity(np.array(offset), scale))
@@ -173,7 +173,7 @@ def test_offset_only_where_float32_is_too_coarse(
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("bands", [0, 3, 8, 15])
-def test_reads_any_order_type_and_degree(tmp_path: Path, form: str, bands: int):
+def test_properties_may_have_any_order_type_and_sh_degree(tmp_path: Path, form: str, bands: int):
     cloud = make_cloud(20, rest=bands)
     columns = columns_of(cloud, bands)
     columns["junk"] = np.arange(20).astype(np.uint8)
@@ -183,7 +183,7 @@ def test_reads_any_order_type_and_degree(tmp_path: Path, form: str, bands: int):
     assert_same(read_ply(path), expected)
 
 
-def test_reads_line_ends_of_other_systems_in_the_header(tmp_path: Path):
+def test_a_header_with_line_ends_of_other_systems_is_read(tmp_path: Path):
     cloud = make_cloud(2)
     write_ply(tmp_path / "a.ply", cloud)
     raw = (tmp_path / "a.ply").read_bytes()
@@ -198,7 +198,7 @@ def test_a_file_without_gaussians_is_refused(tmp_path: Path):
         read_ply(tmp_path / "a.ply")
 
 
-def test_gaussians_that_are_not_finite_are_left_out(tmp_path: Path):
+def test_non_finite_gaussians_are_left_out(tmp_path: Path):
     cloud = make_cloud(5)
     cloud.means[0, 1] = np.nan
     cloud.sh_rest[3, 2, 2] = np.inf
@@ -208,7 +208,9 @@ def test_gaussians_that_are_not_finite_are_left_out(tmp_path: Path):
     assert_same(read_ply(tmp_path / "a.ply"), cloud.selected(np.array([0, 1, 1, 0, 1], dtype=bool)))
 
 
-def test_more_than_one_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_file_larger_than_one_chunk_is_written_completely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("crossgrad_plugins.exporters.ply_file._CHUNK", 7)
     cloud = make_cloud(50)
     write_ply(tmp_path / "a.ply", cloud)
@@ -240,7 +242,7 @@ def break_header(raw: bytes) -> bytes:
         (lambda raw: raw[:-16] + bytes(16), "rotation of length zero"),
     ],
 )
-def test_bad_files_are_explained(tmp_path: Path, damage, message: str):
+def test_damaged_files_are_refused_with_the_reason(tmp_path: Path, damage, message: str):
     write_ply(tmp_path / "a.ply", make_cloud(4))
     (tmp_path / "b.ply").write_bytes(damage((tmp_path / "a.ply").read_bytes()))
     with pytest.raises(UserError, match=message) as told:
@@ -248,12 +250,12 @@ def test_bad_files_are_explained(tmp_path: Path, damage, message: str):
     assert "b.ply" in str(told.value)
 
 
-def test_missing_file_is_explained(tmp_path: Path):
+def test_a_missing_file_is_refused_with_the_reason(tmp_path: Path):
     with pytest.raises(UserError, match="no such PLY file"):
         read_ply(tmp_path / "none.ply")
 
 
-def test_a_pipe_is_not_waited_for_and_called_one(tmp_path: Path):
+def test_a_pipe_is_refused_without_waiting(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.ply")
     with pytest.raises(UserError) as told:
         read_ply(tmp_path / "pipe.ply")
@@ -268,14 +270,14 @@ def test_a_pipe_is_not_waited_for_and_called_one(tmp_path: Path):
         (lambda text: text.rstrip()[:-1] + "z\n", "not"),
     ],
 )
-def test_bad_ascii_files_are_explained(tmp_path: Path, change, message: str):
+def test_damaged_ascii_files_are_refused_with_the_reason(tmp_path: Path, change, message: str):
     path = write_text_ply(tmp_path / "a.ply", columns_of(make_cloud(3)))
     path.write_text(change(path.read_text()))
     with pytest.raises(UserError, match=message):
         read_ply(path)
 
 
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "a.ply"
     write_ply(path, make_cloud(3))
     before = path.read_bytes()
@@ -305,7 +307,7 @@ def gaussians(**changes) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gaussians_survive_as_a_cloud(degree: int):
+def test_gaussians_converted_to_a_cloud_and_back_are_unchanged(degree: int):
     before = gaussians(sh_degree=degree, response="antialiased")
     after = SplatCloud.from_gaussians(before).to_gaussians()
     assert after.sh_degree == degree

@@ -17,7 +17,7 @@ def taken(lights, **given):
 
 
 @pytest.mark.parametrize(("lights", "name"), [(DIFFERENT, "gain"), (EQUAL, "none")])
-def test_a_run_decides_by_the_photos_and_says_why(lights, name):
+def test_exposure_auto_decides_by_the_photos_and_reports_the_reason(lights, name):
     found, notes = taken(lights)
     assert found == name
     assert any(note.startswith(f"exposure auto: {name}") for note in notes)
@@ -30,5 +30,5 @@ def test_no_gain_is_chosen_for_a_named_exposure_or_the_published_recipe(given):
     assert taken(DIFFERENT, **given)[0] == "none"
 
 
-def test_published_rules_have_the_exposure_that_is_named():
+def test_exposure_auto_can_be_requested_with_the_published_recipe():
     assert taken(DIFFERENT, recipe={"name": "published"}, exposure={"name": "auto"})[0] == "gain"

@@ -80,30 +80,30 @@ def check_map(image, matrix):
 
 @settings(max_examples=60, deadline=None)
 @given(SIZES, SEEDS, STOPS)
-def test_one_gain_is_that_of_the_curve_of_srgb(size, seed, stops):
+def test_a_gain_agrees_with_the_srgb_curve(size, seed, stops):
     check_gain(image(size, seed), torch.tensor(stops))
 
 
 @settings(max_examples=60, deadline=None)
 @given(SIZES, SEEDS, st.tuples(STOPS, STOPS, STOPS))
-def test_each_channel_has_a_gain_of_its_own(size, seed, stops):
+def test_each_channel_has_a_separate_gain(size, seed, stops):
     check_gain(image(size, seed), torch.tensor(stops))
 
 
 @settings(max_examples=40, deadline=None)
 @given(SIZES, SEEDS)
-def test_an_affine_map_is_a_product(size, seed):
+def test_an_affine_map_is_a_matrix_product(size, seed):
     matrix = torch.randn(3, 4, generator=torch.Generator().manual_seed(seed))
     check_map(image(size, seed), matrix)
 
 
-def test_long_sums_stay_exact():
+def test_long_sums_are_exact():
     check_gain(image((160, 240), 3, 0.0, 1.0), torch.tensor([0.5, -0.5, 2.0]))
     check_map(image((160, 240), 3, 0.0, 1.0), torch.eye(3, 4))
 
 
 @pytest.mark.parametrize("stops", [-10.0, -1.0, 0.0, 1.0, 10.0])
-def test_the_reference_is_differentiable_wherever_it_is_smooth(stops):
+def test_the_reference_is_differentiable_except_at_its_corners(stops):
     values = image((4, 5), 1).double()
     light = srgb.decoded(values)
     # Away from the two corners of the curve.
@@ -115,7 +115,7 @@ def test_the_reference_is_differentiable_wherever_it_is_smooth(stops):
     assert torch.autograd.gradcheck(srgb.with_gain, inputs, eps=1e-7, rtol=1e-3)
 
 
-def test_the_curve_and_its_inverse():
+def test_decoding_inverts_the_srgb_curve_and_has_known_values():
     values = torch.linspace(-1, 3, 401, dtype=torch.float64)
     assert torch.allclose(srgb.encoded(srgb.decoded(values)), values, atol=1e-6)
     # IEC 61966-2-1: 18 % grey, and the ends.
@@ -123,14 +123,14 @@ def test_the_curve_and_its_inverse():
     assert torch.allclose(grey, torch.tensor([0.0, 0.46136, 1.0], dtype=torch.float64), atol=1e-5)
 
 
-def test_a_nan_stays_visible():
+def test_nan_values_are_kept():
     values = image((3, 9), 2)
     values[1, 4, 2] = float("nan")
     taken = with_gain(values, torch.tensor(1.0))
     assert torch.equal(taken.isnan(), values.isnan())
 
 
-def test_a_view_that_is_not_contiguous_is_taken_as_it_is():
+def test_an_image_that_is_not_contiguous_gives_the_same_result():
     values = image((6, 8), 4)
     turned = values.transpose(0, 1)
     expected = with_gain(turned.contiguous(), torch.tensor(0.7))

@@ -45,7 +45,7 @@ def _told(view, others, values, middle, centers):
 
 @given(SEEDS, st.integers(2, 12), st.integers(1, 3))
 @settings(max_examples=60, deadline=None)
-def test_values_are_those_of_the_definition(seed, count, width):
+def test_predicted_values_agree_with_the_definition(seed, count, width):
     rng = np.random.default_rng(seed)
     views, values = views_of(rng, count), rng.normal(size=(count, width))
     asked = views_of(rng, 1)[0]
@@ -56,7 +56,7 @@ def test_values_are_those_of_the_definition(seed, count, width):
 
 @given(SEEDS, st.integers(2, 12))
 @settings(max_examples=60, deadline=None)
-def test_errors_are_those_of_photos_that_were_left_out(seed, count):
+def test_leave_one_out_errors_agree_with_a_loop(seed, count):
     rng = np.random.default_rng(seed)
     views, values = views_of(rng, count), rng.normal(size=(count, 1))
     centers = [view.camera.center.numpy() for view in views]
@@ -72,7 +72,7 @@ def test_errors_are_those_of_photos_that_were_left_out(seed, count):
     assert Neighbours(views).errors(values) == pytest.approx(wanted)
 
 
-def test_neighbours_predict_exposure_only_if_they_predict_better_than_regimes():
+def test_neighbours_predict_exposure_only_if_they_predict_better_than_the_mean():
     rng = np.random.default_rng(0)
     # Of two kinds of photos that stand apart each tells of its own kind, whatever the regimes are.
     views = [
@@ -108,7 +108,7 @@ def test_photos_without_evidence_start_at_the_exposure_of_their_neighbours(monke
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
-def test_photos_of_one_place_and_one_direction_are_reported_by_finite_numbers(count):
+def test_photos_with_equal_poses_give_finite_predictions(count):
     views = [posed_view((0, 0, 0), f"{n}.png") for n in range(count)]
     scene = posed_scene([*views, posed_view((0, 0, 0), "held out.png")], test=(count,))
     stops = torch.linspace(-1, 1, count)

@@ -49,7 +49,7 @@ def stops_between(model, values):
 @pytest.mark.parametrize(
     "stops", [(-5, 5), (-3, 3), (-2, 2), (-1.3, 1.72), (0, 0, 10), (-10, 10)], ids=str
 )
-def test_a_start_differs_by_the_stops_that_were_found(model, stops, monkeypatch):
+def test_initial_values_differ_by_the_measured_stops(model, stops, monkeypatch):
     start = start_of(model, stops, monkeypatch)
     assert torch.allclose(start.double().mean(dim=0), neutral(model), atol=ROUNDING)
     wanted = torch.tensor(stops).double() - stops[0]
@@ -69,7 +69,7 @@ def test_a_neutral_mean_keeps_the_differences_between_photos(model, stops, level
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**16))
-def test_affine_maps_keep_what_one_is_after_another(seed):
+def test_projection_of_affine_maps_keeps_their_relative_maps(seed):
     """Of general maps, too: A_i composed with the inverse of A_j is what it was."""
     noise = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
     values = Affine().neutral() + 0.1 * noise
@@ -88,7 +88,7 @@ def squares(maps):
 
 
 @pytest.mark.parametrize("left", [0.0, 1e-12])
-def test_maps_that_lose_all_colours_still_have_a_finite_neutral_mean(left):
+def test_affine_maps_that_remove_all_colour_have_a_finite_neutral_mean(left):
     values = torch.zeros(3, 3, 4).double()
     values[:, range(3), range(3)] = torch.tensor([[2.0, -2.0, left]]).double().T
     found = Affine().project({"matrix": values})["matrix"]
@@ -96,7 +96,7 @@ def test_maps_that_lose_all_colours_still_have_a_finite_neutral_mean(left):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=NAMES)
-def test_values_move_from_one_level_to_another(model):
+def test_values_can_be_shifted_from_one_level_to_another(model):
     values, start, end = (model.of_stops(torch.tensor(s).double())
                           for s in ([-4.0, 0.0, 4.0], -4.0, 1.0))  # fmt: skip
     found = model.shift(model.parameter, values, start, end)
@@ -106,7 +106,7 @@ def test_values_move_from_one_level_to_another(model):
 
 @pytest.mark.parametrize("model", MODELS, ids=NAMES)
 @pytest.mark.parametrize("stops", [0.0, 3.5, 10.0])
-def test_photos_that_a_file_puts_far_from_the_mean_are_named(model, stops):
+def test_photos_that_a_file_places_far_from_the_mean_are_named(model, stops):
     levels = torch.tensor([stops, *[0.0] * 30, -stops]).double()
     known = model.project({model.parameter: model.of_stops(levels)})
     messages = model.messages(scene_of(len(levels)), known)
@@ -117,7 +117,7 @@ def test_photos_that_a_file_puts_far_from_the_mean_are_named(model, stops):
         assert "2 photos are more than 4 stops from the mean (0.png, 31.png)" in messages[0]
 
 
-def test_one_channel_far_off_is_enough_and_black_is_far():
+def test_a_photo_with_one_extreme_channel_or_a_black_map_is_named():
     for model, value in ((ChannelGain(), [0.0, -7, 7]), (Affine(), torch.zeros(3, 4).tolist())):
         known = torch.stack([model.neutral()] * 3)
         known[1] = torch.tensor(value)

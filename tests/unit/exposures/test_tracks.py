@@ -86,11 +86,11 @@ def test_groups_of_different_exposure_are_found_with_few_shared_points(joining, 
     [{}, {"noise": 0.5, "outliers": 0.15}, {"lobes": 0.4}],
     ids=["noise", "outliers", "dependence on the view"],
 )
-def test_photos_of_one_exposure_do_not_differ_however_few_points_join_them(joining, errors, seed):
+def test_photos_of_equal_exposure_do_not_differ_even_if_few_points_join_them(joining, errors, seed):
     assert not judged(two_groups(joining, **errors, seed=seed)).differ
 
 
-def test_a_single_photo_that_is_off_decides_nothing():
+def test_a_single_outlier_photo_does_not_decide():
     seen = two_groups(joining=1_000, outliers=0.0)
     off = seen.stops - 1.3 * (seen.photos == NEAR)
     gains = judged(replace(seen, stops=off))
@@ -99,7 +99,7 @@ def test_a_single_photo_that_is_off_decides_nothing():
     assert judged(replace(seen, stops=seen.stops - 1.3 * (seen.photos % 5 == 0))).differ
 
 
-def test_the_error_of_gains_grows_where_few_points_join_photos():
+def test_the_error_of_gains_grows_if_few_points_join_photos():
     many, few = (judged(two_groups(joining, seed=1)).error for joining in (1_000, 10))
     assert few > 2 * many
     photos, points = np.tile([0, 1], 50), np.repeat(np.arange(50), 2)
@@ -110,14 +110,14 @@ def test_the_error_of_gains_grows_where_few_points_join_photos():
     )
 
 
-def test_planted_gains_are_found_among_outliers():
+def test_known_gains_are_recovered_despite_outliers():
     planted = RNG.normal(0, 1.5, 12)
     fit = fitted(observed(planted, 60, 40), 12)
     assert np.abs(fit.gains - (planted - planted.mean())).max() < 0.08
     assert fit.reduction > 0.3
 
 
-def test_a_long_chain_of_photos_is_solved_to_its_ends():
+def test_a_long_chain_of_photos_is_solved_up_to_its_ends():
     # Each photo shares points with its neighbours only: what alternating fits do not cross.
     count = 200
     planted = np.linspace(-3, 3, count)
@@ -128,7 +128,7 @@ def test_a_long_chain_of_photos_is_solved_to_its_ends():
 
 
 @pytest.mark.parametrize(("count", "shared"), [(400, 1), (800, 5)])
-def test_a_strip_of_hundreds_of_photos_is_solved_to_rounding(count, shared):
+def test_a_strip_of_hundreds_of_photos_is_solved_up_to_rounding(count, shared):
     planted = np.random.default_rng(1).normal(0, 1, count)
     photos = np.repeat(np.arange(count), 2 * shared)
     points = shared * photos + np.tile(np.arange(2 * shared), count)
@@ -138,7 +138,7 @@ def test_a_strip_of_hundreds_of_photos_is_solved_to_rounding(count, shared):
 
 
 @pytest.mark.parametrize("count", [20, 150])
-def test_photos_that_all_share_points_are_solved_by_iterations(count):
+def test_photos_that_all_share_points_are_solved_exactly(count):
     planted = np.random.default_rng(1).normal(0, 1, count)
     seen = observed(planted, 100, 60)
     exact = planted[seen.photos] + np.random.default_rng(2).normal(-2, 1, 100)[seen.points]
@@ -146,7 +146,7 @@ def test_photos_that_all_share_points_are_solved_by_iterations(count):
     assert np.abs(fit.gains - (planted - planted.mean())).max() < 1e-4
 
 
-def test_parts_that_share_no_point_have_a_mean_of_zero_each():
+def test_groups_without_shared_points_have_a_mean_of_zero_each():
     one = observed(np.array([1.0, 3.0]), 20, 20, noise=0.0)
     other = observed(np.array([-5.0, -5.5]), 20, 20, noise=0.0)
     joined = Observations(
@@ -161,14 +161,14 @@ def test_parts_that_share_no_point_have_a_mean_of_zero_each():
     assert gains[3] - gains[2] == pytest.approx(-0.5, abs=0.05)
 
 
-def test_without_observations_all_gains_are_zero():
+def test_gains_without_observations_are_zero():
     none = np.zeros(0, dtype=np.int64)
     fit = fitted(Observations(none, none, np.zeros(0), none), 3)
     assert fit.gains.tolist() == [0.0] * 3
     assert fit.reduction == 0.0
 
 
-def test_light_is_taken_where_the_camera_sees_the_point():
+def test_brightness_is_sampled_at_the_projection_of_a_point():
     camera = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(4, dtype=torch.float64))
     points = np.array([[0.0, 0, 1], [0.2, -0.1, 1], [0, 0, -1], [9, 0, 1], [-0.39, 0, 1]])
     image = torch.zeros(6, 8, 3, dtype=torch.uint8)
@@ -183,7 +183,7 @@ def test_light_is_taken_where_the_camera_sees_the_point():
     assert as_floats.brightness.tolist() == pytest.approx(found.brightness.tolist())
 
 
-def test_photos_of_one_wall_differ_by_their_light():
+def test_photos_of_one_wall_differ_by_their_brightness():
     scene = grey_scene([0.1, 0.2, 0.4, 0.8])
     gains = track_gains(scene, scene.train_views)
     assert gains.gains == pytest.approx([-1.5, -0.5, 0.5, 1.5], abs=0.03)
@@ -192,7 +192,7 @@ def test_photos_of_one_wall_differ_by_their_light():
     assert "4 photos at 240 observations" in gains.evidence
 
 
-def test_black_white_and_unconnected_photos_tell_nothing():
+def test_black_white_and_unconnected_photos_have_no_gain():
     seen = [range(60)] * 4 + [range(3)]
     scene = grey_scene([0.2, 0.4, 0.0, 1.0, 0.2], seen=seen)
     gains = track_gains(scene, scene.train_views)
@@ -200,7 +200,7 @@ def test_black_white_and_unconnected_photos_tell_nothing():
     assert gains.gains[2:].tolist() == [0.0] * 3
 
 
-def test_the_rule_asks_for_both_a_spread_and_a_reduction():
+def test_photos_differ_only_if_the_rule_finds_spread_and_reduction():
     alike = grey_scene([0.2, 0.21, 0.19, 0.2])
     assert not track_gains(alike, alike.train_views).differ
     gains = track_gains(grey_scene([0.1, 0.4]), grey_scene([0.1, 0.4]).train_views)
@@ -209,7 +209,7 @@ def test_the_rule_asks_for_both_a_spread_and_a_reduction():
     assert not weak.differ
 
 
-def test_for_many_photos_a_subset_decides_the_gains():
+def test_a_subset_of_many_photos_decides_the_gains():
     count = 5 * MOST_DECIDING // 2
     lights = np.tile([0.1, 0.1, 0.4, 0.4], count)[:count]
     # Each photo shows points of its own and those of its neighbours.
@@ -223,7 +223,7 @@ def test_for_many_photos_a_subset_decides_the_gains():
     assert deciding_gains(few) is training_gains(few)
 
 
-def test_of_many_observations_a_part_is_looked_at(monkeypatch):
+def test_a_part_of_many_observations_is_used(monkeypatch):
     scene = grey_scene([0.1, 0.2, 0.4])
     module = "crossgrad_plugins.exposures.tracks.observations._MOST"
     monkeypatch.setattr(module, 60)
@@ -233,7 +233,7 @@ def test_of_many_observations_a_part_is_looked_at(monkeypatch):
     assert gains.gains == pytest.approx([-1.0, 0.0, 1.0], abs=0.03)
 
 
-def test_a_scene_is_looked_at_once_and_not_kept():
+def test_gains_of_a_scene_are_computed_once_and_released_with_the_scene():
     scene = grey_scene([0.1, 0.4])
     assert training_gains(scene) is training_gains(scene)
     import weakref
@@ -243,7 +243,7 @@ def test_a_scene_is_looked_at_once_and_not_kept():
     assert gone() is None
 
 
-def test_auto_takes_a_gain_where_the_rule_says_so_and_says_why():
+def test_auto_selects_a_gain_if_the_rule_requires_it_and_reports_the_reason():
     fitted_on = Auto().fitted_to(grey_scene([0.1, 0.2, 0.4]))
     assert fitted_on.name == "gain"
     off = Auto().fitted_to(grey_scene([0.2, 0.2, 0.2]))
@@ -274,7 +274,7 @@ def test_photos_without_tracks_are_not_decoded():
     assert not training_gains(scene).known.any()
 
 
-def test_a_damaged_photo_is_left_to_whoever_needs_it():
+def test_a_photo_that_cannot_be_decoded_gives_no_message():
     scene = grey_scene([0.2, 0.4])
     scene = replace(scene, views=tuple(replace(view, photo=Unseen()) for view in scene.views))
     assert NoExposure().messages(scene, {}) == ()

@@ -23,7 +23,7 @@ def numbers(place):
 
 @settings(max_examples=50)
 @given(PLACES)
-def test_geocentric_coordinates_are_those_of_proj_and_lead_back(place):
+def test_geocentric_coordinates_agree_with_proj_and_can_be_inverted(place):
     here = geocentric(numbers(place))[0]
     expected = TO_EARTH.transform(place.longitude, place.latitude, place.altitude)
     np.testing.assert_allclose(here, expected, atol=1e-7)
@@ -34,7 +34,7 @@ def test_geocentric_coordinates_are_those_of_proj_and_lead_back(place):
 
 @settings(max_examples=50)
 @given(PLACES, st.tuples(*[st.floats(-5000.0, 5000.0)] * 3))
-def test_east_north_up_is_that_of_proj(origin, steps):
+def test_east_north_up_coordinates_agree_with_proj(origin, steps):
     pipeline = Transformer.from_pipeline(
         f"+proj=topocentric +ellps=WGS84 +lat_0={origin.latitude!r} +lon_0={origin.longitude!r} "
         f"+h_0={origin.altitude!r}"
@@ -45,5 +45,5 @@ def test_east_north_up_is_that_of_proj(origin, steps):
 
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 0.0), (5e5, 5e6, 100.0), (np.nan, 0.0, 6.4e6)])
-def test_a_point_far_from_the_surface_has_no_geographic_place(point):
+def test_a_point_far_from_the_surface_has_no_geographic_coordinates(point):
     assert place_at(np.array(point)) is None

@@ -42,7 +42,7 @@ def test_an_exact_similarity_is_found(seed, count, flat):
 
 @settings(max_examples=12)
 @given(SEEDS)
-def test_with_errors_it_is_the_least_squares_one(seed):
+def test_the_fit_with_errors_is_the_least_squares_solution(seed):
     frame, points, measured, _ = case(seed, 7, noise=0.05)
 
     def residuals(numbers):
@@ -74,7 +74,7 @@ def test_outliers_are_left_out_of_the_fit(seed, count):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_up_to_nearly_half_may_be_wrong_even_in_the_same_way(seed):
+def test_nearly_half_of_the_points_may_be_wrong_even_in_the_same_direction(seed):
     """As photos of one folder whose receiver stood elsewhere."""
     _, points, measured, rng = case(seed, 60, noise=0.01)
     frame = case(seed, 60)[0]
@@ -88,7 +88,7 @@ def test_up_to_nearly_half_may_be_wrong_even_in_the_same_way(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_without_wrong_ones_none_is_left_out(seed):
+def test_no_point_is_left_out_without_outliers(seed):
     _, points, measured, _ = case(seed, 20, noise=0.1)
     assert fit_similarity(points, measured).kept.all()
 
@@ -106,14 +106,14 @@ def test_points_on_one_line_give_no_similarity(count):
     assert "in one line" in fit_similarity(points, measured)
 
 
-def test_points_at_one_place_do_not_tell():
+def test_coinciding_points_give_no_similarity():
     points, here = np.random.default_rng(0).normal(size=(9, 3)), np.full((9, 3), 5.0)
     assert "at one place" in fit_similarity(points, here)
     assert "at one place" in fit_similarity(here, points)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_fewer_than_three_do_not_tell(count):
+def test_fewer_than_three_points_give_no_similarity(count):
     assert f"there are {count} of them" in fit_similarity(np.eye(3)[:count], np.eye(3)[:count])
 
 
@@ -131,7 +131,7 @@ def test_the_estimated_rotation_error_agrees_with_repeated_fits(seed):
 
 
 @given(SEEDS)
-def test_a_matrix_of_a_similarity_is_one(seed):
+def test_the_matrix_of_a_similarity_is_recognised(seed):
     frame = case(seed, 1)[0]
     found = similarity_of(frame.matrix)
     np.testing.assert_allclose(found.matrix, frame.matrix, rtol=1e-9, atol=1e-9)
@@ -147,5 +147,5 @@ def test_a_matrix_of_a_similarity_is_one(seed):
         np.full((4, 4), np.nan),
     ],
 )
-def test_uneven_mirrored_or_projective_matrices_are_none(matrix):
+def test_uneven_mirrored_or_projective_matrices_are_not_similarities(matrix):
     assert similarity_of(matrix) is None

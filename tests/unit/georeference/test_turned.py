@@ -51,7 +51,7 @@ def turn_of(placed, gaussians):
 @pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("coordinates", ["enu", "epsg:4978"])
-def test_a_turned_scene_looks_the_same_to_a_turned_camera(degree, seed, coordinates):
+def test_a_rotated_scene_looks_the_same_to_a_rotated_camera(degree, seed, coordinates):
     camera = posed_camera()
     gaussians = random_gaussians(30, camera, seed=seed, sh_degree=degree)
     if degree:
@@ -74,7 +74,7 @@ def test_a_turned_scene_looks_the_same_to_a_turned_camera(degree, seed, coordina
 
 
 @pytest.mark.parametrize("scale", [0.01, 40.0])
-def test_sizes_and_places_are_in_metres(scale):
+def test_sizes_and_positions_are_in_metres(scale):
     gaussians = random_gaussians(20, posed_camera(), sh_degree=1)
     place = on_earth(5, scale)
     placed = place.placed(gaussians, SIMILARITY, "enu")
@@ -85,7 +85,7 @@ def test_sizes_and_places_are_in_metres(scale):
     np.testing.assert_allclose(cloud.means, place.to_enu.points(inputs), rtol=1e-12, atol=1e-9)
 
 
-def test_in_projected_coordinates_the_turn_is_that_of_the_grid():
+def test_the_rotation_in_projected_coordinates_follows_the_grid():
     """Meridian convergence and point scale, by PROJ's own derivatives."""
     gaussians = random_gaussians(5, posed_camera(), sh_degree=3)
     rotation = Rotation.random(random_state=1).as_matrix()
@@ -110,7 +110,7 @@ def in_utm():
     return OnEarth(PLACE, frame, "a test", system=system), similarity
 
 
-def test_a_scene_in_utm_is_the_same_in_utm():
+def test_a_scene_in_utm_is_exported_unchanged_to_utm():
     place, similarity = in_utm()
     gaussians = random_gaussians(20, posed_camera(), sh_degree=2)
     placed = place.placed(gaussians, similarity, "utm")
@@ -123,7 +123,7 @@ def test_a_scene_in_utm_is_the_same_in_utm():
     assert placed.similarity.scale == pytest.approx(similarity.scale, rel=1e-9)
 
 
-def test_a_scene_in_utm_is_where_proj_says_in_metres():
+def test_a_scene_in_utm_agrees_with_proj_in_metres():
     place, similarity = in_utm()
     gaussians = random_gaussians(20, posed_camera())
     placed = place.placed(gaussians, similarity, "enu")
@@ -150,7 +150,7 @@ ZONES = [(51.5, -0.1), (0.0, 0.0), (-1e-9, 6.0), (64.1, -21.9), (-33.9, 151.2), 
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), [*ZONES, (10.0, -180.0), (-75.0, 179.9)])
-def test_the_zone_of_utm_is_one_that_is_used_there(latitude, longitude):
+def test_the_utm_zone_is_one_in_use_at_its_position(latitude, longitude):
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
     found = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area, contains=True)
     codes = {f"epsg:{each.code}" for each in found}
@@ -166,7 +166,7 @@ def test_the_zone_of_utm_is_one_that_is_used_there(latitude, longitude):
         ("epsg:99999", "crs not found"),
     ],
 )
-def test_systems_that_stretch_unevenly_or_do_not_exist_are_refused(code, found):
+def test_coordinate_systems_that_stretch_unevenly_or_do_not_exist_are_refused(code, found):
     gaussians = random_gaussians(3, posed_camera())
     place = OnEarth(Place(33.4, 151.2, 0.0), on_earth(0).to_enu, "a test")
     with pytest.raises(UserError, match=found) as caught:
@@ -194,7 +194,7 @@ def test_without_pyproj_only_epsg_codes_are_refused(monkeypatch):
         on_earth(0).placed(gaussians, SIMILARITY, "epsg:32756")
 
 
-def test_gaussians_that_are_not_finite_stay_so():
+def test_non_finite_gaussians_are_still_non_finite():
     gaussians = random_gaussians(4, posed_camera())
     gaussians.means[1, 2] = float("nan")
     for coordinates in ("enu", "utm"):

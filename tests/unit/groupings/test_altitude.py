@@ -50,13 +50,13 @@ def test_the_up_axis_is_found_from_upright_cameras(axis):
 
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 @pytest.mark.parametrize("points", [True, False])
-def test_cameras_in_all_headings_fall_back_to_the_flattest_axis(flip, points):
+def test_cameras_with_all_headings_use_the_flattest_axis(flip, points):
     found, source = upward(nadir(flip, points=points))
     assert np.allclose(found, (0.0, 0.0, flip))
     assert "least variance" in source
 
 
-def test_cancelling_up_axes_are_refused_where_they_were_asked_for():
+def test_cancelling_up_axes_are_refused_if_the_user_selected_cameras():
     with pytest.raises(UserError, match="cancel"):
         upward(nadir(), "cameras")
 
@@ -73,14 +73,14 @@ def test_an_axis_without_direction_is_refused(axis):
         upward(nadir(), axis)
 
 
-def test_low_cameras_are_near():
+def test_low_cameras_get_the_label_near():
     scene = nadir()
     labels = Altitude().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert labels == ("near", "far", "far", "near") * 2
 
 
 @pytest.mark.parametrize(("cut", "near"), [("median", 4), ("otsu", 6), ("gap", 7)])
-def test_heights_are_cut_where_it_was_asked_for(cut, near):
+def test_heights_are_split_at_the_requested_cut(cut, near):
     heights = (0.0, 0.1, 0.2, 0.3, 1.0, 1.1, 3.5, 6.5)
     scene = posed_scene([posed_view((i, 0, h), f"{i}.png") for i, h in enumerate(heights)])
     grouping = Altitude(up=(0.0, 0.0, 1.0), cut=cut)
@@ -94,7 +94,7 @@ def within(values, threshold):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_otsu_has_the_least_variance_within(seed):
+def test_otsus_threshold_has_the_least_variance_within_groups(seed):
     rng = np.random.default_rng(seed)
     values = np.concatenate([rng.normal(size=13), rng.normal(4.0, 2.0, size=7)])
     best = within(values, otsu_threshold(values))
@@ -103,5 +103,5 @@ def test_otsu_has_the_least_variance_within(seed):
 
 @pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
 @pytest.mark.parametrize("threshold", [otsu_threshold, gap_threshold])
-def test_equal_values_are_all_on_the_lower_side(values, threshold):
+def test_values_equal_to_the_threshold_are_on_the_lower_side(values, threshold):
     assert threshold(np.array(values)) == 2.0

@@ -62,7 +62,7 @@ def label(name, scene, views=None, seed=0, **options):
 
 
 @pytest.mark.parametrize("name", entries("groupings"))
-def test_labels_are_among_the_declared_ones_and_no_needed_group_is_empty(name):
+def test_labels_are_declared_and_no_required_group_is_empty(name):
     scene = hybrid()
     labels = label(name, scene)
     declared = build("groupings", name, {}).labels
@@ -71,7 +71,7 @@ def test_labels_are_among_the_declared_ones_and_no_needed_group_is_empty(name):
 
 
 @pytest.mark.parametrize("name", entries("groupings"))
-def test_the_rule_is_fitted_on_training_cameras_and_applied_to_all(name):
+def test_a_grouping_is_fitted_on_training_cameras_and_applied_to_all_cameras(name):
     scene = hybrid()
     every = label(name, scene, scene.views)
     assert tuple(every[i] for i in scene.train) == label(name, scene)
@@ -82,7 +82,7 @@ def test_the_rule_is_fitted_on_training_cameras_and_applied_to_all(name):
 
 
 @pytest.mark.parametrize("name", entries("groupings"))
-def test_the_unit_of_length_does_not_matter(name):
+def test_the_unit_of_length_of_a_scene_does_not_change_the_labels(name):
     labels = label(name, hybrid())
     assert label(name, hybrid(scale=1e-3)) == labels
     assert label(name, hybrid(scale=1e4)) == labels
@@ -96,7 +96,7 @@ def test_the_regimes_of_a_hybrid_scene_are_found(name):
 
 
 @pytest.mark.parametrize("name", ["altitude", "conflict-signature", "gmm"])
-def test_the_regimes_are_found_whatever_their_sizes(name):
+def test_regimes_of_any_sizes_are_found(name):
     scene = hybrid(street=16, aerial=6, test=())
     expected = tuple("near" if "street" in view.name else "far" for view in scene.train_views)
     options = {"cut": "gap"} if name == "altitude" else {}
@@ -105,7 +105,7 @@ def test_the_regimes_are_found_whatever_their_sizes(name):
 
 @pytest.mark.parametrize("name", entries("groupings"))
 @pytest.mark.parametrize("cameras", [1, 6])
-def test_cameras_that_do_not_differ_are_a_user_error(name, cameras):
+def test_indistinguishable_cameras_are_a_user_error(name, cameras):
     views = [posed_view((1, 2, 3), f"{i}.png", forward=(0, 1, -1)) for i in range(cameras)]
     scene = posed_scene(views, [(1, 3, 2)])
     with pytest.raises(UserError) as error:
@@ -114,21 +114,21 @@ def test_cameras_that_do_not_differ_are_a_user_error(name, cameras):
 
 
 @pytest.mark.parametrize("name", entries("groupings"))
-def test_no_training_views_are_a_user_error(name):
+def test_a_scene_without_training_views_is_a_user_error(name):
     scene = posed_scene([posed_view((0, 0, 1), "a/1.png")], test=[0])
     with pytest.raises(UserError, match="training views"):
         label(name, scene)
 
 
 @pytest.mark.parametrize("name", BY_POSITION)
-def test_the_fit_is_reported(name):
+def test_the_fit_of_a_grouping_is_reported(name):
     scene = hybrid()
     rule = build("groupings", name, {}).fit(scene, np.random.default_rng(0))
     assert any(note.startswith(f"grouping {name}:") for note in rule.notes)
 
 
 @pytest.mark.parametrize("name", ["gmm", "kmeans"])
-def test_restarts_make_the_seed_unimportant(name):
+def test_restarts_make_the_result_independent_of_the_seed(name):
     rng = np.random.default_rng(2)
     centers = [*rng.normal(size=(12, 3)), *(rng.normal(size=(5, 3)) + np.array([0, 9, 20]))]
     scene = posed_scene([posed_view(p, f"{i:02}.png") for i, p in enumerate(centers)])
@@ -169,13 +169,13 @@ def test_terciles_have_equal_shares():
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 6, 6]
 
 
-def test_anchors_are_thirty_percent_on_either_side():
+def test_anchors_put_thirty_percent_on_either_side():
     scene = on_a_line(*np.linspace(1.0, 2.0, 10))
     labels = Anchors().fit(scene, np.random.default_rng(0)).labels(scene.views)
     assert [labels.count(name) for name in ("near", "middle", "far")] == [6, 8, 6]
 
 
-def test_anchors_need_no_middle():
+def test_anchors_work_without_a_middle_group():
     scene = posed_scene([posed_view((0, 0, 0), "a.png"), posed_view((1, 0, 0), "b.png")])
     three = posed_scene([*scene.views, posed_view((5, 0, 0), "c.png")])
     labels = Anchors(share=0.5).fit(three, np.random.default_rng(0)).labels(three.views)
@@ -211,7 +211,7 @@ def test_gmm_survives_degenerate_distances(distances):
     assert set(rule.labels(scene.views)) == {"near", "far"}
 
 
-def test_gmm_falls_back_to_the_median_and_says_so():
+def test_gmm_falls_back_to_the_median_with_a_note():
     # All that have a logarithm have one.
     scene = on_a_line(0.0, 0.0, 0.0, 1.0, 1.0)
     rule = GaussianMixture().fit(scene, np.random.default_rng(0))
@@ -220,7 +220,7 @@ def test_gmm_falls_back_to_the_median_and_says_so():
     assert "degenerate" in rule.notes[0]
 
 
-def test_gmm_is_not_said_to_be_degenerate_where_it_is_not():
+def test_gmm_reports_no_degenerate_fit_for_a_normal_scene():
     scene = hybrid()
     rule = GaussianMixture().fit(scene, np.random.default_rng(0))
     assert not any("degenerate" in note for note in rule.notes)
@@ -239,7 +239,7 @@ def scene_at(*centers):
 
 
 @pytest.mark.parametrize(("name", "options"), [("radial", {"cut": "otsu"}), ("gmm", {})])
-def test_a_camera_in_the_middle_of_two_rings_is_near_and_moves_no_cut(name, options):
+def test_a_camera_in_the_middle_of_two_rings_is_near_and_changes_no_cut(name, options):
     middle = (0.3, 0.7, 0.4)
     scene = scene_at(ring(1.0, 8, middle, 0.2), ring(3.0, 8, middle, 0.5), middle)
     rule = build("groupings", name, options).fit(scene, np.random.default_rng(0))
@@ -247,14 +247,14 @@ def test_a_camera_in_the_middle_of_two_rings_is_near_and_moves_no_cut(name, opti
 
 
 @pytest.mark.parametrize("name", ["radial", "percentile", "anchors", "terciles"])
-def test_cameras_on_one_ring_are_no_two_groups(name):
+def test_cameras_on_one_ring_do_not_form_two_groups(name):
     scene = scene_at(ring(1.0, 12, (0.3, 0.7, 0.4), 0.2))
     with pytest.raises(UserError, match="leaves a group without training views"):
         build("groupings", name, {}).fit(scene, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("cut", ["median", "otsu", "gap"])
-def test_cameras_at_one_height_over_a_tilted_ground_are_no_two_groups(cut):
+def test_cameras_at_one_height_over_a_tilted_ground_do_not_form_two_groups(cut):
     up = np.array([0.1, -0.3, 0.9]) / np.linalg.norm([0.1, -0.3, 0.9])
     across = np.cross(up, [1.0, 0.0, 0.0])
     plane = np.stack([across, np.cross(up, across)])
@@ -264,7 +264,7 @@ def test_cameras_at_one_height_over_a_tilted_ground_are_no_two_groups(cut):
         grouping.fit(scene_at(rows), np.random.default_rng(0))
 
 
-def test_a_ring_in_large_coordinates_is_one_ring():
+def test_a_ring_in_large_coordinates_counts_as_one_ring():
     # Metres of a zone, whose rounding is that of millions.
     frame = Similarity(np.array([4.5e5, 5.6e6, 100.0]), 1 / 60)
     points = ring(60.0, 16, (4.5e5 + 11.3, 5.6e6 - 7.7, 120.1), 0.2)

@@ -6,7 +6,7 @@ from crossgrad_core.errors import UserError
 from crossgrad_plugins.groupings.lists import read_labels
 
 
-def test_names_with_commas_and_the_line_ends_of_windows(tmp_path):
+def test_names_with_commas_and_windows_line_ends_are_read(tmp_path):
     path = tmp_path / "labels.csv"
     path.write_bytes('\ufeff# view, label\r\nfar/,far\r\n\r\n"a,b.jpg", near\r\n'.encode())
     assert read_labels(path) == {"far/": "far", "a,b.jpg": "near"}
@@ -23,7 +23,7 @@ def test_names_with_commas_and_the_line_ends_of_windows(tmp_path):
         (b"\xff\xfea\0", "cannot be read"),
     ],
 )
-def test_an_invalid_list_of_labels_is_one_error(tmp_path, content, words):
+def test_an_invalid_list_of_labels_gives_one_error(tmp_path, content, words):
     path = tmp_path / "labels.csv"
     path.write_bytes(content)
     with pytest.raises(UserError, match=words) as caught:

@@ -49,7 +49,7 @@ def notes(name, scene):
 @pytest.mark.parametrize(
     ("name", "figure"), [("city_unimodal", "0.51 over 65"), ("brighton_beach", "0.53 over 15")]
 )
-def test_one_mode_of_distances_is_noted_with_its_figure(name, figure, grouping):
+def test_a_split_of_one_mode_of_distances_is_noted_with_its_bimodality(name, figure, grouping):
     (note,) = notes(grouping, layout(name))
     assert f"grouping {grouping} splits what has one mode" in note
     assert f"bimodality of the log distance from the mean camera is {figure} training" in note
@@ -57,11 +57,11 @@ def test_one_mode_of_distances_is_noted_with_its_figure(name, figure, grouping):
 
 
 @pytest.mark.parametrize("grouping", BY_DISTANCE)
-def test_two_modes_of_distances_are_not_noted(grouping):
+def test_a_split_of_two_modes_of_distances_is_not_noted(grouping):
     assert notes(grouping, layout("city_hybrid")) == ()
 
 
-def test_heights_are_judged_by_the_axis_that_splits_them():
+def test_modes_of_heights_are_tested_along_the_axis_that_splits_them():
     one = at_heights(np.random.default_rng(0).normal(size=40))
     (note,) = notes("altitude", one)
     assert "the bimodality of the height is 0." in note
@@ -70,7 +70,7 @@ def test_heights_are_judged_by_the_axis_that_splits_them():
     assert mode_note("altitude", across, one) == ()
 
 
-def test_footprints_are_judged_by_the_logarithm():
+def test_modes_of_footprints_are_tested_on_the_logarithm():
     depths = np.exp(np.random.default_rng(1).normal(size=40))
     (note,) = notes("footprint", looking_from(depths))
     assert "the bimodality of the log depth over focal length is 0." in note
@@ -78,12 +78,12 @@ def test_footprints_are_judged_by_the_logarithm():
 
 
 @pytest.mark.parametrize("grouping", ["kmeans", "lists", "conflict-signature"])
-def test_rules_that_look_at_more_than_one_number_are_not_judged(grouping):
+def test_groupings_of_more_than_one_quantity_are_not_tested_for_modes(grouping):
     assert notes(grouping, layout("city_unimodal")) == ()
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 9])
-def test_small_samples_of_two_modes_are_not_taken_for_one(size):
+def test_small_samples_of_two_modes_are_not_noted_as_one_mode(size):
     assert notes("altitude", at_heights([0.0, 10.0] * (size // 2) + [0.0] * (size % 2))) == ()
 
 
@@ -97,7 +97,7 @@ def test_altitude_notes_are_empty_without_enough_evidence(heights):
     assert notes("altitude", at_heights(heights)) == ()
 
 
-def test_a_camera_without_a_value_does_not_count():
+def test_a_camera_without_a_value_is_ignored():
     views = [*layout("city_unimodal").views]
     middle = np.mean([view.camera.center.numpy() for view in views], axis=0)
     scene = posed_scene([*views, posed_view(middle, "middle.png")])
@@ -118,13 +118,13 @@ class Sized(Grouping):
         return Quantity("the number of points", np.array([float(len(v.seen)) for v in views]))
 
 
-def test_a_third_party_grouping_takes_part():
+def test_a_third_party_grouping_is_tested_for_modes():
     views = [posed_view((0, 0, i), f"{i}.png", seen=range(i)) for i in (2, 3, 3, 3, 3, 3, 4, 4, 4)]
     (note,) = mode_note("sized", Sized(), posed_scene(views))
     assert "the number of points" in note
 
 
-def test_the_note_is_among_those_of_the_run():
+def test_the_note_about_one_mode_is_a_note_of_the_run():
     settings = {"steps": 5, "sampler": {"name": "near-far"}}
     scene = replace(layout("city_unimodal"), points=sample_scene().points)
     near_far = assemble(RunConfig.model_validate(settings), scene, "none")

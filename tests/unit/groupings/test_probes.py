@@ -28,13 +28,13 @@ def test_a_footprint_is_the_median_of_focal_length_over_depth():
     assert footprint_of(posed_scene([view], points), view) == pytest.approx(12.0 / 4.0)
 
 
-def test_a_view_that_observed_nothing_takes_the_points_in_its_image():
+def test_a_view_without_observations_uses_the_points_in_its_image():
     points = [(0, 2, 0), (0, 8, 0), (50, 3, 0), (0, -3, 0)]
     view = posed_view((0, 0, 0), focal=10.0)
     assert footprint_of(posed_scene([view], points), view) == pytest.approx(10.0 / 5.0)
 
 
-def test_views_of_nothing_at_all_are_a_user_error():
+def test_a_scene_without_visible_points_is_a_user_error():
     view = posed_view((0, 0, 0))
     scene = posed_scene([view], [(0, -5, 0)])
     assert np.isnan(footprint_of(scene, view))
@@ -43,7 +43,7 @@ def test_views_of_nothing_at_all_are_a_user_error():
 
 
 @pytest.mark.parametrize(("place", "label"), [((0.1, -1, 0), "near"), ((3.9, -8, 0), "far")])
-def test_a_view_of_nothing_goes_with_the_nearest_camera(place, label):
+def test_a_view_without_points_gets_the_label_of_the_nearest_camera(place, label):
     views = [posed_view((i, -1.0 - 7 * (i > 2), 0), f"{i}.png", seen=[0]) for i in range(5)]
     blind = posed_view(place, "blind.png", forward=(0, -1, 0))
     scene = posed_scene([*views, blind], [(0, 0, 0)])
@@ -53,7 +53,7 @@ def test_a_view_of_nothing_goes_with_the_nearest_camera(place, label):
 
 
 @pytest.mark.parametrize("depths", [(1, 1.1, 1.2, 1.3, 1.4, 1.5, 9, 10), (1, 2, 7, 8, 9, 10, 11)])
-def test_otsu_cuts_where_the_gap_is_and_the_median_in_the_middle(depths):
+def test_otsu_cuts_at_the_gap_and_the_median_in_the_middle(depths):
     views = [posed_view((i, -d, 0), f"{i}.png", seen=[i]) for i, d in enumerate(depths)]
     scene = posed_scene(views, [(i, 0, 0) for i in range(len(depths))])
     near = [d < 5 for d in depths]
@@ -68,14 +68,14 @@ def test_otsu_cuts_where_the_gap_is_and_the_median_in_the_middle(depths):
     assert [label == "near" for label in labels] == [each for each in near for _ in (0, 1)]
 
 
-def test_the_focal_length_decides_at_one_place():
+def test_the_focal_length_decides_if_all_cameras_are_at_one_position():
     views = [posed_view((0, 0, 0), f"{f}.png", focal=f, seen=(0,)) for f in (4.0, 8.0, 16.0, 2.0)]
     scene = posed_scene(views, [(0, 5, 0)])
     labels = Footprint().fit(scene, RNG).labels(scene.views)
     assert labels == ("far", "near", "near", "far")
 
 
-def test_without_a_probe_the_signature_begins_with_the_radial_split():
+def test_the_conflict_signature_starts_with_the_radial_split_without_a_probe():
     scene = names("a.png", "b.png", "c.png", "d.png")
     rule = ConflictSignature(at=7).fit(scene, RNG)
     assert rule.labels(scene.views) == Radial().fit(scene, RNG).labels(scene.views)
@@ -96,21 +96,21 @@ class VectorProbe:
         return np.stack([row @ row.T for row in rows])
 
 
-def test_the_signature_splits_where_gradients_oppose():
+def test_the_conflict_signature_separates_opposing_gradients():
     probe = VectorProbe([[1, 0], [-1, 0.1], [1, 0.1], [-1, 0]])
     scene = names("a.png", "b.png", "c.png", "d.png")
     labels = ConflictSignature().fit(scene, RNG, probe).labels(scene.views)
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
-def test_the_signature_ignores_lengths_and_zero_gradients():
+def test_the_conflict_signature_ignores_lengths_and_zero_gradients():
     probe = VectorProbe([[1e-9, 0], [-3e7, 0], [2, 0], [0, 0]], [[1, 0], [-1, 0], [1, 0], [-2, 0]])
     scene = names("a.png", "b.png", "c.png", "d.png")
     labels = ConflictSignature().fit(scene, RNG, probe).labels(scene.views)
     assert labels[0] == labels[2] != labels[1] == labels[3]
 
 
-def test_views_that_were_not_probed_follow_the_nearest_one():
+def test_views_without_a_probe_get_the_label_of_the_nearest_probed_view():
     probe = VectorProbe([[1.0]] * 5 + [[-1.0]] * 5)
     scene = names(*(f"{i}.png" for i in range(10)))
     labels = ConflictSignature(cameras=4).fit(scene, RNG, probe).labels(scene.views)
@@ -120,24 +120,24 @@ def test_views_that_were_not_probed_follow_the_nearest_one():
     assert labels[0] != labels[9]
 
 
-def test_cosines_are_averaged_over_blocks_that_have_them():
+def test_cosines_are_averaged_over_blocks_with_nonzero_gradients():
     gramians = np.array([[[1.0, -1.0], [-1.0, 1.0]], [[0.0, 0.0], [0.0, 4.0]]])
     assert np.allclose(mean_cosines(gramians), [[1.0, -1.0], [-1.0, 1.0]])
 
 
-def test_the_cut_survives_exact_opposition():
+def test_the_cut_is_finite_for_exactly_opposite_gradients():
     cosines = np.array([[1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
     sides = spectral_cut(cosines)
     assert sides[0] == sides[1] != sides[2]
 
 
-def test_folders_are_labels():
+def test_folders_become_labels():
     scene = names("street/1.png", "aerial/1.png", "street/deep/2.png")
     rule = Lists().fit(scene, RNG)
     assert rule.labels(scene.views) == ("street", "aerial", "street")
 
 
-def test_one_folder_is_a_user_error():
+def test_a_single_folder_is_a_user_error():
     scene = names("a/1.png", "a/2.png")
     with pytest.raises(UserError, match="CSV"):
         Lists().fit(scene, RNG)
@@ -154,7 +154,7 @@ def listed(tmp_path):
     return write
 
 
-def test_a_file_names_views_and_folders(listed):
+def test_a_label_file_may_name_views_and_folders(listed):
     text = "# name,label\nnear/,near\nnear/3.png,far\nb.png, far\n\nnear/deep/,low\n"
     labels = listed(text, "near/1.png", "near/3.png", "b.png", "near/deep/1.png")
     assert labels == ("near", "far", "far", "low")
@@ -170,14 +170,14 @@ def test_a_file_names_views_and_folders(listed):
         pytest.param("a.png,near\nb.png,near\n", "near", id="one group"),
     ],
 )
-def test_a_bad_file_is_a_user_error_that_names_the_row(listed, text, found):
+def test_a_bad_label_file_is_a_user_error_that_names_the_row(listed, text, found):
     with pytest.raises(UserError) as error:
         listed(text, "a.png", "b.png")
     assert found in error.value.found
     assert "labels.csv" in error.value.where
 
 
-def test_a_missing_file_is_a_user_error(tmp_path):
+def test_a_missing_label_file_is_a_user_error(tmp_path):
     scene = names("a.png", "b.png")
     with pytest.raises(UserError, match="cannot be read"):
         Lists(file=tmp_path / "no.csv").fit(scene, RNG)
@@ -185,7 +185,7 @@ def test_a_missing_file_is_a_user_error(tmp_path):
 
 @pytest.mark.parametrize("size", [1, 2, 5, 8])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_spectral_cut_separates_groups_that_share_nothing(size, seed):
+def test_the_spectral_cut_separates_orthogonal_groups(size, seed):
     # The largest eigenvalue stands there twice: any vector of its plane comes out of a solver.
     sides = np.repeat([1.0, -1.0], size)
     order = np.random.default_rng(seed).permutation(2 * size)
@@ -196,6 +196,6 @@ def test_the_spectral_cut_separates_groups_that_share_nothing(size, seed):
     assert len(set(found)) == 2
 
 
-def test_two_cameras_that_are_alike_are_not_cut():
+def test_identical_cameras_are_not_separated():
     assert spectral_cut(np.ones((2, 2))).tolist() == [0, 0]
     assert spectral_cut(np.ones((5, 5))).tolist() == [0] * 5

@@ -84,7 +84,7 @@ def depth_of(camera, points, fewest=8, centers=((0.0, 0.0, 4.0),)):
     return Depth.of(camera, points, fewest, sky)
 
 
-def test_depth_of_a_plane_is_exact_far_from_its_points_and_through_outliers():
+def test_the_depth_of_a_plane_is_exact_far_from_its_points_and_despite_outliers():
     camera = looking_down(0.0, 0.0).camera
     points = LEFT[camera.project(LEFT)[1] > 0]
     wrong = points.copy()
@@ -96,7 +96,7 @@ def test_depth_of_a_plane_is_exact_far_from_its_points_and_through_outliers():
     np.testing.assert_allclose(depth_of(camera, wrong).at(around), true, rtol=0.12)
 
 
-def test_ground_is_between_near_and_twice_as_far_as_the_points_and_the_sky_beyond_everything():
+def test_ground_depth_is_at_most_twice_that_of_the_points_and_sky_is_behind_everything():
     camera = looking_down(0.0, 0.0, tilt=3.0).camera
     ahead = some_ground(300, (-3.0, 3.0), (4.0, 20.0))
     depths = camera.project(ahead)[1]
@@ -118,7 +118,7 @@ def test_ground_is_between_near_and_twice_as_far_as_the_points_and_the_sky_beyon
 
 
 @pytest.mark.parametrize("shifted", [0.0, 9.0])
-def test_beyond_a_wall_is_sky_only_where_rays_go_up(shifted):
+def test_pixels_beyond_a_wall_are_sky_only_for_rays_that_go_up(shifted):
     # Along a wall on its left, whose plane vanishes in the middle of the picture.
     rng = np.random.default_rng(2)
     wall = np.column_stack([np.full(300, -1.0), rng.uniform(2, 9, 300), rng.uniform(-1, 3, 300)])
@@ -161,7 +161,7 @@ def covered_by_hand(cells, points, sizes):
     margin=st.integers(0, 3),
     scale=st.floats(-3.0, 0.5),
 )
-def test_cells_are_covered_as_by_hand(seed, count, size, margin, scale):
+def test_covered_cells_agree_with_a_loop(seed, count, size, margin, scale):
     rng = np.random.default_rng(seed)
     points = rng.normal(0.0, 3.0, (count, 3))
     sizes = 10.0**scale * rng.uniform(0.1, 1.0, count)
@@ -172,7 +172,7 @@ def test_cells_are_covered_as_by_hand(seed, count, size, margin, scale):
 
 
 @pytest.mark.parametrize("size", [4.0, 5.0, 7.3, 48.0])
-def test_colors_are_means_of_what_counts(size):
+def test_cell_colors_are_means_of_unmasked_pixels(size):
     view = looking_down(0.0, 0.0)
     image = view.photo.image().numpy()
     mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.3
@@ -191,7 +191,7 @@ def test_colors_are_means_of_what_counts(size):
             np.testing.assert_array_equal(color, kept.mean(axis=0).round())
 
 
-def test_ground_without_points_is_filled_where_it_is_in_its_colours():
+def test_ground_without_points_is_filled_with_the_colours_of_the_ground():
     more = Filled(margin=0.0).more_points(ground_scene(LEFT))
     assert len(more.positions) > 10
     np.testing.assert_allclose(more.positions[:, 2], 0.0, atol=1e-6)
@@ -202,7 +202,7 @@ def test_ground_without_points_is_filled_where_it_is_in_its_colours():
     assert ((more.sizes > 0.2) & (more.sizes < 0.8)).all()
 
 
-def test_the_sky_stands_before_no_camera():
+def test_added_sky_gaussians_are_not_in_front_of_a_camera():
     # One camera on the ground looks along it; the others look down from above and beyond.
     ahead = some_ground(400, (-1.0, 1.0), (2.0, 6.0))
     down = ground_scene(ahead, [(0.0, 3.0), (40.0, 3.0)])
@@ -220,7 +220,7 @@ def test_the_sky_stands_before_no_camera():
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.5])
-def test_nothing_is_added_nearer_to_a_camera_than_what_it_sees(margin):
+def test_no_gaussian_is_added_nearer_to_a_camera_than_its_visible_points(margin):
     # Beside the top of a tower, at its depth, nothing is but air: another camera looks down there.
     ground = some_ground(400, (-6.0, 6.0), (3.0, 20.0))
     tower = np.column_stack([np.zeros(60), np.full(60, 10.0), np.linspace(0.0, 7.0, 60)])
@@ -238,7 +238,7 @@ def test_nothing_is_added_nearer_to_a_camera_than_what_it_sees(margin):
     assert (depth[shown] > 30.0).sum() > 20  # The sky.
 
 
-def test_rays_that_go_down_end_on_the_ground_however_near_a_camera():
+def test_rays_that_go_down_end_on_the_ground_even_near_a_camera():
     # Along a street, 1.6 high, 3 apart; each sees the ground from 5 on.
     ground = some_ground(3000, (-8.0, 8.0), (5.0, 60.0))
     views = []
@@ -259,7 +259,7 @@ def test_rays_that_go_down_end_on_the_ground_however_near_a_camera():
     assert (more.positions[:, 2] >= 5.0).any()
 
 
-def test_cameras_around_an_object_have_margins_though_they_see_each_other():
+def test_cameras_around_an_object_have_margins_although_they_see_each_other():
     rng, views = np.random.default_rng(3), []
     walls = rng.uniform(0.0, 2.0 * np.pi, 2000)
     room = np.column_stack([4.5 * np.cos(walls), 4.5 * np.sin(walls), rng.uniform(0, 2.5, 2000)])
@@ -303,7 +303,7 @@ def test_a_scene_without_gaps_is_not_filled():
     assert Filled(margin=0.0).begun(scene) is scene
 
 
-def test_the_margin_is_where_no_training_photo_looks_that_shows_as_far():
+def test_the_margin_contains_only_regions_outside_all_training_photos():
     scene = ground_scene(LEFT)
     inner = Filled(margin=0.0).more_points(scene)
     more = Filled(margin=0.5).more_points(scene)
@@ -324,7 +324,7 @@ def test_the_margin_is_where_no_training_photo_looks_that_shows_as_far():
 
 
 @pytest.mark.parametrize(("away", "hides"), [(0.5, True), (20.0, False)])
-def test_the_margin_goes_on_behind_what_another_photo_sees_before_it(away, hides):
+def test_the_margin_continues_behind_nearer_points_of_another_photo(away, hides):
     # A camera in the street looks over all the ground beyond the left edges, at a wall or far away.
     rng, street = np.random.default_rng(1), np.array([-6.0, 1.5, 0.3])
     wall = street + np.column_stack(
@@ -356,7 +356,7 @@ def test_photos_without_enough_points_or_pixels_are_left_out():
     assert Filled().more_points(replace(hidden, views=views)) is None
 
 
-def test_no_more_photos_are_looked_at_than_asked_for():
+def test_no_more_photos_are_read_than_requested():
     centers = [(0.3 * number, 0.0) for number in range(20)]
     scene, looked_at = ground_scene(LEFT, centers), []
     views = [
@@ -367,7 +367,7 @@ def test_no_more_photos_are_looked_at_than_asked_for():
     assert len(set(looked_at)) == 3
 
 
-def test_added_gaussians_get_their_size_and_opacity_and_the_others_do_not_change():
+def test_added_gaussians_get_size_and_opacity_and_existing_ones_do_not_change():
     scene = ground_scene(LEFT)
     begun = Filled(opacity=0.7).begun(scene)
     rng = np.random.default_rng(0)

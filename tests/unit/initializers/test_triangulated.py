@@ -31,7 +31,7 @@ def bare(scene):
     return replace(scene, views=views, points=scene.points[:0], point_colors=scene.point_colors[:0])
 
 
-def test_points_lie_among_those_of_colmap_and_have_their_colour(scene, bare):
+def test_triangulated_points_are_near_points_of_colmap_and_have_their_colour(scene, bare):
     from scipy.spatial import cKDTree
 
     more = FEW.more_points(bare)
@@ -53,7 +53,7 @@ def test_triangulation_is_repeatable(bare):
     assert ours.positions.tobytes() == again.positions.tobytes()
 
 
-def test_a_scene_with_points_starts_from_those(scene):
+def test_a_scene_with_points_keeps_its_points(scene):
     assert Triangulated().more_points(scene) is None
     assert "has points" in Triangulated().messages(scene)[0]
 
@@ -72,7 +72,7 @@ def test_a_scene_without_points_is_refused_with_the_options_that_add_points(bare
 
 
 @pytest.mark.parametrize("backbone", sorted(entries("backbones")))
-def test_every_backbone_begins_with_triangulated_points(bare, backbone):
+def test_every_backbone_can_start_from_triangulated_points(bare, backbone):
     """The points have no sizes and opacities of their own: the backbone has to find some."""
     chosen = {"backbone": {"name": backbone}, "initializer": {"name": "triangulated", "views": 4}}
     setup = assemble(RunConfig(scene="somewhere", steps=2, threads=1, **chosen), bare, "colmap")
@@ -81,13 +81,13 @@ def test_every_backbone_begins_with_triangulated_points(bare, backbone):
     assert all(tensor.isfinite().all() for tensor in state.parameters.values())
 
 
-def test_photos_that_show_nothing_in_common_are_refused(bare):
+def test_photos_without_common_content_are_refused(bare):
     alone = replace(bare, train=bare.train[:1])
     with pytest.raises(UserError, match="no points could be triangulated"):
         Triangulated().more_points(alone)
 
 
-def test_masked_pixels_are_left_out(bare):
+def test_masked_pixels_are_not_triangulated(bare):
     from torch import zeros
 
     class Hidden:
@@ -102,7 +102,7 @@ def test_masked_pixels_are_left_out(bare):
         FEW.more_points(replace(bare, views=views))
 
 
-def test_rays_meet_where_the_point_is(scene):
+def test_rays_of_one_point_meet_at_the_point(scene):
     first, *others = scene.views
     second = max(others, key=lambda view: len(np.intersect1d(view.seen, first.seen)))
     points = scene.points[np.intersect1d(first.seen, second.seen)[:50]]

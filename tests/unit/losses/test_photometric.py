@@ -93,7 +93,7 @@ def test_fused_agrees_with_the_float64_reference(image, target, bound, mask, ssi
 
 
 @pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
-def test_an_8_bit_target_means_its_255th(mask):
+def test_a_uint8_target_is_divided_by_255(mask):
     target = (NATURAL * 255).round().to(torch.uint8)
     kept = mask((H, W))
     from_bytes = loss_and_gradient(photometric_loss, BLURRED, target, kept)
@@ -112,7 +112,7 @@ def test_equal_images_have_no_loss_and_no_gradient(image):
 
 
 @pytest.mark.parametrize("loss", [photometric_loss, l1_ssim_loss])
-def test_no_kept_pixel_gives_zero(loss):
+def test_a_fully_masked_image_has_zero_loss(loss):
     nothing = torch.zeros(H, W, dtype=torch.bool)
     value, gradient = loss_and_gradient(loss, BLURRED, NATURAL, nothing)
     assert value == 0
@@ -130,7 +130,7 @@ def test_masked_pixels_change_neither_the_loss_nor_its_gradient(loss):
     assert not clean[1][~kept].any()
 
 
-def test_a_full_mask_is_no_mask():
+def test_a_full_mask_equals_no_mask():
     full = torch.ones(H, W, dtype=torch.bool)
     masked = loss_and_gradient(photometric_loss, BLURRED, NATURAL, full)
     plain = loss_and_gradient(photometric_loss, BLURRED, NATURAL, None)
@@ -152,7 +152,7 @@ def test_bits_do_not_depend_on_the_number_of_threads():
         assert torch.equal(gradient, results[0][1])
 
 
-def test_bits_do_not_depend_on_how_tiles_share_scratch_memory():
+def test_bits_do_not_depend_on_the_scratch_memory_of_earlier_tiles():
     image, target = (tensor.numpy() for tensor in TILED)
     alone, again = np.empty_like(image), np.empty_like(image)
     first = loss_terms(image, target, None, alone)
@@ -161,12 +161,12 @@ def test_bits_do_not_depend_on_how_tiles_share_scratch_memory():
     np.testing.assert_array_equal(alone, again)
 
 
-def test_leaving_out_the_gradient_keeps_the_value():
+def test_omitting_the_gradient_keeps_the_value():
     image, target = BLURRED.numpy(), NATURAL.numpy()
     assert loss_terms(image, target) == loss_terms(image, target, None, np.empty_like(image))
 
 
-def test_upstream_gradient_scales_and_repeats():
+def test_the_gradient_scales_with_the_upstream_gradient():
     image = BLURRED.clone().requires_grad_()
     loss = photometric_loss(image, NATURAL)
     (once,) = torch.autograd.grad(loss, image, retain_graph=True)
@@ -174,7 +174,7 @@ def test_upstream_gradient_scales_and_repeats():
     torch.testing.assert_close(thrice, 3 * once)
 
 
-def test_nan_in_the_image_reaches_the_loss():
+def test_nan_in_the_image_gives_a_nan_loss():
     image = BLURRED.clone()
     image[3, 5, 1] = torch.nan
     value, gradient = loss_and_gradient(photometric_loss, image, NATURAL, None)
@@ -182,7 +182,7 @@ def test_nan_in_the_image_reaches_the_loss():
     assert torch.isfinite(gradient[20:]).all()
 
 
-def test_layouts_and_types_other_than_the_fused_one():
+def test_other_memory_layouts_and_types_give_the_same_loss():
     transposed = NATURAL.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     plain = photometric_loss(BLURRED, NATURAL)
     assert photometric_loss(BLURRED, transposed) == plain
@@ -193,18 +193,18 @@ def test_layouts_and_types_other_than_the_fused_one():
 
 
 @pytest.mark.parametrize("kept", [None, random_mask((5, 7))])
-def test_reference_gradient_is_that_of_finite_differences(kept):
+def test_the_reference_gradient_agrees_with_finite_differences(kept):
     image, target = noise(17, 5, 7).double().requires_grad_(), noise(18, 5, 7)
     assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, kept), image, fast_mode=True)
 
 
-def test_window_is_the_normalised_gaussian():
+def test_the_window_is_a_normalised_gaussian():
     window = gaussian_window()
     assert window.sum().item() == pytest.approx(1, abs=1e-15)
     assert (window[6] / window[5]).item() == pytest.approx(np.exp(-1 / (2 * 1.5**2)))
 
 
-def test_ssim_of_constant_images_inside_is_the_luminance_term():
+def test_ssim_of_constant_images_is_the_luminance_term_away_from_the_border():
     x, y = 0.3, 0.6
     images = (torch.full((13, 13, 3), value, dtype=torch.float64) for value in (x, y))
     inside = ssim_map(*images)[6, 6]
@@ -212,7 +212,7 @@ def test_ssim_of_constant_images_inside_is_the_luminance_term():
     assert inside.numpy() == pytest.approx(np.full(3, expected), rel=1e-12)
 
 
-def test_ssim_of_one_pixel_sees_the_zero_padding():
+def test_ssim_of_one_pixel_includes_the_zero_padding():
     x, y, w = 0.4, 0.5, gaussian_window()[5].item() ** 2
     luminance = (2 * w * x * w * y + 1e-4) / ((w * x) ** 2 + (w * y) ** 2 + 1e-4)
     variances = (w - w * w) * (x * x + y * y)
@@ -230,7 +230,7 @@ def test_ssim_of_one_pixel_sees_the_zero_padding():
         (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3), torch.ones(4, 4)),
     ],
 )
-def test_wrong_shapes_are_refused(image, target, mask):
+def test_invalid_shapes_are_refused(image, target, mask):
     with pytest.raises(ValueError, match="must"):
         photometric_loss(image, target, mask)
 
@@ -259,7 +259,7 @@ def test_the_analytic_gradient_agrees_with_autograd(name, masked):
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 1.0])
 @pytest.mark.parametrize("kept", [None, "none", "one"])
-def test_the_gradient_written_out_at_the_ends_of_its_options(ssim_weight, kept):
+def test_the_analytic_gradient_is_correct_at_the_ends_of_its_options(ssim_weight, kept):
     """What does not count may be anything."""
     image, target = BLURRED.double(), NATURAL.double()
     mask = None if kept is None else torch.zeros(image.shape[:2], dtype=torch.bool)
@@ -274,14 +274,14 @@ def test_the_gradient_written_out_at_the_ends_of_its_options(ssim_weight, kept):
 
 
 @pytest.mark.parametrize("image", [NATURAL, FLAT, torch.zeros(H, W, 3), torch.zeros(0, 4, 3)])
-def test_equal_images_have_no_loss_where_the_gradient_is_written_out(image):
+def test_the_analytic_gradient_of_equal_images_is_zero(image):
     value, slope = on_device.loss_and_gradient(image, image, None, 0.2)
     assert value.item() == 0.0
     assert slope.shape == image.shape
     assert not slope.any()
 
 
-def test_the_loss_of_a_gpu_hands_its_gradient_on():
+def test_the_gpu_loss_multiplies_its_gradient_by_the_upstream_gradient():
     """On the CPU here: what comes from above is a factor, of any sign."""
     image = BLURRED.clone().requires_grad_()
     loss = _DeviceLoss.apply(image, NATURAL, None, 0.2)
@@ -299,7 +299,7 @@ def test_a_window_cached_in_inference_mode_can_be_used_with_gradients():
     assert image.grad.any()
 
 
-def test_uint8_photos_are_shares_of_255_where_the_gradient_is_written_out():
+def test_the_analytic_gradient_divides_uint8_photos_by_255():
     photo = (255 * NATURAL).round().to(torch.uint8)
     found = on_device.loss_and_gradient(BLURRED, photo, None, 0.2)
     expected = on_device.loss_and_gradient(BLURRED, photo.float() / 255, None, 0.2)

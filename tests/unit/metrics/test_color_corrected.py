@@ -38,7 +38,7 @@ def by_lstsq(render, photo, mask=None):
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("masks", [False, True])
-def test_the_map_is_that_of_least_squares(seed, masks):
+def test_the_colour_map_is_the_least_squares_solution(seed, masks):
     render, noise = image(seed, 40, 200), image(seed + 100, 0, 60)
     mixing = np.random.default_rng(seed).uniform(-0.3, 0.9, (3, 3))
     mixed = render.numpy() @ mixing + noise.numpy()
@@ -48,7 +48,7 @@ def test_the_map_is_that_of_least_squares(seed, masks):
     assert np.array_equal(found.numpy(), by_lstsq(render, photo, mask))
 
 
-def test_another_exposure_and_white_balance_are_forgiven():
+def test_differences_of_exposure_and_white_balance_are_corrected():
     photo = image(1, 30, 220)
     gains, offsets = torch.tensor([0.5, 0.8, 0.6]), torch.tensor([9.0, 0.0, 20.0])
     render = (photo * gains + offsets).round().to(torch.uint8)
@@ -60,7 +60,7 @@ def test_another_exposure_and_white_balance_are_forgiven():
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_it_is_never_further_than_the_render_by_more_than_rounding(seed):
+def test_correction_never_increases_the_error_by_more_than_rounding(seed):
     render, photo = image(seed), image(seed + 50)
     corrected = color_corrected(compared(render, photo))
     errors = [(each.double() - photo.double()).square().mean() for each in (corrected, render)]
@@ -82,7 +82,7 @@ def test_a_grey_render_is_fitted_by_its_brightness():
     assert (found.int() - photo.int()).abs().max() <= 1
 
 
-def test_without_a_pixel_that_counts_there_is_no_figure():
+def test_a_fully_masked_image_has_no_metric_value():
     render = image(0)
     pair = compared(render, render, torch.zeros(render.shape[:2], dtype=torch.bool))
     assert color_corrected(pair) is None
@@ -91,6 +91,6 @@ def test_without_a_pixel_that_counts_there_is_no_figure():
 
 
 @pytest.mark.parametrize("kind", [ColorCorrectedPSNR, ColorCorrectedSSIM])
-def test_results_say_what_was_fitted_to_what(kind):
+def test_the_definition_in_the_results_states_the_fitted_map(kind):
     told = kind().described().definition
     assert "affine" in told and "least squares" in told and "photo of the view" in told

@@ -50,7 +50,7 @@ def test_default_metrics_with_a_duplicate_column_are_left_out(regimes, left_out)
     assert not [note for note in again.notes if "left out" in note]
 
 
-def test_a_metric_that_the_user_names_is_refused():
+def test_a_metric_with_a_duplicate_column_that_the_user_names_is_refused():
     with pytest.raises(UserError, match="ssim_cc") as caught:
         assembled(["cc"], ["ssim-cc"])
     assert "leave metric ssim-cc out" in caught.value.todo

@@ -106,14 +106,14 @@ def of_torchmetrics(monkeypatch, net, images, *, scales):
     ("kind", "net", "scales"),
     [(LPIPS, "alex", True), (LPIPSOfVGG, "vgg", True), (LPIPSOfVGGAs3DGS, "vgg", False)],
 )
-def test_torchmetrics_finds_the_same(kind, net, scales, seed, trunks, monkeypatch):
+def test_lpips_agrees_with_torchmetrics(kind, net, scales, seed, trunks, monkeypatch):
     found = pair(seed)
     expected = of_torchmetrics(monkeypatch, net, (found.render, found.photo), scales=scales)
     assert expected > 1e-3
     assert built(kind, trunks).measure(found) == pytest.approx(expected, abs=1e-5, rel=1e-5)
 
 
-def test_the_two_scalings_differ(trunks, heads):
+def test_the_two_input_scalings_give_different_values(trunks, heads):
     figures = [
         built(kind, trunks, heads=heads / "vgg.pth").measure(pair())
         for kind in (LPIPSOfVGG, LPIPSOfVGGAs3DGS)
@@ -122,14 +122,14 @@ def test_the_two_scalings_differ(trunks, heads):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_image_is_no_distance_from_itself(kind, trunks, heads):
+def test_the_distance_of_an_image_from_itself_is_zero(kind, trunks, heads):
     metric = built(kind, trunks, heads=heads / kind.net.heads)
     same = pair()
     assert metric.measure(Compared(same.view, same.photo, same.photo, None)) == 0.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_masked_pixels_do_not_count_and_no_pixel_gives_no_figure(kind, trunks, heads):
+def test_masked_pixels_do_not_count_and_a_fully_masked_image_has_no_value(kind, trunks, heads):
     metric = built(kind, trunks, heads=heads / kind.net.heads)
     mask = torch.ones(70, 94, dtype=torch.bool)
     mask[:, 40:] = False
@@ -141,7 +141,7 @@ def test_masked_pixels_do_not_count_and_no_pixel_gives_no_figure(kind, trunks, h
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_smallest_image_has_a_figure_and_a_smaller_one_a_reason(kind, trunks, heads):
+def test_an_image_below_the_smallest_size_has_no_value_but_a_reason(kind, trunks, heads):
     metric = built(kind, trunks, heads=heads / kind.net.heads)
     least = kind.net.smallest
     assert metric.measure(pair(size=(least, least + 9))) > 0
@@ -150,14 +150,14 @@ def test_the_smallest_image_has_a_figure_and_a_smaller_one_a_reason(kind, trunks
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_without_a_file_it_is_null_and_says_how_to_name_one(kind):
+def test_lpips_without_a_weight_file_is_null_and_explains_the_option(kind):
     assert kind().measure(pair()) is None
     told = kind().described().undefined
     assert f"--set metrics.{kind.entry}.trunk=FILE" in told and kind.net.published in told
     assert kind().crossgrad_validate_selection(NO_SELECTION) == []
 
 
-def test_safetensors_and_a_trunk_without_prefix_are_read_alike(trunks, heads, tmp_path):
+def test_safetensors_files_and_a_trunk_without_prefix_are_read_alike(trunks, heads, tmp_path):
     bare = {k.removeprefix("features."): v for k, v in state_dict("alexnet").items()}
     save_file({k: v.contiguous() for k, v in bare.items()}, tmp_path / "alex.safetensors")
     head = heads / "alex.pth"
@@ -165,7 +165,7 @@ def test_safetensors_and_a_trunk_without_prefix_are_read_alike(trunks, heads, tm
     assert one == LPIPS(trunk=trunks / "alexnet.pth", heads=head).measure(pair())
 
 
-def test_results_say_which_weights_were_used(trunks, heads):
+def test_the_definition_in_the_results_names_the_weights(trunks, heads):
     told = LPIPS(trunk=trunks / "alexnet.pth", heads=heads / "alex.pth").described().definition
     assert "images in [-1, 1]" in told and "alexnet.pth (SHA-256 " in told
     assert "not the file that torchvision publishes" in told
@@ -180,7 +180,7 @@ def refused(metric):
     return caught.value
 
 
-def test_bad_files_are_refused_before_training(trunks, heads, tmp_path):
+def test_invalid_weight_files_are_refused_before_training(trunks, heads, tmp_path):
     head = heads / "alex.pth"
     assert "no file" in refused(LPIPS(trunk=tmp_path / "none.pth", heads=head)).what
 
@@ -201,7 +201,7 @@ def test_bad_files_are_refused_before_training(trunks, heads, tmp_path):
     assert "not finite" in refused(LPIPS(trunk=tmp_path / "nan.pth", heads=head)).found
 
 
-def test_a_pickle_that_would_run_code_is_not_run(heads, tmp_path):
+def test_a_pickle_with_code_is_not_executed(heads, tmp_path):
     class Evil:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "ran",))
@@ -212,12 +212,12 @@ def test_a_pickle_that_would_run_code_is_not_run(heads, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_heads_without_a_trunk_are_refused(heads):
+def test_linear_heads_without_a_trunk_are_refused(heads):
     reasons = LPIPS(heads=heads / "alex.pth").crossgrad_validate_selection(NO_SELECTION)
     assert len(reasons) == 1 and "metrics.lpips.trunk=FILE" in reasons[0]
 
 
-def test_missing_heads_say_where_to_get_them(trunks, monkeypatch):
+def test_the_error_about_missing_heads_names_the_package_to_install(trunks, monkeypatch):
     place = "crossgrad_plugins.metrics.lpips_distance.find_spec"
     monkeypatch.setattr(place, lambda package: None)
     # A path of its own, since weights are kept once they are read.
@@ -227,7 +227,7 @@ def test_missing_heads_say_where_to_get_them(trunks, monkeypatch):
     assert "linear heads" in error.what and "pip install torchmetrics" in error.todo
 
 
-def test_a_relative_path_is_kept_whole(trunks, monkeypatch):
+def test_a_relative_path_is_stored_as_an_absolute_path(trunks, monkeypatch):
     monkeypatch.chdir(trunks)
     assert LPIPS(trunk="alexnet.pth").model_dump(mode="json")["trunk"] == str(
         trunks / "alexnet.pth"

@@ -31,7 +31,7 @@ def compared(drawn, photo, mask=None, points=POINTS):
 
 
 @pytest.mark.parametrize("stops", [-2.0, -0.5, 0.0, 0.4])
-def test_a_render_of_another_exposure_is_brought_to_that_of_the_photo(stops):
+def test_a_render_is_brought_to_the_exposure_of_its_photo(stops):
     drawn = smooth()
     photo = with_gain(drawn, torch.tensor(stops))
     assert TrackExposedPSNR().measure(compared(drawn, photo)) > 45
@@ -40,7 +40,7 @@ def test_a_render_of_another_exposure_is_brought_to_that_of_the_photo(stops):
         assert psnr(pair.render, pair.photo) < 30
 
 
-def test_light_beyond_white_comes_back():
+def test_values_above_white_are_recovered():
     photo = smooth()
     drawn = with_gain(photo, torch.tensor(1.5))
     assert drawn.max() > 1
@@ -48,7 +48,7 @@ def test_light_beyond_white_comes_back():
 
 
 @pytest.mark.parametrize("value", [1.5, 3.0, 50.0])
-def test_single_lights_far_beyond_white_are_white(value):
+def test_single_pixels_far_above_white_are_clipped_to_white(value):
     photo = smooth()
     drawn = with_gain(photo, torch.tensor(-0.5))
     drawn[8:12, 8:12] = value
@@ -57,7 +57,7 @@ def test_single_lights_far_beyond_white_are_white(value):
     assert found == pytest.approx(psnr(white, photo), abs=0.5)
 
 
-def test_only_the_observed_places_are_looked_at():
+def test_only_observed_positions_determine_the_exposure():
     drawn, photo = smooth(), with_gain(smooth(), torch.tensor(-1.0))
     mask = torch.ones(SIDE, SIDE, dtype=torch.bool)
     mask[:, :24] = False
@@ -68,7 +68,7 @@ def test_only_the_observed_places_are_looked_at():
     assert TrackExposedPSNR().measure(compared(drawn, photo, points=POINTS[:5])) is None
 
 
-def test_too_dark_and_cut_off_observations_do_not_count():
+def test_observations_that_are_too_dark_or_clipped_do_not_count():
     drawn = smooth()
     assert TrackExposedPSNR().measure(compared(drawn, torch.zeros_like(drawn))) is None
     assert TrackExposedPSNR().measure(compared(drawn, torch.ones_like(drawn))) is None
@@ -80,6 +80,6 @@ def test_a_black_render_keeps_its_plain_psnr():
     assert TrackExposedPSNR().measure(pair) == pytest.approx(psnr(pair.render, pair.photo))
 
 
-def test_structure_counts_as_before():
+def test_structural_differences_lower_the_psnr_after_exposure_correction():
     drawn, photo = smooth(), with_gain(smooth().flip(0), torch.tensor(-1.0))
     assert TrackExposedPSNR().measure(compared(drawn, photo)) < 25

@@ -47,7 +47,7 @@ def run_with(progress: Progress, steps: int = 20, first: int = 1) -> None:
     hook.crossgrad_run_end(status="finished")
 
 
-def test_plain_lines_at_every_tenth(capsys: pytest.CaptureFixture[str]):
+def test_plain_lines_are_printed_at_every_tenth_of_the_run(capsys: pytest.CaptureFixture[str]):
     run_with(Progress())
     out, err = capsys.readouterr()
     lines = err.splitlines()
@@ -65,7 +65,7 @@ def test_plain_lines_at_every_tenth(capsys: pytest.CaptureFixture[str]):
     assert "\r" not in err
 
 
-def test_plain_lines_after_the_interval(
+def test_plain_lines_are_printed_after_the_interval(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     times = iter(range(0, 10_000, 4))
@@ -75,12 +75,12 @@ def test_plain_lines_after_the_interval(
     assert steps == ["step 996", "step 998", "step 1000"]
 
 
-def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]):
+def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]):
     run_with(Progress(level="quiet"))
     assert capsys.readouterr() == ("", "")
 
 
-def test_verbose_adds_density_changes(capsys: pytest.CaptureFixture[str]):
+def test_verbose_also_prints_density_changes(capsys: pytest.CaptureFixture[str]):
     run_with(Progress(level="verbose"))
     lines = capsys.readouterr().err.splitlines()
     assert "- no masks" in lines
@@ -107,7 +107,7 @@ def test_the_bar_of_a_resumed_run_does_not_start_at_zero(monkeypatch: pytest.Mon
     assert " 0/20 " not in terminal.getvalue()
 
 
-def test_a_stopped_run_says_so(capsys: pytest.CaptureFixture[str]):
+def test_a_stopped_run_is_reported_as_stopped(capsys: pytest.CaptureFixture[str]):
     make_manager({"progress": Progress()}).hook.crossgrad_run_end(status="stopped")
     assert capsys.readouterr().err == "run stopped\n"
 
@@ -120,7 +120,7 @@ def test_a_stopped_run_says_so(capsys: pytest.CaptureFixture[str]):
         ((21,), []),
     ],
 )
-def test_changes_of_the_plan_are_one_line_at_the_end(capsys, totals, said):
+def test_changes_of_the_length_give_one_line_at_the_end(capsys, totals, said):
     hook = make_manager({"progress": Progress()}).hook
     run = SimpleNamespace(
         scene=SimpleNamespace(name="s", train=(), test=()),

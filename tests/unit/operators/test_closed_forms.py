@@ -36,7 +36,7 @@ WEIGHTS = {
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
-def test_two_gradients(name, ask):
+def test_weights_of_two_conflicting_gradients_agree_with_the_formulas(name, ask):
     np.testing.assert_allclose(ask(name, PAIR).weights, WEIGHTS[name], rtol=1e-14)
 
 
@@ -45,7 +45,7 @@ def test_gradients_that_agree_are_added(name, ask):
     np.testing.assert_array_equal(ask(name, [[1.0, 0.5], [0.25, 1.0]]).weights, [1.0, 1.0])
 
 
-def test_cagrad_meets_its_own_optimality(ask):
+def test_cagrad_solves_its_optimisation_problem_in_the_plane(ask):
     """max over |d - g0| <= c |g0| of min g_k.d, against a fine grid of directions."""
     pairs = (PAIR, np.array([[3.0, 1.0], [-1.0, 2.0]]), np.array([[1.0, 0.0], [-0.9, 0.1]]))
     for rows in pairs:
@@ -69,7 +69,7 @@ def test_cagrad_of_three_is_never_worse_than_random_directions(ask):
 
 
 @pytest.mark.parametrize(("rescale", "factor"), [("1+c", 1.5), ("1+c^2", 1.25)])
-def test_cagrad_rescaled(rescale, factor, ask):
+def test_cagrad_is_rescaled_by_the_published_factors(rescale, factor, ask):
     plain = ask("cagrad", PAIR).weights
     scaled = ask(build("operators", "cagrad", {"rescale": rescale}), PAIR).weights
     np.testing.assert_allclose(scaled * factor, plain, rtol=1e-14)
@@ -86,13 +86,13 @@ def test_cagrad_with_a_large_radius_tends_to_mgda(ask):
     assert found @ other / np.linalg.norm(found) / np.linalg.norm(other) > 1 - 1e-10
 
 
-def test_aligned_brings_all_singular_values_to_the_smallest(ask):
+def test_aligned_reduces_all_singular_values_to_the_smallest(ask):
     rows = np.array([[3.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
     np.testing.assert_allclose(ask("aligned", rows).result, [1 / 3, 1 / 3, 1 / 3], rtol=1e-14)
 
 
 @pytest.mark.parametrize("views", [2, 3, 4, 7])
-def test_imtl_g_projects_equally_on_all(views, ask):
+def test_imtl_g_has_equal_projections_on_all_gradients(views, ask):
     rows = np.random.default_rng(views).standard_normal((views, 12))
     rows *= np.arange(1, views + 1)[:, None]
     found = ask("imtl-g", rows)
@@ -111,7 +111,7 @@ def test_nash_solves_the_bargaining_equation(views, ask):
 
 @pytest.mark.parametrize("views", [2, 3, 4, 7])
 @pytest.mark.parametrize("name", ["mgda", "upgrad", "dualproj"])
-def test_non_conflicting_methods_conflict_with_nobody(name, views, ask):
+def test_results_of_non_conflicting_operators_conflict_with_no_gradient(name, views, ask):
     for seed in range(10):
         rows = np.random.default_rng(seed).standard_normal((views, 8)) + 0.1
         found = ask(name, rows).result
@@ -135,7 +135,7 @@ def test_soft_removes_a_share_of_the_conflicting_component(ask):
     np.testing.assert_array_equal(ask(patient, PAIR).weights, [1, 1])
 
 
-def test_preconditioner_weighs_by_distance(ask):
+def test_preconditioner_weights_by_squared_distance(ask):
     weights = ask("preconditioner", PAIR, distances=[2.0, 0.5]).weights
     np.testing.assert_allclose(weights, [4.0, 0.25])
     weights = ask("preconditioner", PAIR, distances=[1e6, 0.0]).weights
@@ -147,7 +147,7 @@ def test_anchors_project_only_between_a_near_and_a_far_view(labels, ask):
     np.testing.assert_array_equal(ask("anchors", PAIR, labels=labels).weights, [1, 1])
 
 
-def test_symmetric_of_three_uses_the_original_partners_in_the_order_of_the_slots(ask):
+def test_symmetric_projects_three_gradients_on_the_original_partners_in_slot_order(ask):
     rows = np.array([[1.0, 0.0], [-1.0, 1.0], [-1.0, -2.0]])
     expected = np.zeros(2)
     for i in range(3):

@@ -58,7 +58,7 @@ FAMILIES = (short_rows, of_low_rank, nearly_alike, far_apart)
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 @pytest.mark.parametrize("name", OURS)
-def test_drawn_gramians_give_finite_weights(name, family, ask):
+def test_random_degenerate_gramians_give_finite_weights(name, family, ask):
     rng = np.random.default_rng(1)
     operator = build("operators", name, {})
     for _ in range(200):
@@ -70,7 +70,7 @@ def test_nash_of_parallel_gradients_of_both_signs_is_zero(ask):
     np.testing.assert_array_equal(ask("nash", rows).weights, 0)
 
 
-def test_nash_does_not_stop_between_damped_and_whole_steps():
+def test_nash_does_not_stop_between_damped_and_full_steps():
     rng = np.random.default_rng(2)
     for _ in range(12):
         assert judged("nash", of_low_rank(rng)[:7], torch.float32) <= 8
@@ -79,7 +79,7 @@ def test_nash_does_not_stop_between_damped_and_whole_steps():
 @pytest.mark.parametrize("name", ["nash", "aligned"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("dtype", TYPES)
-def test_pairs_at_every_distance(name, sign, dtype):
+def test_nearly_parallel_pairs_are_exact_at_every_distance(name, sign, dtype):
     for power in range(17):
         if sign < 0 and power in {5, 6}:
             # 1 + cos passes 1e-12 there, where the definition jumps.
@@ -91,20 +91,20 @@ def test_pairs_at_every_distance(name, sign, dtype):
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 @pytest.mark.parametrize("name", ["nash", "imtl-g", "aligned", "gradvac", "soft"])
 @pytest.mark.parametrize("dtype", TYPES)
-def test_drawn_gradients_against_fifty_digits(name, family, dtype):
+def test_results_for_random_gradients_agree_with_fifty_digits(name, family, dtype):
     rng = np.random.default_rng(5)
     for _ in range(3):
         assert judged(name, family(rng)[:6], dtype) <= 8
 
 
-def test_soft_leaves_a_conflict_at_its_threshold_alone():
+def test_the_soft_operator_does_not_change_a_conflict_at_its_threshold():
     """The cosine is -1/4 exactly, and the rule jumps there."""
     rows = [[1.0, 0, 0, 0, 0], [-1.0, 3, 2, 1, 1]]
     for scale in (1.0, 3.0, 7.0):
         assert judged("soft", np.array(rows) * [[scale], [1.0]], torch.float32) <= 8
 
 
-def test_bounds_outside(ask):
+def test_results_are_bounded_by_a_multiple_of_the_longest_gradient(ask):
     rng = np.random.default_rng(6)
     for family in FAMILIES:
         for _ in range(100):
@@ -118,7 +118,7 @@ def test_bounds_outside(ask):
 
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize("name", OURS)
-def test_a_block_without_any_view_among_doubtful_ones(name, dtype):
+def test_a_block_without_views_among_ill_conditioned_blocks_is_handled(name, dtype):
     rows = np.zeros((3, 4, 1))
     rows[1:, :, 0] = [[1, -1, 1, 0], [1, 2, 3, -4]]
     found = results(made(name), Batch(rows, dtype, "test"))

@@ -48,7 +48,7 @@ def test_a_view_without_a_gradient_is_left_out(name, ask):
 
 
 @pytest.mark.parametrize("name", sorted({*ALONE} - {"anchors"}))
-def test_one_view_is_left_as_it_is(name, ask):
+def test_a_single_view_is_unchanged(name, ask):
     np.testing.assert_array_equal(ask(name, [3 * E]).weights, [1])
 
 
@@ -58,14 +58,14 @@ def test_zero_gradients_give_a_zero_result(name, ask):
 
 
 @pytest.mark.parametrize("name", UNEQUAL)
-def test_two_to_one_opposition(name, ask):
+def test_opposite_gradients_of_ratio_two_give_the_specified_result(name, ask):
     found = ask(name, [2 * E, -E])
     np.testing.assert_allclose(found.result, UNEQUAL[name] * E, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("name", sorted({*PROJECTING, *VANISHING, "cagrad", "aligned", "dualproj"}))
 @pytest.mark.parametrize("factor", [1.0, 3.0, 1e-12, 1e9])
-def test_exact_opposition_leaves_no_rounding_noise(name, factor, ask):
+def test_exactly_opposite_gradients_leave_no_rounding_noise(name, factor, ask):
     expected = {"cagrad": (1 - factor) / 4, "aligned": (1 - factor) / 2}.get(name, 0.0)
     rounded = factor * E.astype(np.float32).astype(float)
     found = ask(name, [rounded / factor, -rounded]).result
@@ -75,13 +75,13 @@ def test_exact_opposition_leaves_no_rounding_noise(name, factor, ask):
         np.testing.assert_array_equal(found, 0 * E)
 
 
-def test_almost_opposite_counts_as_opposite(ask):
+def test_almost_opposite_gradients_count_as_opposite(ask):
     rows = [[1.0, 0.0], [-1.0, 1e-7]]
     for name in (*PROJECTING, *VANISHING):
         np.testing.assert_array_equal(ask(name, rows).result, [0, 0])
 
 
-def test_a_ratio_of_1e12_keeps_the_projection_finite(ask):
+def test_a_length_ratio_of_1e12_keeps_the_projection_finite(ask):
     rows = np.array([[1.0, 0.0], [-0.5e-12, np.sqrt(0.75) * 1e-12]])
     np.testing.assert_allclose(ask("symmetric", rows).weights, [1, 5e11], rtol=1e-10)
     np.testing.assert_allclose(np.linalg.norm(ask("symmetric", rows).result), np.sqrt(0.75))
@@ -97,14 +97,14 @@ def test_a_ratio_of_1e12_keeps_the_projection_finite(ask):
     )
 
 
-def test_aligned_jumps_where_the_smaller_view_falls_below_the_floor(ask):
+def test_aligned_drops_a_view_shorter_than_the_threshold(ask):
     below = np.array([[1.0, 0.0], [0.0, 1e-8]])
     np.testing.assert_allclose(ask("aligned", below).result, [0.5, 0.0], atol=1e-9)
     above = np.array([[1.0, 0.0], [0.0, 1e-7]])
     np.testing.assert_allclose(ask("aligned", above).result, [5e-8, 5e-8], rtol=1e-12)
 
 
-def test_cagrad_gives_up_where_a_combination_vanishes(ask):
+def test_cagrad_gives_zero_if_a_combination_of_gradients_vanishes(ask):
     """Three directions of one plane that cancel: g_w = 0, the direction is undefined."""
     rows = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
     np.testing.assert_array_equal(ask("cagrad", rows).result, [0, 0])

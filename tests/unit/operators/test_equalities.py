@@ -31,7 +31,7 @@ def test_operators_equal_symmetric_for_two_views(name, factor, ask):
         same(ask("symmetric", rows), factor * ask(name, rows).weights, rows)
 
 
-def test_a_gate_without_memory_is_symmetric(ask):
+def test_a_gate_without_memory_equals_symmetric(ask):
     open_gate = build("operators", "confgate", {"warmup": 0})
     for rows in pairs():
         same(ask("symmetric", rows), ask(open_gate, rows).weights, rows)
@@ -47,7 +47,7 @@ def test_nash_is_parallel_to_imtl_g(ask):
         assert one @ other / lengths[0] / lengths[1] == pytest.approx(1, abs=1e-12)
 
 
-def test_soft_at_strength_zero_is_sum(ask):
+def test_soft_with_strength_zero_equals_sum(ask):
     weak = build("operators", "soft", {"strength": 0.0})
     for rows in pairs():
         present = rows.any(axis=1)

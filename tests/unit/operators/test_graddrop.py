@@ -16,7 +16,7 @@ def drop(*gradients, seed=0):
     return GradDrop().aggregate(context, EMPTY_STATE)[0].gradients["means"]
 
 
-def test_two_to_one_keeps_the_positive_in_two_of_three_places():
+def test_graddrop_keeps_the_positive_sign_with_probability_two_thirds_for_two_to_one():
     count = 90_000
     found = drop(torch.full((count,), 2.0), torch.full((count,), -1.0))
     assert set(found.unique().tolist()) == {-1.0, 2.0}
@@ -24,7 +24,7 @@ def test_two_to_one_keeps_the_positive_in_two_of_three_places():
     assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / count)
 
 
-def test_elements_of_one_sign_are_added_and_zeros_stay():
+def test_elements_of_equal_sign_are_added_and_zeros_are_kept():
     found = drop(torch.tensor([1.0, -2.0, 0.0, 0.0]), torch.tensor([3.0, -1.0, 5.0, 0.0]))
     assert found.tolist() == [4.0, -3.0, 5.0, 0.0]
 
@@ -36,13 +36,13 @@ def test_extreme_elements_neither_overflow_nor_vanish(size):
     assert 400 < int((found > 0).sum()) < 600
 
 
-def test_the_same_generator_gives_the_same_draws():
+def test_the_same_generator_gives_the_same_signs():
     g = torch.randn((2, 500), generator=torch.Generator().manual_seed(0))
     assert torch.equal(drop(*g), drop(*g))
     assert not torch.equal(drop(*g), drop(*g, seed=1))
 
 
-def test_views_that_are_not_finite_are_left_out():
+def test_non_finite_views_are_left_out():
     bad = torch.tensor([1.0, float("nan")])
     assert drop(bad, torch.tensor([2.0, -3.0])).tolist() == [2.0, -3.0]
     assert drop(bad, bad) is None

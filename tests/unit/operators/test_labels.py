@@ -38,7 +38,7 @@ def test_anchors_need_near_and_far_views():
     assert objections("gradnorm", "random-split") == []
 
 
-def test_anchors_need_pairs():
+def test_the_anchors_operator_requires_two_views():
     assert objections("anchors", "anchors-30", "anchors", views=4) == [
         "operator anchors needs K = 2 (--views); K is 4"
     ]
@@ -46,7 +46,7 @@ def test_anchors_need_pairs():
 
 @pytest.mark.parametrize("name", ["sum", "symmetric", "upgrad", "graddrop", "chain"])
 @pytest.mark.parametrize("views", [1, 2, 5])
-def test_other_operators_take_any_views(name, views):
+def test_other_operators_accept_any_views(name, views):
     assert objections(name, "random", views=views) == []
 
 
@@ -55,7 +55,7 @@ CHAIN = {"name": "chain", "links": ["gradnorm"]}
 
 @pytest.mark.parametrize("operator", [{"name": "anchors"}, {"name": "gradnorm"}, CHAIN], ids=str)
 @pytest.mark.parametrize("sampler", ["epoch", "random", "fps"])
-def test_an_operator_brings_the_grouping_that_it_needs(operator, sampler):
+def test_an_operator_selects_the_grouping_that_it_needs(operator, sampler):
     config = RunConfig.model_validate(
         {"steps": 10, "operator": operator, "sampler": {"name": sampler}}
     )

@@ -35,7 +35,7 @@ DRAWN = settings(
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
 @pytest.mark.parametrize("name", OURS)
-def test_law(name, law):
+def test_every_operator_obeys_every_law(name, law):
     error = law(made(name))
     assert error is None or error <= 8
 
@@ -43,7 +43,9 @@ def test_law(name, law):
 @pytest.mark.parametrize("name", GRAMIAN)
 @DRAWN
 @given(data=st.data())
-def test_any_gradients(name, data, ask, gradient_rows):
+def test_results_for_any_gradients_are_finite_and_independent_of_scale(
+    name, data, ask, gradient_rows
+):
     """Finite, bounded where promised, the same for gradients 2^60 times as long or short."""
     operator = build("operators", name, {})
     rows = data.draw(gradient_rows())
@@ -61,7 +63,7 @@ def test_any_gradients(name, data, ask, gradient_rows):
 @pytest.mark.parametrize("name", UNORDERED)
 @DRAWN
 @given(data=st.data())
-def test_order_of_views(name, data, ask):
+def test_the_order_of_views_does_not_change_the_result(name, data, ask):
     seed, views = data.draw(st.integers(0, 10_000)), data.draw(st.integers(2, 6))
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((views, 9)) * 10.0 ** rng.uniform(-4, 4, (views, 1))

@@ -29,7 +29,7 @@ def revived(state):
     return PluginState(values, tensors, rows)
 
 
-def test_gradvac_turns_gradients_to_the_usual_cosine(context_of, ask):
+def test_gradvac_rotates_gradients_to_the_averaged_cosine(context_of, ask):
     state = repeat(ask, "gradvac", AGREEMENT, 60).state
     usual = AGREEMENT[0] @ AGREEMENT[1] / np.linalg.norm(AGREEMENT[1])
     gramians = (CONFLICT @ CONFLICT.T)[None]
@@ -41,7 +41,7 @@ def test_gradvac_turns_gradients_to_the_usual_cosine(context_of, ask):
         assert v @ partner / np.linalg.norm(v) / np.linalg.norm(partner) == pytest.approx(usual)
 
 
-def test_confgate_waits_and_then_projects(ask):
+def test_confgate_projects_only_after_repeated_conflicts(ask):
     operator = build("operators", "confgate", {})
     waiting = repeat(ask, operator, CONFLICT, 100)
     np.testing.assert_array_equal(waiting.weights, [1, 1])
@@ -57,7 +57,7 @@ def test_confgate_does_not_project_a_rare_conflict(ask):
     np.testing.assert_array_equal(ask(operator, CONFLICT, state=used_to_agree).weights, [1, 1])
 
 
-def test_confgate_low_believes_sooner_than_v2(ask):
+def test_confgate_low_detects_conflict_sooner_than_v2(ask):
     """Cosines of about -1 and +1, a few more of the former: P(conflict) wanders around 0.8."""
     signs = np.where(np.random.default_rng(0).random(600) < 0.54, -1.0, 1.0)
     gates = {}
@@ -78,7 +78,7 @@ def test_confgate_does_not_count_zero_or_disjoint_pairs(rows, ask):
     assert not state.tensors["moments"].any()
 
 
-def test_gradnorm_brings_the_norms_together(ask):
+def test_gradnorm_equalises_the_gradient_norms(ask):
     rows = np.array([[10.0, 0.0], [0.0, 1.0]])
     found = repeat(ask, "gradnorm", rows, 400)
     lengths = found.weights * np.linalg.norm(rows, axis=1)
@@ -86,7 +86,7 @@ def test_gradnorm_brings_the_norms_together(ask):
     assert found.weights.sum() == pytest.approx(2)
 
 
-def test_gradnorm_favours_the_group_whose_loss_falls_slowly(ask):
+def test_gradnorm_favours_the_group_whose_loss_decreases_slowly(ask):
     rows = np.array([[1.0, 0.0], [0.0, 1.0]])
     state = repeat(ask, "gradnorm", rows, 50, losses=[1.0, 1.0]).state
     found = repeat(ask, "gradnorm", rows, 300, state=state, losses=[1.0, 0.5])
@@ -100,7 +100,7 @@ def test_gradnorm_gives_the_views_of_a_group_one_weight(ask):
     assert weights[:2].sum() == pytest.approx(2)
 
 
-def test_gradnorm_needs_labels(context_of):
+def test_gradnorm_requires_labels(context_of):
     import dataclasses
 
     gramians = np.eye(2)[None]
@@ -111,7 +111,7 @@ def test_gradnorm_needs_labels(context_of):
 
 
 @pytest.mark.parametrize("name", ["gradvac", "confgate", "gradnorm", "dispatch"])
-def test_a_resumed_run_goes_on_exactly(name, ask):
+def test_a_resumed_operator_continues_exactly(name, ask):
     rng = np.random.default_rng(0)
     steps = rng.standard_normal((130, 2, 4)) - 0.2
     state = resumed = EMPTY_STATE
@@ -122,7 +122,7 @@ def test_a_resumed_run_goes_on_exactly(name, ask):
 
 
 @pytest.mark.parametrize("name", ["gradvac", "confgate", "gradnorm"])
-def test_rows_of_primitives_have_their_own_memory_that_moves_with_them(name, context_of):
+def test_per_primitive_memory_follows_its_primitives(name, context_of):
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((5, 2, 3))
     gramians = rows @ rows.transpose(0, 2, 1)

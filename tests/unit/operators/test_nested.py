@@ -22,12 +22,12 @@ def chain(*links):
     return build("operators", "chain", {"links": links})
 
 
-def test_the_empty_chain_is_sum(ask):
+def test_an_empty_chain_equals_sum(ask):
     np.testing.assert_array_equal(ask(chain(), ROWS).weights, [1, 1, 1])
 
 
 @pytest.mark.parametrize("name", ["symmetric", "cagrad", "upgrad", "mgda", "preconditioner"])
-def test_one_link_and_the_identity_change_nothing(name, ask):
+def test_a_chain_of_one_operator_and_the_identity_equals_the_operator(name, ask):
     alone = ask(name, ROWS).weights
     for links in ((name,), ("sum", name), (name, "sum")):
         np.testing.assert_allclose(ask(chain(*links), ROWS).weights, alone, rtol=1e-13)
@@ -42,26 +42,26 @@ def test_chains_are_associative(ask):
         np.testing.assert_allclose(found.weights, flat.weights, rtol=1e-13)
 
 
-def test_a_link_sees_what_the_one_before_made_of_the_gradients(ask):
+def test_a_link_receives_the_result_of_the_previous_link(ask):
     scaled = ROWS * np.array([[0.25], [1.0], [4.0]])
     expected = ask("symmetric", scaled).result / 3
     found = ask(chain("preconditioner", "symmetric", "mean"), ROWS, distances=[0.5, 1, 2])
     np.testing.assert_allclose(found.result, expected, rtol=1e-13)
 
 
-def test_rows_that_cancel_are_gone_for_the_next_link(ask):
+def test_gradients_that_cancel_are_zero_for_the_next_link(ask):
     rows = np.array([[2.0, 0.0], [-1.0, 0.0], [0.0, 3.0]])
     np.testing.assert_allclose(ask(chain("symmetric", "imtl-g"), rows).result, [0.0, 3.0])
 
 
-def test_the_state_of_every_link_is_kept_apart(ask):
+def test_each_link_has_a_separate_state(ask):
     operator = chain("gradvac", "confgate", "gradvac")
     state = ask(operator, ROWS).state
     assert set(state.tensors) == {"0/target", "1/moments", "2/target"}
     assert set(ask(operator, ROWS, state=state).state.tensors) == set(state.tensors)
 
 
-def test_dispatch_serves_each_kind_by_its_own_operator(context_of):
+def test_dispatch_applies_a_separate_operator_to_each_kind(context_of):
     gramians = np.stack([ROWS[:2] @ ROWS[:2].T] * 3)
     blocks = ("means", "opacities", "f_dc")
     context = context_of(gramians, blocks=blocks)
@@ -96,14 +96,14 @@ def test_dispatch_serves_each_kind_by_its_own_operator(context_of):
     ],
     ids=["chain", "dispatch"],
 )
-def test_configurations_are_read_back(operator):
+def test_configurations_of_nested_operators_are_read_back(operator):
     written = json.loads(json.dumps(operator.model_dump(mode="json")))
     assert type(operator).model_validate(written) == operator
     assert hash(type(operator).model_validate(written)) == hash(operator)
 
 
 @pytest.mark.parametrize("links", [["graddrop"], [{"name": "pcgrad", "granularity": "kind"}], [3]])
-def test_links_that_cannot_work_are_refused(links):
+def test_links_that_cannot_be_combined_are_refused(links):
     with pytest.raises(ValidationError):
         Chain(links=links)
 
@@ -142,7 +142,7 @@ def test_rules_for_blocks_that_do_not_exist_are_refused():
     "outer",
     [chain("sum", "pcgrad"), Dispatch(rules={"geometry": "pcgrad", "appearance": "pcgrad"})],
 )
-def test_a_wrong_answer_of_an_inner_operator_names_it(ask, monkeypatch, outer, answer):
+def test_a_wrong_result_of_an_inner_operator_names_this_operator(ask, monkeypatch, outer, answer):
     monkeypatch.setattr(PCGrad, "transform", lambda self, *_: answer)
     with pytest.raises(UserError) as caught:
         ask(outer, ROWS)

@@ -23,12 +23,12 @@ def verdict(name, rows, dtype=torch.float32):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_five_short_rows(name):
+def test_five_short_rows_give_exact_results(name):
     assert verdict(name, FIVE).verdict == "ok"
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_integer_rows(name):
+def test_integer_rows_give_exact_results(name):
     rng = np.random.default_rng(3)
     for _ in range(12):
         views, size = rng.integers(3, 10), rng.integers(1, 5)
@@ -66,12 +66,12 @@ NEARLY = [
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", METHODS)
-def test_directions_that_nearly_cancel(name, dtype):
+def test_nearly_cancelling_rows_give_no_wrong_result(name, dtype):
     for rows in NEARLY:
         assert verdict(name, rows, dtype).verdict in {"ok", "undetermined", "outside"}, rows
 
 
-def test_a_pair_that_cancels_leaves_no_direction(ask):
+def test_cagrad_gives_zero_if_two_short_gradients_cancel(ask):
     """CAGrad between others and two short ones: no level above 0 can be reached by all."""
     rows = np.array([[0.5, 1, 2], [0.2, 4, 1], [0.3, 2, 5], [1e-3, 0, 0], [-1e-3, 0, 0]])
     assert not ask("cagrad", rows).result.any()

@@ -79,13 +79,13 @@ class Absolute(GramianOperator):
 
 
 @pytest.mark.parametrize("dtype", BOTH, ids=str)
-def test_an_operator_that_is_seldom_wrong_by_a_little_is_found(dtype):
+def test_the_search_finds_an_operator_that_is_seldom_slightly_wrong(dtype):
     (tally,) = search([symmetric_as(SeldomOff())], Extent(rounds=4, dtypes=(dtype,)))
     assert failed(tally)
     assert "u kappa" in tally.failures[0][1]
 
 
-def test_an_operator_that_is_not_a_number_once_in_ten_thousand_is_found():
+def test_the_search_finds_an_operator_that_is_rarely_nan():
     found = run_finite(symmetric_as(SeldomNan()), 20_000)
     assert found.not_finite > 0
     assert "not finite" in as_text([found])
@@ -94,7 +94,7 @@ def test_an_operator_that_is_not_a_number_once_in_ten_thousand_is_found():
     assert np.isnan(again).any()
 
 
-def test_an_operator_that_jumps_is_found():
+def test_the_search_finds_an_operator_with_a_jump():
     (tally,) = search([symmetric_as(Jumps())], Extent(rounds=1, dtypes=(torch.float64,)))
     assert any("moves by" in reason for _, reason in tally.failures)
 
@@ -105,24 +105,24 @@ def test_an_operator_without_a_reference_must_scale_with_the_gradients():
     assert failed(tally)
 
 
-def test_the_right_operator_keeps_every_promise():
+def test_the_correct_operator_passes_the_search():
     assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
 
 
 @pytest.mark.parametrize("rounds", [4, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [*sorted(ORACLES), "chain"])
-def test_a_short_search_finds_nothing_outside_what_is_stated(name, rounds):
+def test_a_short_search_finds_no_result_outside_the_stated_bounds(name, rounds):
     (tally, wide) = search([subject_of(name)], Extent(seed=1, rounds=rounds))
     assert not tally.failures and not wide.failures
 
 
-def test_the_stated_bounds_are_on_the_page():
+def test_the_stated_bounds_are_documented():
     page = (Path(__file__).parents[3] / "docs" / "operators.md").read_text(encoding="utf-8")
     for name, promise in PROMISES.items():
         assert f"| {name} | " in page and f" | {promise.factor_words} |" in page
 
 
-def test_a_longer_search_begins_with_the_cases_of_a_shorter_one():
+def test_a_longer_search_begins_with_the_cases_of_a_shorter_search():
     once = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
     again = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
     for one, other in zip(once, again, strict=True):
@@ -134,14 +134,14 @@ def test_a_longer_search_begins_with_the_cases_of_a_shorter_one():
 
 @pytest.mark.parametrize("dtype", BOTH, ids=str)
 @pytest.mark.parametrize("family", list(FAMILIES))
-def test_gradients_are_exact_in_their_type_and_finite(family, dtype):
+def test_sampled_gradients_are_finite_and_exact_in_their_type(family, dtype):
     rows = rounded(FAMILIES[family](np.random.default_rng(1), 50, 7, 5), dtype)
     assert rows.shape == (50, 7, 5)
     assert np.isfinite(rows).all()
     assert np.array_equal(torch.from_numpy(rows).to(dtype).double().numpy(), rows)
 
 
-def test_families_reach_the_extremes_that_they_are_meant_for():
+def test_gradient_families_reach_their_intended_extremes():
     rng = np.random.default_rng(2)
     norms = np.linalg.norm(FAMILIES["ratios"](rng, 200, 12, 5), axis=2)
     assert (norms.max(axis=1) / norms.min(axis=1)).max() > 1e11
@@ -153,7 +153,7 @@ def test_families_reach_the_extremes_that_they_are_meant_for():
     assert (~FAMILIES["zeros"](rng, 50, 6, 5).any(axis=2)).any()
 
 
-def test_a_failing_case_is_reduced_to_the_rows_it_needs():
+def test_a_failing_case_is_reduced_to_the_rows_that_cause_it():
     class OffForThree(Symmetric):
         def transform(self, gramians, context, state, rng):
             matrices, state = super().transform(gramians, context, state, rng)
@@ -167,7 +167,7 @@ def test_a_failing_case_is_reduced_to_the_rows_it_needs():
     assert small.rows.shape[1] <= 2
 
 
-def test_rows_are_printed_so_that_they_are_read_again_exactly():
+def test_printed_rows_are_read_back_exactly():
     for dtype in BOTH:
         rows = rounded(FAMILIES["mixed"](np.random.default_rng(5), 1, 4, 3)[0], dtype)
         text = Sample(rows, dtype, "test", 0, 1.0).text()
@@ -191,7 +191,7 @@ def test_rows_are_printed_so_that_they_are_read_again_exactly():
         *("[" * 5000, f"[[1{'0' * 400},1]]"),
     ],
 )
-def test_rows_that_are_no_matrix_are_refused(text):
+def test_rows_that_do_not_form_a_matrix_are_refused(text):
     with pytest.raises(UserError, match="no matrix"):
         read_rows(text, torch.float32)
 
@@ -202,7 +202,7 @@ def stress(*arguments):
     return CliRunner().invoke(app, ["stress", *arguments])
 
 
-def test_the_command_searches_and_repeats_what_it_prints():
+def test_the_command_searches_and_repeats_a_printed_case():
     found = stress("symmetric", "--search", "0.01", "--type", "float32")
     assert found.exit_code == 0, found.output
     assert "nothing outside what is stated" in found.output
@@ -211,7 +211,7 @@ def test_the_command_searches_and_repeats_what_it_prints():
     assert stress("symmetric", "--rows", rows, "--type", "float32").exit_code == 0
 
 
-def test_the_command_tells_of_broken_promises_by_its_exit_status(monkeypatch):
+def test_a_failed_search_ends_with_exit_code_1(monkeypatch):
     from crossgrad_operators.stress import suite
 
     monkeypatch.setattr(suite, "subject_of", lambda _name: symmetric_as(Off()))
@@ -220,7 +220,7 @@ def test_the_command_tells_of_broken_promises_by_its_exit_status(monkeypatch):
     assert "broken promises" in found.output
 
 
-def test_the_command_runs_very_many_matrices(monkeypatch):
+def test_the_command_checks_thousands_of_matrices(monkeypatch):
     assert stress("symmetric", "--matrices", "2500").exit_code == 0
 
 
@@ -233,13 +233,13 @@ def test_the_command_runs_very_many_matrices(monkeypatch):
         (["--type", "float32"], "--type does nothing with the fixed cases"),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(arguments, message):
+def test_options_without_an_effect_are_refused(arguments, message):
     found = stress(*arguments)
     assert isinstance(found.exception, UserError)
     assert message in str(found.exception)
 
 
-def test_every_kind_of_run_writes_a_table(tmp_path):
+def test_every_kind_of_search_writes_a_table(tmp_path):
     for place, mode in enumerate((["--search", "0.01"], ["--matrices", "10"], ["--rows", "[[1]]"])):
         path = tmp_path / f"{place}.csv"
         assert stress("sum", *mode, "--csv", str(path)).exit_code == 0

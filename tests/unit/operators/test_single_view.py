@@ -33,7 +33,7 @@ def leaves_one_view_alone(operator):
 
 @pytest.mark.parametrize("name", ADMITTING_ONE)
 @pytest.mark.parametrize("options", [{}, OPTIONS], ids=["defaults", "options"])
-def test_an_operator_says_whether_it_leaves_one_view_alone(name, options):
+def test_an_operator_reports_whether_it_keeps_a_single_view_unchanged(name, options):
     operator = build("operators", name, options.get(name, {}))
     if name == "torchjd":  # Which weighting it has is TorchJD's matter: it claims nothing.
         assert not operator.is_identity(1)
@@ -42,7 +42,7 @@ def test_an_operator_says_whether_it_leaves_one_view_alone(name, options):
     assert not operator.is_identity(2)
 
 
-def test_a_chain_with_a_link_that_does_something_is_not_idle():
+def test_a_chain_with_an_effective_link_is_not_an_identity():
     links = ["preconditioner", "symmetric"]
     assert not build("operators", "chain", {"links": links}).is_identity(1)
 
@@ -75,9 +75,7 @@ def views_of(operator, sampler=None):
         ("pcgrad", {"name": "near-far", "alternating": True}, 1),
     ],
 )
-def test_views_are_those_of_the_sampler_where_the_operator_works_with_them(
-    operator, sampler, views
-):
+def test_the_sampler_sets_the_views_if_the_operator_accepts_them(operator, sampler, views):
     assert views_of(operator, sampler) == (views, [])
 
 
@@ -89,7 +87,7 @@ def test_a_named_operator_gets_enough_views_per_step(operator):
     assert note.startswith(needed)
 
 
-def test_an_operator_without_a_second_view_is_noted_once_with_the_way_out():
+def test_an_operator_without_a_second_view_is_noted_once_with_a_remedy():
     (note,) = notes_of({"name": "pcgrad"}, views=1)
     assert "operator pcgrad does nothing at K = 1" in note
     assert "--views 2" in note
@@ -114,7 +112,7 @@ def test_the_note_names_a_sampler_that_draws_one_view_only():
     assert "--views" not in note and "near-far" in note
 
 
-def test_the_noted_run_is_the_plain_one():
+def test_a_run_with_the_note_equals_a_plain_run():
     def trained(operator):
         config = RunConfig(
             data={"init": "random"}, steps=10, rasterizer=ComponentChoice(name="torch"),

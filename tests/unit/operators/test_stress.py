@@ -30,7 +30,7 @@ SHORT = cases(large=20_000, exact=300)
 
 
 @pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
-def test_case(case):
+def test_every_operator_passes_every_stress_case(case):
     with mpmath.mp.workdps(50):
         exact = ExactCase(case)
         for name in OURS:
@@ -39,7 +39,7 @@ def test_case(case):
             assert cell.finding.verdict != "failed", (name, cell.finding)
 
 
-def test_every_built_in_but_the_adapter_has_a_reference():
+def test_every_bundled_operator_except_the_adapter_has_a_reference():
     for name in OURS:
         reference = reference_of(name, made(name))
         assert (reference.oracle or reference.rule) or name == "torchjd"
@@ -70,7 +70,7 @@ class Broken(Symmetric):
         (Broken(), "zero row", "not finite"),
     ],
 )
-def test_flaws_are_found(operator, case, reason):
+def test_deliberate_flaws_are_found(operator, case, reason):
     (chosen,) = (c for c in SHORT if c.name == case)
     reference = Reference(reference_of("symmetric", Symmetric()).oracle, {})
     with mpmath.mp.workdps(50):
@@ -96,7 +96,7 @@ def test_exact_gramians_have_fifty_digits():
         assert gramian[0][1] == mpmath.mpf(10) ** 16 - 1 + mpmath.mpf(2) ** -298
 
 
-def test_a_repeated_pattern_counts_as_often_as_it_is_there():
+def test_a_repeated_pattern_counts_with_its_repetitions():
     case = Case("x", np.zeros((2, 0)), np.array([[1.0, 2.0], [3.0, -1.0]]), copies=7)
     assert case.size == 14
     assert torch.cat([g[:2] for g in case.gradients()]).tolist() == [1, 2, 3, -1]
@@ -116,7 +116,7 @@ def test_the_table_shows_errors_times_and_failures(tmp_path):
     assert any(row.startswith("anchors,K = 3,refused") for row in rows)
 
 
-def test_no_table_is_overwritten(tmp_path, capsys):
+def test_an_existing_table_is_not_overwritten(tmp_path, capsys):
     table = tmp_path / "table.csv"
     table.write_text("mine")
     assert ended("stress", "symmetric", "--case", "plain", "--csv", table) == 2
@@ -128,7 +128,7 @@ def test_an_unknown_stress_case_is_refused(capsys):
     assert "no case has this in its name" in capsys.readouterr().err
 
 
-def test_the_command_tells_by_its_exit_status(monkeypatch):
+def test_the_exit_code_tells_whether_checks_fail(monkeypatch):
     from crossgrad_core.cli.main import app
     from crossgrad_operators.stress import suite
 
@@ -141,7 +141,7 @@ def test_the_command_tells_by_its_exit_status(monkeypatch):
     assert "checks fail" in bad.output
 
 
-def test_without_mpmath_the_suite_says_what_to_install(monkeypatch):
+def test_the_suite_without_mpmath_names_the_package_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mpmath", None)
     with pytest.raises(UserError, match=r"crossgrad\[test\]"):
         list(run_suite(["sum"], []))

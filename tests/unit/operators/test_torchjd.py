@@ -43,12 +43,12 @@ def agree(name, weighting, views, ask):
     ("name", "weighting"),
     [("sum", "Sum"), ("mean", "Mean"), ("imtl-g", "IMTLG"), ("aligned", "AlignedMTL")],
 )
-def test_direct_methods(name, weighting, views, ask):
+def test_closed_form_methods_agree_with_torchjd(name, weighting, views, ask):
     agree(name, getattr(aggregation, f"{weighting}Weighting")(), views, ask)
 
 
 @pytest.mark.parametrize(("name", "weighting"), [("pcgrad", "PCGrad"), ("gradvac", "GradVac")])
-def test_pairwise_methods_at_two_views(name, weighting, ask):
+def test_pairwise_methods_agree_with_torchjd_for_two_views(name, weighting, ask):
     for rows in gradients(2):
         gramian = rows @ rows.T
         fresh = getattr(aggregation, f"{weighting}Weighting")()
@@ -57,7 +57,7 @@ def test_pairwise_methods_at_two_views(name, weighting, ask):
 
 
 @pytest.mark.parametrize("beta", [0.3, 0.5])
-def test_gradvac_follows_the_same_targets(beta, ask):
+def test_gradvac_follows_the_target_cosines_of_torchjd(beta, ask):
     operator = build("operators", "gradvac", {"beta": beta})
     theirs = aggregation.GradVacWeighting(beta=beta)
     state = None
@@ -70,7 +70,7 @@ def test_gradvac_follows_the_same_targets(beta, ask):
 
 
 @pytest.mark.parametrize("views", VIEWS)
-def test_mgda(views, ask):
+def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
     """Frank and Wolfe's steps shrink slowly: theirs is as far off as it is longer, no further.
 
     For u the shortest point of a convex set and v any other, |v - u|^2 <= |v|^2 - |u|^2.
@@ -86,7 +86,7 @@ def test_mgda(views, ask):
 
 
 @pytest.mark.parametrize("views", VIEWS)
-def test_mgda_where_every_view_counts(views, ask):
+def test_mgda_agrees_with_torchjd_if_every_view_has_a_positive_weight(views, ask):
     """Frank and Wolfe's steps converge fast where the shortest point lies well inside."""
     theirs = aggregation.MGDAWeighting(epsilon=1e-16, max_iters=1000)
     compared = 0
@@ -102,14 +102,14 @@ def test_mgda_where_every_view_counts(views, ask):
 
 @pytest.mark.parametrize("views", VIEWS)
 @pytest.mark.parametrize(("name", "weighting"), [("upgrad", "UPGrad"), ("dualproj", "DualProj")])
-def test_cone_projections(name, weighting, views, ask):
+def test_cone_projections_agree_with_torchjd(name, weighting, views, ask):
     projector = QuadprogProjector(norm_eps=1e-12, reg_eps=1e-10)
     agree(name, getattr(aggregation, f"{weighting}Weighting")(projector=projector), views, ask)
 
 
 @pytest.mark.parametrize("views", VIEWS)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
-def test_cagrad(views, ask, monkeypatch):
+def test_cagrad_agrees_with_torchjd_with_a_tight_solver(views, ask, monkeypatch):
     """With a tight solver, which warns that it could not get all the way to 1e-15."""
     solve = partialmethod(cvxpy.Problem.solve, **TIGHT)
     monkeypatch.setattr(cvxpy.Problem, "solve", solve)
@@ -117,7 +117,7 @@ def test_cagrad(views, ask, monkeypatch):
 
 
 @pytest.mark.parametrize("views", VIEWS)
-def test_cagrad_is_never_behind_theirs_as_it_comes(views, ask):
+def test_cagrad_is_never_worse_than_torchjd_with_default_solver(views, ask):
     """With TorchJD's own solver settings the directions differ by its accuracy, about 6e-5.
 
     Both stay within c |g_0| of the mean; theirs never serves the worst-off view better.
@@ -134,7 +134,7 @@ def test_cagrad_is_never_behind_theirs_as_it_comes(views, ask):
         np.testing.assert_allclose(found, expected, atol=2e-4 * np.linalg.norm(expected))
 
 
-def test_adapter_is_scale_free_and_leaves_zero_views_out(ask):
+def test_the_adapter_does_not_depend_on_scale_and_ignores_zero_views(ask):
     rows = np.random.default_rng(0).standard_normal((3, 8))
     rows[1] = 0
     plain = ask("torchjd", rows).weights
@@ -143,7 +143,7 @@ def test_adapter_is_scale_free_and_leaves_zero_views_out(ask):
     assert plain[1] == 0
 
 
-def test_adapter_passes_options_and_leaves_the_global_generator_alone(ask):
+def test_the_adapter_passes_options_and_does_not_use_the_global_generator(ask):
     operator = build("operators", "torchjd", {"weighting": "Krum", "options": {"n_byzantine": 0}})
     assert hash(operator) == hash(type(operator).model_validate(operator.model_dump(mode="json")))
     rows = np.random.default_rng(0).standard_normal((4, 8))
@@ -164,12 +164,12 @@ def test_adapter_passes_options_and_leaves_the_global_generator_alone(ask):
         ({"weighting": "ConstantWeighting"}, "cannot be made"),
     ],
 )
-def test_adapter_refuses(options, reason, ask):
+def test_the_adapter_refuses_unusable_weightings(options, reason, ask):
     with pytest.raises(UserError, match=reason):
         ask(build("operators", "torchjd", options), np.eye(2))
 
 
-def test_adapter_says_what_to_install(monkeypatch, ask):
+def test_the_adapter_names_the_package_to_install(monkeypatch, ask):
     monkeypatch.setitem(__import__("sys").modules, "torchjd", None)
     with pytest.raises(UserError, match=r"crossgrad\[torchjd\]"):
         ask("torchjd", np.eye(2))

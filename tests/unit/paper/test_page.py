@@ -36,7 +36,7 @@ def verdicts(text):
     return [re.split(r"[:|]", row[-1])[0].strip() for row in rows if len(row) == 5]
 
 
-def test_every_table_and_row_of_the_paper_is_there(modules, empty):
+def test_every_table_and_row_of_the_paper_is_on_the_page(modules, empty):
     for table, methods in modules.data.read_tables().items():
         assert f"(`{table}`)" in empty
         part = empty.partition(f"(`{table}`)")[2].partition("###")[0]
@@ -44,14 +44,14 @@ def test_every_table_and_row_of_the_paper_is_there(modules, empty):
             assert f"\n| {method} |" in part
 
 
-def test_every_claim_is_there(modules, empty):
+def test_every_claim_of_the_paper_is_on_the_page(modules, empty):
     for section in modules.data.read_claims().sections:
         assert f"### {section.title}" in empty
         for claim in section.claims:
             assert f"| {claim.where} | {claim.says} |" in empty
 
 
-def test_without_runs_nothing_is_claimed(empty):
+def test_the_page_makes_no_claim_without_runs(empty):
     found = verdicts(empty)
     # What follows from the paper's own tables needs no run.
     assert found.count("does not hold") == 1 and "from the paper's own tables" in empty
@@ -60,14 +60,14 @@ def test_without_runs_nothing_is_claimed(empty):
     assert re.search(r"\*\*0 of \d+ runs have finished\.\*\*", empty)
 
 
-def test_every_row_that_is_tested_names_its_command(modules, empty):
+def test_every_tested_row_names_its_command(modules, empty):
     scripts = re.findall(r"`python benchmarks/paper\.py run --only ([\w,]+)`", empty)
     names = {name for script in scripts for name in script.split(",")}
     assert names <= set(modules.data.read_plan().grids)
     assert names >= {"views", "pairing", "operators", "variants", "groupings", "backbones"}
 
 
-def test_claims_name_arms_that_one_grid_has(modules, measured):
+def test_claims_name_arms_that_exactly_one_grid_defines(modules, measured):
     homes = [arm.name for grid in measured.values() for arm in grid.arms]
     assert len(set(homes)) == len(homes)
     named = {arm for check in modules.data.read_claims().checks() for arm in check.arms}
@@ -83,7 +83,7 @@ def test_every_arm_of_the_grids_is_on_the_page(modules, measured):
     assert homes <= named
 
 
-def test_every_rate_comes_from_an_arm_that_is_tuned(modules, grids):
+def test_every_learning_rate_comes_from_a_tuned_arm(modules, grids):
     plan = modules.data.read_plan()
     tuned = {arm.name for arm in grids[plan.tuning].arms}
     assert set(plan.rates.values()) <= tuned
@@ -94,7 +94,7 @@ def test_every_rate_comes_from_an_arm_that_is_tuned(modules, grids):
     )
 
 
-def test_the_budget_is_twelve_core_hours(modules, grids):
+def test_the_grids_of_the_paper_need_at_most_twelve_core_hours(modules, grids):
     plan, total = modules.data.read_plan(), 0.0
     for name, grid in grids.items():
         cells = len(grid.scenes) * len(grid.seeds)
@@ -104,7 +104,7 @@ def test_the_budget_is_twelve_core_hours(modules, grids):
     assert total <= 12 * 3600
 
 
-def test_runs_are_shown_scene_by_scene_and_over_training(modules, planted, grid_of):
+def test_runs_are_shown_per_scene_and_over_training(modules, planted, grid_of):
     arms = {"one view, 1x": 0.0, "one view, 2x stretched": 0.5, "two random views": 0.5}
     sweep = planted("views", {**arms, "symmetric": 0.5})
     figures = {
@@ -127,7 +127,7 @@ def test_runs_are_shown_scene_by_scene_and_over_training(modules, planted, grid_
 
 
 @pytest.mark.parametrize(("low", "high"), [("", ""), (0.0, 0.0)], ids=["now", "before"])
-def test_an_estimate_below_zero_without_an_interval_says_so(modules, planted, grid_of, low, high):
+def test_an_estimate_below_zero_without_an_interval_is_marked(modules, planted, grid_of, low, high):
     sweep = planted("below", {"symmetric": 0.0})
     figures = {"sigma_w2": 4.0, "sigma_w2_low": 3.0, "sigma_w2_high": 5.0, "rho": -0.0105}
     figures |= {"rho_low": low, "rho_high": high, "sigma_b2": -0.042, "conflict_rate": 0.5}
@@ -139,7 +139,7 @@ def test_an_estimate_below_zero_without_an_interval_says_so(modules, planted, gr
     assert f"| 4 (3 to 5) | -0.042 (0 to 0.1) | {none} | {none} |" in text
 
 
-def test_machines_have_their_commits(modules, planted, grid_of):
+def test_machines_are_listed_with_their_commits(modules, planted, grid_of):
     sweeps = {
         name: planted(name, {name: 0.0}, environment={"commit": commit})
         for name, commit in (("symmetric", "bbbbbbb"), ("near-far", "aaaaaaa"))
@@ -150,7 +150,7 @@ def test_machines_have_their_commits(modules, planted, grid_of):
     assert "Machines: A Processor, crossgrad 0.2.0 (commits: aaaaaaa, bbbbbbb). " in text
 
 
-def test_the_same_results_make_the_same_page(modules, planted, grid_of):
+def test_the_same_results_give_the_same_page(modules, planted, grid_of):
     sweep = planted("again", {"symmetric": 0.0, "near-far": 0.0})
     pages = []
     for _ in range(2):

@@ -35,7 +35,7 @@ def factors(modules, sweep, wanted, **more):
 
 
 @pytest.mark.parametrize("first", ["a", "z"])
-def test_a_changed_grid_has_its_own_runs(modules, tmp_path, first):
+def test_a_changed_grid_uses_its_own_runs_only(modules, tmp_path, first):
     """Whatever the order of the folders' names, which are hashes."""
     old = write_runs(tmp_path, first, rate_factor=2.0)
     new = write_runs(tmp_path, "m", rate_factor=20.0)
@@ -56,7 +56,7 @@ def test_runs_of_an_earlier_grid_do_not_replace_missing_runs(modules, tmp_path):
     assert factors(modules, tmp_path, grid()) == []
 
 
-def test_runs_of_another_length_are_others(modules, tmp_path):
+def test_runs_of_another_length_do_not_count_for_the_grid(modules, tmp_path):
     write_table(tmp_path, write_runs(tmp_path, "a", steps=300, rate_factor=2.0))
     assert factors(modules, tmp_path, grid(steps=600)) == []
     assert factors(modules, tmp_path, grid(max_views=300)) == [2.0] * 3

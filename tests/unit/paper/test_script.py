@@ -21,7 +21,7 @@ def grid(*arms):
     )
 
 
-def test_an_arm_has_the_factors_of_the_tuned_one_by_scene(modules):
+def test_an_arm_gets_the_factors_of_its_tuned_arm_by_scene(modules):
     plan = modules.data.read_plan()
     names = ["one view, 2x stretched", "near and far by turns", "cagrad"]
     rates = {name: modules.paper.own_rate(name, plan, FACTORS) for name in names}
@@ -30,13 +30,13 @@ def test_an_arm_has_the_factors_of_the_tuned_one_by_scene(modules):
     assert factors == [[1.5, 3.0], [1.5, 3.0], [3.0, 6.0]]
 
 
-def test_a_scene_that_was_not_tuned_on_is_refused(modules):
+def test_a_scene_without_tuning_is_refused(modules):
     bad = Grid.model_validate({"scenes": ["/scenes/wood"], "arms": [{"name": "cagrad"}]})
     with pytest.raises(UserError, match="not tuned"):
         modules.paper.with_rates(bad, {"cagrad": "two random views"}, FACTORS)
 
 
-def test_backbones_get_the_methods_and_rates_of_what_they_train(modules):
+def test_backbones_use_the_methods_and_rates_of_similar_arms(modules):
     plan = modules.data.read_plan()
     methods = [
         Arm(name="one view, 2x stretched", settings={"views": 1, "observers": ["diagnostics"]}),
@@ -72,7 +72,7 @@ def paper(modules, tmp_path):
     return make
 
 
-def test_the_estimate_counts_what_is_there_from_packed_tables(paper, planted, modules, capsys):
+def test_the_estimate_subtracts_runs_in_packed_tables(paper, planted, modules, capsys):
     scenes = [f"/scenes/{name}" for name in SCENES[:2]]
     found = paper(scene=scenes, only=["views"])
 
@@ -96,14 +96,14 @@ def test_the_estimate_counts_what_is_there_from_packed_tables(paper, planted, mo
     assert before - left() == pytest.approx(12 * (60 + modules.paper.BESIDES) / 3600, abs=0.011)
 
 
-def test_the_page_is_written_without_runs(paper):
+def test_the_page_can_be_written_without_runs(paper):
     found = paper()
     found.write_page()
     text = found.place.page.read_text(encoding="utf-8")
     assert text.startswith("# The paper, row by row") and "**0 of " in text
 
 
-def test_best_methods_wait_for_all_candidates(paper, planted):
+def test_best_methods_are_chosen_only_after_all_candidates_ran(paper, planted):
     found = paper(scene=["/scenes/city"])
     assert found._best(found.results(), found.grids()) == []
 

@@ -43,7 +43,7 @@ def results(modules, planted, grid_of):
         ("a bit", "better", "holds"),
     ],
 )
-def test_a_planted_difference_has_its_verdict(modules, results, arm, expected, outcome):
+def test_a_known_difference_gets_the_expected_verdict(modules, results, arm, expected, outcome):
     (found,) = answers_of(modules, results, compare(modules, arm, "base", expected))
     assert found.outcome == outcome
     assert "n = 12" in found.figure and "plain" in found.figure
@@ -59,7 +59,7 @@ def test_a_noisy_comparison_is_inconclusive_and_reports_the_pairs_needed(modules
         assert "pairs needed" in found.detail
 
 
-def test_what_was_not_run_is_not_judged(modules, planted, grid_of):
+def test_a_claim_without_runs_is_not_judged(modules, planted, grid_of):
     sweep = planted("half", {"a": 0.0})
     grids = {"half": grid_of(["a", "b"])}
     results = modules.runs.read_results({"half": sweep}, grids)
@@ -70,7 +70,7 @@ def test_what_was_not_run_is_not_judged(modules, planted, grid_of):
     assert not known.figure and not unknown.figure
 
 
-def test_a_sweep_that_is_under_way_is_not_judged(modules, planted, grid_of):
+def test_an_unfinished_sweep_is_not_judged(modules, planted, grid_of):
     sweep = planted("part", {"a": 0.0, "b": 1.0}, scenes=SCENES[:2])
     results = modules.runs.read_results({"part": sweep}, {"part": grid_of("ab")})
     (found,) = answers_of(modules, results, compare(modules, "b", "a", "better"))
@@ -79,9 +79,7 @@ def test_a_sweep_that_is_under_way_is_not_judged(modules, planted, grid_of):
 
 
 @pytest.mark.parametrize(("failed", "outcome"), [(1, "holds"), (3, "inconclusive")])
-def test_failed_runs_leave_a_claim_open_where_they_are_many(
-    modules, planted, grid_of, failed, outcome
-):
+def test_many_failed_runs_leave_a_claim_undecided(modules, planted, grid_of, failed, outcome):
     """A whole scene of four, here, that an arm cannot be trained on."""
     sweep = planted("some", {"a": 0.0, "b": 1.0})
     results = modules.runs.read_results({"some": sweep}, {"some": grid_of("ab")})
@@ -96,7 +94,7 @@ def test_failed_runs_leave_a_claim_open_where_they_are_many(
 @pytest.mark.parametrize(
     ("level", "elsewhere", "says"), [(0.3, -0.3, "better"), (-0.3, 0.3, "worse"), (0, 0.5, "equal")]
 )
-def test_a_scene_that_contradicts_the_others_leaves_a_claim_open(
+def test_a_scene_that_contradicts_the_other_scenes_leaves_a_claim_undecided(
     modules, planted, grid_of, level, elsewhere, says
 ):
     most = planted("most", {"a": 0.0, "b": level}, scenes=SCENES[:3])
@@ -111,7 +109,7 @@ def test_a_scene_that_contradicts_the_others_leaves_a_claim_open(
     assert found.outcome == "holds"
 
 
-def test_statements_of_one_side_are_corrected_together_too(modules):
+def test_one_sided_statements_are_also_corrected_together(modules):
     """Each p-value is below 0.05; of six, only the least is after Holm's correction."""
     rng = np.random.default_rng(0)
     noise = rng.normal(size=9)
@@ -122,7 +120,7 @@ def test_statements_of_one_side_are_corrected_together_too(modules):
     assert not any(each.is_not_above for each in modules.verdicts.judgements(found))
 
 
-def test_scenes_can_be_chosen(modules, results):
+def test_a_claim_can_be_limited_to_scenes(modules, results):
     check = compare(modules, "ahead", "base", "better", scenes=("city", "town"))
     (found,) = answers_of(modules, results, check)
     assert found.outcome == "holds" and "n = 6" in found.figure
@@ -139,7 +137,7 @@ def test_p_values_of_a_table_are_corrected_together(modules, planted, grid_of):
     assert alone.outcome == "holds" and together.outcome != "holds"
 
 
-def test_figures_of_gradients_are_located(modules, planted, grid_of):
+def test_claims_about_gradient_statistics_are_judged_by_their_interval(modules, planted, grid_of):
     sweep = planted("located", {"a": 0.0})
     for number, run in enumerate(sorted((sweep / "runs").iterdir())):
         write_probes_of(run, rho=0.05 + 0.01 * (number % 3))
@@ -186,7 +184,7 @@ def test_blocks_are_compared_and_averaged_run_by_run(modules, planted, grid_of):
     assert found[0].figure.startswith("+0.800") and found[2].figure.startswith("0.400")
 
 
-def test_shares_of_the_papers_own_gap(modules):
+def test_shares_of_the_gap_in_the_papers_tables_contradict_its_text(modules):
     """The text says 80 to 100 % on four of five scenes; its tables do not."""
     claims = modules.data.read_claims()
     claim = next(c for s in claims.sections for c in s.claims if c.id == "gap-closed")

@@ -123,7 +123,7 @@ def test_the_decision_on_modes_matches_the_measured_scenes(name):
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_exposure_as_measured(name, monkeypatch):
+def test_the_exposure_decision_matches_the_measured_scenes(name, monkeypatch):
     *_, spread, reduction, choice = MEASURED[name]
     fit = Fit(np.array([-spread, spread]), 1.0, 1.0 - reduction, np.full(2, 0.01))
     measured = TrackGains(fit.gains, np.array([99, 99]), fit)
@@ -160,7 +160,7 @@ def bundled():
     return config, read_scene(config)[0]
 
 
-def test_the_bundled_scene(bundled):
+def test_the_plan_of_the_bundled_scene_sets_the_gain_exposure(bundled):
     plan = plan_of(*bundled)
     assert [finding.part for finding in plan.findings] == PARTS_OF_THE_TABLE
     assert plan.of_part("modes").choice == "one mode, continuous"
@@ -170,7 +170,7 @@ def test_the_bundled_scene(bundled):
     assert plan.seconds > 0.0
 
 
-def test_what_the_user_set_stays_and_the_table_says_so(bundled):
+def test_settings_of_the_user_are_kept_and_marked_in_the_table(bundled):
     config, scene = bundled
     mine = config.model_copy(update={"exposure": ComponentChoice(name="none")})
     plan = plan_of(mine, scene)
@@ -191,7 +191,7 @@ def test_decisions_become_settings(bundled):
     assert json.loads(json.dumps(data)) == data
 
 
-def test_pairs_need_the_probe():
+def test_pairs_of_views_are_decided_only_with_a_probe():
     found = grouping.pairs(evidence_of("city_hybrid"))
     assert found.basis == "default"
     assert "--probe" in found.evidence
@@ -207,7 +207,7 @@ def test_pairs_need_the_probe():
         (np.nan, np.nan, np.nan, "default", {}),
     ],
 )
-def test_pairs_are_decided_by_the_whole_interval(low, rho, high, status, changes):
+def test_pairs_of_views_are_decided_by_the_whole_interval(low, rho, high, status, changes):
     probe = Probe(rho=rho, rho_low=low, rho_high=high, noise_scale=50.0, conflict=0.5)
     found = grouping.pairs(evidence_of("city_hybrid", probe))
     assert found.basis == status
@@ -221,7 +221,7 @@ def test_an_estimate_below_zero_without_an_interval_decides_nothing():
     assert "-0.011, 95 % interval none, the estimate is below 0" in found.evidence
 
 
-def test_pairs_are_not_drawn_by_an_odd_number_of_views():
+def test_pairs_of_views_are_not_used_with_an_odd_number_of_views():
     probe = Probe(rho=0.5, rho_low=0.2, rho_high=0.9)
     found = grouping.pairs(evidence_of("city_hybrid", probe, views_per_step=3))
     assert not found.settings
@@ -229,7 +229,7 @@ def test_pairs_are_not_drawn_by_an_odd_number_of_views():
 
 
 @pytest.mark.parametrize("noise", [0.4, 2.0, 640.0, np.inf])
-def test_one_view_whatever_the_noise_of_gradients(noise):
+def test_one_view_per_step_is_chosen_for_any_gradient_noise(noise):
     probe = Probe(noise_scale=noise, rho=0.0, rho_low=0.0, rho_high=0.0)
     found = grouping.views_per_step(evidence_of("city_unimodal", probe))
     assert (found.choice, found.basis, found.settings) == ("1", "decided", {})
@@ -244,13 +244,13 @@ def test_a_sampler_of_pairs_sets_two_views_per_step():
 
 
 @pytest.mark.parametrize("name", ["backward", "batch_rule", "densify_views"])
-def test_the_views_of_pairs_are_reported_whatever_else_was_set(name):
+def test_two_views_per_step_are_reported_for_pairs_with_any_other_setting(name):
     value = {"backward": "joint", "batch_rule": "sqrt", "densify_views": "one"}[name]
     evidence = evidence_of("city_hybrid", PAIRS_PAY, **{name: value})
     assert grouping.views_per_step(evidence).choice == "2"
 
 
-def test_views_are_counted_as_the_run_will_have_them():
+def test_the_planner_counts_the_views_per_step_of_the_planned_run():
     assert grouping.views_of_steps(evidence_of("city_hybrid")).counts == (1,)
     asked = evidence_of("city_hybrid", operator={"name": "pcgrad"})
     assert grouping.views_of_steps(asked).counts == (2,)
@@ -259,13 +259,13 @@ def test_views_are_counted_as_the_run_will_have_them():
 
 
 @pytest.mark.parametrize("name", ["sampler", "operator"])
-def test_views_are_left_to_components_that_were_chosen(name):
+def test_views_per_step_are_not_decided_if_the_user_chose_sampler_or_operator(name):
     chosen = {"sampler": "near-far", "operator": "pcgrad"}[name]
     evidence = evidence_of("city_hybrid", **{name: {"name": chosen}})
     assert grouping.views_per_step(evidence).basis == "default"
 
 
-def test_pairs_of_modes_of_unequal_size_would_train_another_objective():
+def test_pairs_from_modes_of_unequal_size_are_rejected_because_they_change_the_objective():
     found = grouping.pairs(evidence_of("ochota_kap_hybrid", PAIRS_PAY))
     assert (found.basis, dict(found.settings)) == ("default", {})
     assert "the smaller mode has 34% of the views" in found.evidence
@@ -282,7 +282,7 @@ def test_pairs_of_modes_of_unequal_size_would_train_another_objective():
         ({"sampler": {"name": "near-far"}, "backward": "joint"}, "sum"),
     ],
 )
-def test_projection_for_pairs_that_the_user_s_sampler_draws(given, choice):
+def test_projection_is_chosen_for_pairs_from_the_sampler_of_the_user(given, choice):
     assert grouping.operator(evidence_of("city_hybrid", PAIRS_PAY, **given)).choice == choice
 
 
@@ -295,20 +295,20 @@ def test_projection_for_pairs_that_the_user_s_sampler_draws(given, choice):
         ({"grouping": {"name": "percentile", "q": 20}}, {"name": "percentile", "q": 20}),
     ],
 )
-def test_the_probe_looks_at_the_groups_of_the_run(given, grouping):
+def test_the_probe_uses_the_groups_of_the_run(given, grouping):
     assert evidence_of("city_hybrid", **given).grouping.model_dump() == grouping
 
 
 @pytest.mark.parametrize(
     ("name", "grouping"), [("city_hybrid", "altitude"), ("ochota_kap_hybrid", "footprint")]
 )
-def test_modes_are_cut_where_they_part_most_cleanly(name, grouping):
+def test_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, grouping):
     assert evidence_of(name).grouping.name == grouping
 
 
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("law", ["uniform", "normal", "exponential", "lognormal"])
-def test_distances_without_a_gap_are_one_mode(law, views):
+def test_distances_without_a_gap_form_one_mode(law, views):
     rng = np.random.default_rng(views)
     draw = {
         "uniform": lambda: rng.uniform(0.0, 2.5, views),
@@ -323,7 +323,7 @@ def test_distances_without_a_gap_are_one_mode(law, views):
 
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("share", [0.2, 0.5])
-def test_modes_with_a_gap_are_two(share, views):
+def test_distances_with_a_gap_form_two_modes(share, views):
     rng = np.random.default_rng(views)
     far = np.arange(views) < round(share * views)
     found = [modes_at(rng.normal(0.0, 0.07, views) + far) for _ in range(100)]
@@ -335,7 +335,7 @@ def test_modes_with_a_gap_are_two(share, views):
 
 @pytest.mark.parametrize("views", [10, 20, 30, 50, 100])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_tenth_of_the_views_is_a_mode_on_either_side(views, side):
+def test_a_tenth_of_the_views_forms_a_mode_on_either_side(views, side):
     far = np.arange(views) < views // 10
     found = modes_at(np.linspace(0.0, 0.1, views) + 2.0 * side * far)
     assert found.two
@@ -343,7 +343,7 @@ def test_a_tenth_of_the_views_is_a_mode_on_either_side(views, side):
 
 
 @pytest.mark.parametrize("stragglers", [1, 2, 5])
-def test_stragglers_are_no_mode(stragglers):
+def test_a_few_outliers_do_not_form_a_mode(stragglers):
     logs = np.random.default_rng(5).normal(0.0, 0.1, 60)
     logs[:stragglers] += 3.0
     assert not modes_at(logs).two
@@ -354,13 +354,13 @@ def test_stragglers_are_no_mode(stragglers):
     ("conflict_low", "rho_low", "choice"),
     [(0.6, 0.2, "symmetric"), (0.45, 0.2, "sum"), (0.6, 0.0, "sum")],
 )
-def test_projection_needs_conflict_beyond_chance_and_pairs(conflict_low, rho_low, choice):
+def test_projection_requires_pairs_and_conflict_beyond_chance(conflict_low, rho_low, choice):
     probe = Probe(rho=0.5, rho_low=rho_low, rho_high=0.9, conflict=0.7, conflict_low=conflict_low)
     assert grouping.operator(evidence_of("city_hybrid", probe)).choice == choice
     assert grouping.operator(evidence_of("city_unimodal", probe)).choice == "sum"
 
 
-def test_a_probe_that_fails_decides_nothing():
+def test_a_failed_probe_decides_nothing():
     probe = Probe(problem="a probe needs two training views of each group")
     evidence = evidence_of("city_hybrid", probe)
     for part in (grouping.pairs, grouping.operator):
@@ -404,7 +404,7 @@ def street(count=30):
     return posed_scene(views, cloud)
 
 
-def test_an_orbit_has_one_distance():
+def test_a_scene_with_cameras_in_an_orbit_has_one_distance():
     plan = plan_for(orbit())
     assert plan.of_part("modes").choice == "one mode, one distance"
     assert plan.of_part("pairs of views").choice == "epoch"
@@ -412,7 +412,7 @@ def test_an_orbit_has_one_distance():
     assert not plan.settings
 
 
-def test_a_transparent_render_gets_the_colour_behind_it():
+def test_a_transparent_render_gets_the_background_of_its_photos():
     note = "photos: 40 of 40 photos with transparency: blended over RGB (1.0, 1.0, 1.0)"
     scene = replace(orbit(), notes=(note,))
     assert plan_for(scene).settings == {"background": "white"}
@@ -420,7 +420,7 @@ def test_a_transparent_render_gets_the_colour_behind_it():
     assert not plan_for(scene, background="black").settings
 
 
-def test_a_street_alone_has_one_mode():
+def test_a_street_scene_has_one_mode():
     plan = plan_for(street())
     assert plan.of_part("modes").choice == "one mode, continuous"
     assert plan.of_part("modes").figures["range"] > 3.0
@@ -428,7 +428,7 @@ def test_a_street_alone_has_one_mode():
     assert not plan.settings
 
 
-def test_a_view_without_points_does_not_keep_pairs_from_being_drawn():
+def test_a_view_without_points_does_not_prevent_pairs():
     rng = np.random.default_rng(1)
     cloud = rng.uniform(-1.0, 1.0, (200, 3))
     views = [
@@ -446,7 +446,7 @@ def test_a_view_without_points_does_not_keep_pairs_from_being_drawn():
     assert rule.labels(views) == ("near", "far") * 10
 
 
-def test_street_and_air_have_two_modes():
+def test_a_scene_of_street_and_aerial_photos_has_two_modes():
     low = street(15)
     cloud = low.points
     high = [
@@ -460,7 +460,7 @@ def test_street_and_air_have_two_modes():
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])
-def test_few_photos_without_points(count):
+def test_a_single_photo_starts_from_random_points_and_several_photos_are_triangulated(count):
     scene = posed_scene([posed_view((i, i * i, 0), f"{i}.png") for i in range(count)])
     plan = plan_for(scene)
     changes = {"data.init": "random"} if count == 1 else {"initializer": "triangulated"}
@@ -471,7 +471,7 @@ def test_few_photos_without_points(count):
 
 
 @pytest.mark.parametrize("photos", [1, 9, 10, 11, 40])
-def test_a_run_without_a_length_gets_one_by_its_photos(photos):
+def test_a_run_without_a_length_gets_a_length_from_its_photos(photos):
     most = max(FEWEST_VIEWS, PASSES * photos)
     found = length_of(photos)
     assert (found.choice, found.basis) == (f"{most:,} views", "decided")
@@ -490,13 +490,13 @@ def test_the_planned_length_is_never_longer_than_the_default(photos, stays):
 
 
 @pytest.mark.parametrize(("views", "photos"), [(2, 600), ("1..2@0.5", 450), ("2..1@0.9", 570)])
-def test_views_of_a_step_are_as_many_of_the_length(views, photos):
+def test_the_planned_length_counts_every_view_of_a_step(views, photos):
     assert length_of(photos - 1, views_per_step=views).choice == f"{100 * photos - 100:,} views"
     assert length_of(photos, views_per_step=views).choice == "30,000 steps"
 
 
 @pytest.mark.parametrize("seconds", [0.5, 60.0])
-def test_seconds_are_the_most_that_may_be_spent(seconds):
+def test_given_seconds_are_an_upper_limit_of_the_planned_length(seconds):
     found = length_of(20, seconds=seconds)
     assert found.choice == f"2,000 views within {seconds:g} s"
     assert dict(found.settings) == {"max_views": 2_000}
@@ -518,26 +518,26 @@ def test_views_and_seconds_given_by_the_user_are_kept():
 
 
 @pytest.mark.parametrize("mine", [{"steps": 7}, {"max_views": 90_000}])
-def test_steps_and_views_are_exactly_what_was_asked_for(mine):
+def test_given_steps_and_views_are_kept_exactly(mine):
     found = length_of(20, **mine)
     assert (found.basis, dict(found.settings)) == ("given", {})
     decided, _, _ = with_decisions(config_of(**mine), orbit(20))
     assert (decided.steps, decided.max_views) == (mine.get("steps"), mine.get("max_views"))
 
 
-def test_a_scene_without_photos_keeps_the_length():
+def test_a_scene_without_photos_keeps_the_default_length():
     assert length(Evidence(config_of(), posed_scene([]))).basis == "default"
 
 
 @pytest.mark.parametrize("backbone", ["scaffold", "mip"])
-def test_a_backbone_that_the_user_chose_is_left_alone(backbone):
+def test_a_backbone_chosen_by_the_user_is_kept(backbone):
     plan = plan_for(orbit(), backbone={"name": backbone})
     assert not plan.settings
     assert plan.of_part("scale filter").basis == "given"
 
 
 @pytest.mark.parametrize("width", [60, 80, 109, 110, 120, 200])
-def test_the_table_keeps_to_the_terminal(width):
+def test_the_table_fits_the_terminal(width):
     lines = list(lines_of(plan_for(street(), steps=50), width))
     assert max(map(len, lines)) <= width
     text = " ".join(lines)
@@ -545,7 +545,7 @@ def test_the_table_keeps_to_the_terminal(width):
     assert "nothing is changed" in text
 
 
-def test_every_decision_says_why_and_how_to_overrule_it():
+def test_every_decision_states_its_reason_and_how_to_override_it():
     for finding in plan_for(street()).findings:
         assert finding.evidence
         assert finding.rule
@@ -602,6 +602,6 @@ def test_the_planner_handles_random_scenes(centers, points, asked, notes):
         (data.held_out, "test_every", 4),
     ],
 )
-def test_settings_of_the_data_that_the_user_set_are_not_decided(decides, setting, value):
+def test_data_settings_of_the_user_are_not_decided(decides, setting, value):
     evidence = Evidence(config_of(data={setting: value}), posed_scene([]))
     assert decides(evidence).basis == "given"

@@ -62,7 +62,7 @@ def test_the_leave_one_out_error_agrees_with_a_loop():
         assert found[row] == pytest.approx((np.array(errors) ** 2).mean(axis=0))
 
 
-def test_matte_points_need_no_bands(monkeypatch):
+def test_matte_points_need_no_sh_bands(monkeypatch):
     scene = ring()
     found = decided(scene, observed(scene, 0.0), monkeypatch)
     assert (found.choice, found.basis) == ("0", "decided")
@@ -71,14 +71,14 @@ def test_matte_points_need_no_bands(monkeypatch):
     assert found.saved == "45 of 59 numbers of a Gaussian"
 
 
-def test_exposure_is_no_view_dependence(monkeypatch):
+def test_exposure_differences_do_not_count_as_view_dependence(monkeypatch):
     scene = ring()
     gains = np.random.default_rng(4).normal(0, 1.5, VIEWS)
     found = decided(scene, observed(scene, 0.0, gains=gains), monkeypatch)
     assert found.choice == "0"
 
 
-def test_a_sheen_keeps_the_bands(monkeypatch):
+def test_a_glossy_surface_keeps_the_sh_bands(monkeypatch):
     scene = ring()
     found = decided(scene, observed(scene, 0.3), monkeypatch)
     assert (found.choice, found.basis) == ("3", "decided")
@@ -94,7 +94,7 @@ def test_short_tracks_decide_nothing(per_point, monkeypatch):
     assert found.figures["tracks"] == 0
 
 
-def test_directions_of_a_narrow_cone_decide_nothing(monkeypatch):
+def test_viewing_directions_in_a_narrow_cone_decide_nothing(monkeypatch):
     scene = ring(radius=1.0, height=40.0)
     found = decided(scene, observed(scene, 0.0), monkeypatch)
     assert found.basis == "default"
@@ -110,14 +110,14 @@ def test_directions_of_a_narrow_cone_decide_nothing(monkeypatch):
         ((500, np.nan, np.nan, np.nan), "3", "default"),
     ],
 )
-def test_the_whole_interval_decides(figures, choice, basis, monkeypatch):
+def test_the_whole_interval_decides_about_sh_bands(figures, choice, basis, monkeypatch):
     measured = view_dependence.ViewDependence(*figures)
     monkeypatch.setattr(view_dependence, "view_dependence", lambda scene: measured)
     found = appearance.degree(Evidence(configured({"scene": "nowhere"}), ring()))
     assert (found.choice, found.basis) == (choice, basis)
 
 
-def test_the_user_s_degree_stays(monkeypatch):
+def test_an_sh_degree_of_the_user_is_kept(monkeypatch):
     scene = ring()
     mine = {"backbone": {"name": "vanilla", "sh_degree": 2}}
     found = decided(scene, observed(scene, 0.0), monkeypatch, **mine)

@@ -46,7 +46,7 @@ def decision(scene, **given):
     return view_schedule(Evidence(configured({"scene": "x", "steps": 100, **given}), scene))
 
 
-def test_far_views_come_first_where_near_ones_look_around():
+def test_the_far_first_schedule_is_chosen_if_near_views_look_around():
     scene = scene_of(AROUND)
     found = decision(scene)
     assert found.basis == "decided"
@@ -57,7 +57,7 @@ def test_far_views_come_first_where_near_ones_look_around():
     json.dumps(found.as_data())
 
 
-def test_the_decided_view_schedule_is_the_sampler_of_the_run():
+def test_the_decided_view_schedule_becomes_the_sampler_of_the_run():
     scene = scene_of(AROUND)
     plan = plan_of(configured({"scene": "x", "steps": 100}), scene)
     run = assemble(configured(plan.applied_to({"scene": "x", "steps": 100})), scene, "colmap")
@@ -79,7 +79,7 @@ def test_a_short_run_uses_the_far_first_schedule(length):
 
 
 @pytest.mark.parametrize("given", [{"steps": 100}, {"seconds": 5.0}, {"steps": 30_000}], ids=str)
-def test_runs_without_a_plan_draw_epochs(given):
+def test_runs_without_a_plan_use_the_epoch_sampler(given):
     asked = configured({"scene": "x", "plan": "off", **given})
     run = assemble(asked, scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "epoch"
@@ -91,7 +91,7 @@ def test_runs_without_a_plan_draw_epochs(given):
     [{"steps": 100, "sampler": {"name": "epoch"}}, {"steps": 100, "schedule": "absolute"}],
     ids=str,
 )
-def test_what_the_user_set_draws_epochs_with_this_plan(given):
+def test_settings_of_the_user_that_exclude_the_plan_keep_the_epoch_sampler(given):
     asked = configured({"scene": "x", **given})
     run = assemble(asked, scene_of(AROUND), "colmap")
     assert run.selection.names["sampler"] == "epoch"
@@ -108,7 +108,7 @@ def missing(*_arguments):
 @pytest.mark.parametrize(
     ("name", "value"), [("resolve_entry", lambda _: broken), ("find", missing)]
 )
-def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeypatch):
+def test_a_planner_that_fails_is_called_only_if_a_plan_is_requested(name, value, monkeypatch):
     monkeypatch.setattr(decisions, name, value)
     off = configured({"scene": "x", "steps": 100, "plan": "off"})
     assemble(off, scene_of(AROUND), "colmap")
@@ -117,14 +117,14 @@ def test_a_planner_that_fails_is_asked_only_where_a_plan_is(name, value, monkeyp
         assemble(asked, scene_of(AROUND), "colmap")
 
 
-def test_long_runs_draw_epochs():
+def test_long_runs_use_the_epoch_sampler():
     found = decision(scene_of(AROUND), steps=30_000)
     assert (found.choice, found.settings) == ("epoch", {})
     assert found.evidence == "measured in shorter runs only"
 
 
 @pytest.mark.parametrize(("photos", "short"), [(100, True), (400, False)])
-def test_a_whole_plan_of_many_photos_is_no_short_run(photos, short):
+def test_a_planned_run_with_many_photos_does_not_count_as_short(photos, short):
     views = scene_of(AROUND).views
     scene = posed_scene([replace(views[i % 24], name=f"{i}.png") for i in range(photos)], CLOUD)
     found = view_schedule(Evidence(configured({"scene": "x"}), scene))
@@ -132,21 +132,21 @@ def test_a_whole_plan_of_many_photos_is_no_short_run(photos, short):
 
 
 @pytest.mark.parametrize("height", [20.0, 30.0])
-def test_two_flight_levels_come_alike(height):
+def test_two_flight_levels_use_the_epoch_sampler(height):
     found = decision(scene_of(DOWN, height))
     assert not found.settings
     assert found.choice == "epoch"
     assert "degrees away" in found.evidence
 
 
-def test_a_scene_with_one_mode_draws_epochs():
+def test_a_scene_with_one_mode_uses_the_epoch_sampler():
     views = [posed_view((3 * i, 0, 90.0), f"{i}.png", forward=(0, 0.2, -1)) for i in range(24)]
     found = decision(posed_scene(views, CLOUD))
     assert (found.choice, dict(found.settings)) == ("epoch", {})
 
 
 @pytest.mark.parametrize("given", [{"sampler": "random"}, {"grouping": "radial"}])
-def test_what_the_user_set_wins(given):
+def test_settings_of_the_user_override_the_decision(given):
     given = {name: {"name": value} for name, value in given.items()}
     assert decision(scene_of(AROUND), **given).basis == "given"
 
@@ -167,7 +167,7 @@ def test_a_small_far_mode_does_not_get_the_far_first_schedule():
     assert found.evidence == "the smaller mode has 33% of the views"
 
 
-def test_far_views_that_look_everywhere_have_no_direction():
+def test_far_views_in_all_directions_do_not_differ_in_direction():
     low = scene_of(AROUND).views[12:]
     ring = [(np.cos(angle), np.sin(angle), 0) for angle in np.linspace(0, 2 * np.pi, 12, False)]
     high = [posed_view((0, 0, 90.0), f"{i}.png", forward=f) for i, f in enumerate(ring)]

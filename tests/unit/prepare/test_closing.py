@@ -30,7 +30,7 @@ def test_the_last_line_is_the_command_that_the_planner_advises(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(("georef", "known"), [(None, False), ({}, True)])
-def test_a_picture_says_from_above_only_where_up_is_known(georef, known, monkeypatch):
+def test_a_diagram_is_titled_from_above_only_if_up_is_known(georef, known, monkeypatch):
     model = pycolmap.Reconstruction(bundled_scene() / "sparse" / "0")
     photos = [SimpleNamespace(name=each.name, folder="") for each in model.images.values()]
     report = SimpleNamespace(

@@ -37,7 +37,7 @@ def numbers(model):
     return sorted(model.reg_image_ids())
 
 
-def test_right_poses_are_not_contradicted(made):
+def test_correct_poses_are_not_contradicted(made):
     assert contradicted(*made) == {}
 
 
@@ -53,7 +53,7 @@ def test_misplaced_photos_are_contradicted(made, count):
     assert all(votes[0] == 0 and votes[1] >= 30 * (PHOTOS - count) for votes in found.values())
 
 
-def test_one_other_photo_does_not_contradict_a_pose(made):
+def test_a_single_other_photo_does_not_contradict_a_pose(made):
     """Which of two is wrong nobody can tell."""
     model, path = made
     one, *others = numbers(model)

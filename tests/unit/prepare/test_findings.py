@@ -44,7 +44,7 @@ def test_the_advice_for_two_models_at_different_heights_is_a_ramp():
     assert bridge.heights == (5.0, 40.0)
 
 
-def test_without_heights_it_is_reported_in_ratios():
+def test_a_bridge_without_known_heights_is_reported_in_ratios():
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS), {})
     assert "between aerial and street" in bridge.advice
     assert bridge.heights is None
@@ -62,20 +62,20 @@ def test_one_bridge_covers_all_pieces_of_a_folder():
     assert bridge.photos == 3
 
 
-def test_a_folder_that_falls_apart_is_reported_so():
+def test_a_folder_split_into_several_models_is_reported():
     pieces = [frozenset(AERIAL[:2]), frozenset(AERIAL[2:])]
     (bridge,) = bridges_of(plan_of(*map(photo, AERIAL)), [], pieces, {})
     assert "aerial: the photos fall apart" in bridge.advice
 
 
-def test_a_folder_in_no_model_needs_a_bridge_and_one_model_of_all_needs_none():
+def test_a_folder_without_a_model_needs_a_bridge_and_a_complete_model_needs_none():
     (bridge,) = bridges_of(PLAN, [], parts_of(PLAN, MODELS[:1]), {})
     assert bridge.second == "street"
     assert not bridges_of(PLAN, [], parts_of(PLAN, [frozenset(AERIAL + STREET)]), {})
     assert not bridges_of(PLAN, [], [], {})
 
 
-def test_pairs_across_are_counted():
+def test_image_pairs_between_folders_are_counted():
     links = [Link("aerial/0", "street/1", 20), Link("aerial/0", "aerial/1", 300)]
     (bridge,) = bridges_of(PLAN, links, parts_of(PLAN, MODELS), {})
     assert bridge.pairs == 1
@@ -111,7 +111,7 @@ def test_intermediate_heights_span_the_range_in_equal_factors(low, factor):
         ({}, 900, 2, "matches with 2 photos"),
     ],
 )
-def test_reasons_why_a_photo_is_lost(changed, features, links, why):
+def test_the_reason_why_a_photo_is_lost_is_reported(changed, features, links, why):
     bad = photo("bad", **changed)
     plan = plan_of(*map(photo, AERIAL), bad)
     found = [Link("bad", name, 20) for name in AERIAL[:links]]

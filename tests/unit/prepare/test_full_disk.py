@@ -82,7 +82,7 @@ def plan_of(model, root, **changed):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_models_that_are_cut_short_or_incomplete_are_reported(model, name, tmp_path):
+def test_truncated_or_incomplete_models_are_reported(model, name, tmp_path):
     folder = written(model, tmp_path / "0")
     assert is_whole(folder)
     size = (folder / name).stat().st_size
@@ -93,7 +93,7 @@ def test_models_that_are_cut_short_or_incomplete_are_reported(model, name, tmp_p
     assert not is_whole(folder)
 
 
-def test_a_model_that_is_cut_short_is_one_error(model, full, tmp_path):
+def test_a_truncated_model_gives_one_error(model, full, tmp_path):
     with pytest.raises(UserError, match=FULL):
         write_model(model, tmp_path)
     # What pycolmap says of a file that cannot even be made.
@@ -101,7 +101,7 @@ def test_a_model_that_is_cut_short_is_one_error(model, full, tmp_path):
         write_model(model, tmp_path / "gone")
 
 
-def test_mapping_names_no_model_that_is_cut_short(model, layout, full, monkeypatch):
+def test_mapping_returns_no_truncated_model(model, layout, full, monkeypatch):
     ways = {"_incremental": lambda *_: {0: model}, "way_of": lambda _: "incremental"}
     ways |= {"_looked_again": lambda *_: ([model], frozenset())}
     ways |= {"_without_misplaced": lambda _, models, __: models}
@@ -122,7 +122,7 @@ def test_a_partly_written_georegistered_model_is_not_kept(model, layout, full):
     assert not layout.placed.exists()
 
 
-def test_adjusting_does_not_read_a_model_that_is_cut_short(model, full, tmp_path, monkeypatch):
+def test_bundle_adjustment_does_not_read_a_truncated_model(model, full, tmp_path, monkeypatch):
     """Pycolmap would read it without an end."""
     place = written(model, tmp_path / "0")
     monkeypatch.setattr(pycolmap, "triangulate_points", lambda *_, **__: model)
@@ -130,7 +130,7 @@ def test_adjusting_does_not_read_a_model_that_is_cut_short(model, full, tmp_path
         mapping._adjusted(1, tmp_path, pycolmap.CancellationToken(), tmp_path / "a.db", place)
 
 
-def test_models_of_earlier_versions_that_are_cut_short_are_made_anew(model, layout):
+def test_truncated_models_of_earlier_versions_are_created_again(model, layout):
     def made():
         for folder in (layout.models / "0", layout.placed, layout.model):
             shutil.rmtree(folder, ignore_errors=True)
@@ -148,7 +148,7 @@ def test_models_of_earlier_versions_that_are_cut_short_are_made_anew(model, layo
     assert not layout.models.exists() and not layout.placed.exists() and not layout.model.exists()
 
 
-def test_a_ready_scene_that_is_cut_short_says_what_to_do(model, layout, tmp_path):
+def test_a_truncated_finished_scene_is_refused_with_a_remedy(model, layout, tmp_path):
     for folder in (layout.models / "0", layout.placed, layout.model):
         written(model, folder)
     layout.images.mkdir()
@@ -175,7 +175,7 @@ def scene_of_png(model, layout):
     return plan
 
 
-def test_photos_and_model_get_their_names_when_they_are_whole(model, layout, monkeypatch):
+def test_photos_and_model_get_their_final_names_when_they_are_complete(model, layout, monkeypatch):
     plan, undistort = scene_of_png(model, layout), pycolmap.undistort_images
     what = ["images/1.png", 100]
 
@@ -198,7 +198,7 @@ def test_photos_and_model_get_their_names_when_they_are_whole(model, layout, mon
     assert is_whole(layout.model) and len(list(layout.images.iterdir())) == len(plan.used)
 
 
-def test_a_mask_that_cannot_be_written_gets_no_name(model, layout, monkeypatch):
+def test_a_mask_that_cannot_be_written_is_not_left_in_the_folder(model, layout, monkeypatch):
     root = layout.scene.parent
     one = next(iter(model.cameras.values()))
     Image.fromarray(np.full((one.height, one.width), 255, np.uint8)).save(root / "mask.png")
@@ -216,7 +216,7 @@ def test_a_mask_that_cannot_be_written_gets_no_name(model, layout, monkeypatch):
     assert len(list(layout.masks.iterdir())) == len(plan.used)
 
 
-def test_half_written_masks_of_killed_processes_go(layout):
+def test_partly_written_masks_of_killed_processes_are_deleted(layout):
     layout.masks.mkdir()
     names = (".a.jpg.png.12.tmp", "a.jpg.png", ".mine.png")
     for name in names:
@@ -225,7 +225,7 @@ def test_half_written_masks_of_killed_processes_go(layout):
     assert {path.name for path in layout.masks.iterdir()} == {"a.jpg.png", ".mine.png"}
 
 
-def test_photos_are_not_begun_without_room(model, layout, free, monkeypatch):
+def test_writing_photos_requires_enough_disk_space(model, layout, free, monkeypatch):
     """The writer of JPEG files ends the process where it cannot write."""
     plan = scene_of_png(model, layout)
     monkeypatch.setattr(undistortion, "_undistort", lambda *_: pytest.fail("it was begun"))
@@ -234,7 +234,7 @@ def test_photos_are_not_begun_without_room(model, layout, free, monkeypatch):
         undistortion.write_scene(layout, plan, 1)
 
 
-def test_features_and_matches_are_not_begun_without_room(model, layout, free, monkeypatch):
+def test_features_and_matches_require_enough_disk_space(model, layout, free, monkeypatch):
     """SQLite ends the process where it cannot write."""
     for module in (features, matching):
         monkeypatch.setattr(module, "waited", lambda *_: pytest.fail("it was begun"))
@@ -259,7 +259,7 @@ def test_finished_features_need_no_disk_space(model, layout, monkeypatch):
     assert matching._room(layout, plan, "exhaustive") == matching.JOURNAL
 
 
-def test_the_database_is_not_copied_without_room(tmp_path, free):
+def test_copying_the_database_requires_enough_disk_space(tmp_path, free):
     database = tmp_path / "a.db"
     pycolmap.Database.open(database).close()
     again = _Again(database, tmp_path / "b.db", pycolmap.Reconstruction(), [], lambda: False)

@@ -38,7 +38,7 @@ def moved(similarity, points):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_similarity_is_found_beside_wrong_gps(seed):
+def test_the_similarity_is_found_despite_wrong_gps(seed):
     rng, model = np.random.default_rng(seed), synthetic()
     centers, wanted = centers_of(model), similarity(np.random.default_rng(seed))
     gps = moved(wanted, centers)
@@ -56,7 +56,7 @@ def test_the_similarity_is_found_beside_wrong_gps(seed):
         assert np.linalg.norm(place - exact[name]) < 0.5
 
 
-def test_gps_on_a_line_places_nothing():
+def test_gps_positions_on_a_line_do_not_georegister_a_model():
     model = synthetic()
     names = sorted(centers_of(model))
     gps = {name: np.array([10.0 * i, 0.0, 0.0]) for i, name in enumerate(names)}
@@ -102,7 +102,7 @@ def test_on_a_straight_track_level_photos_give_the_up_direction(orientation, pit
     assert placement.rms < 0.5
 
 
-def test_a_long_straight_way_takes_no_memory_for_all_pairs_of_photos():
+def test_a_long_straight_track_needs_no_memory_for_all_pairs_of_photos():
     rng = np.random.default_rng(0)
     here = np.arange(3_000.0)[:, None] * [1.0, 0.2, 0.0]
     there = 4.0 * here + rng.normal(0.0, 0.5, here.shape)
@@ -114,7 +114,7 @@ def test_a_long_straight_way_takes_no_memory_for_all_pairs_of_photos():
     assert most < 100 * 2**20
 
 
-def test_on_a_straight_way_photos_that_all_look_aside_tell_nothing():
+def test_sideways_photos_on_a_straight_track_do_not_georegister_a_model():
     rng = np.random.default_rng(0)
     model = walk(rng, 1, 0.0)
     gps = {name: at + 0.1 * rng.normal(size=3) for name, at in centers_of(model).items()}
@@ -131,7 +131,7 @@ def test_on_a_straight_way_photos_that_all_look_aside_tell_nothing():
     assert "which way is up" in why
 
 
-def test_gps_coarser_than_the_scene_places_nothing():
+def test_gps_coarser_than_the_scene_does_not_georegister_a_model():
     rng, model = np.random.default_rng(0), synthetic()
     gps = {name: rng.normal(size=3) * 0.5 for name in centers_of(model)}
     placement, why = placement_of(model, gps, tops_of(model))
@@ -139,7 +139,7 @@ def test_gps_coarser_than_the_scene_places_nothing():
     assert "GPS" in why
 
 
-def test_too_little_gps_places_nothing():
+def test_fewer_than_three_photos_with_gps_do_not_georegister_a_model():
     model = synthetic()
     gps = dict(list(moved(similarity(np.random.default_rng(0)), centers_of(model)).items())[:2])
     assert (
@@ -158,7 +158,7 @@ def part_of(model, keep, folder):
     return pycolmap.Reconstruction(folder)
 
 
-def test_two_halves_make_the_whole_again(tmp_path):
+def test_two_halves_are_merged_into_the_whole_model(tmp_path):
     """Photos, poses and points: those that one half alone has are in it, each photo once."""
     model = synthetic()
     numbers = sorted(model.reg_image_ids())

@@ -33,13 +33,13 @@ def parts_of(model, smallest=3):
 
 
 @pytest.mark.parametrize(("shared", "parts"), [(14, 2), (15, 1)])
-def test_parts_that_share_few_points_are_models_by_themselves(shared, parts):
+def test_parts_that_share_few_points_become_separate_models(shared, parts):
     tracks = [(40, (1, 2)), (40, (2, 3)), (40, (4, 5)), (40, (5, 6)), (shared, (3, 4))]
     found = parts_of(model_of(tracks, 6))
     assert found == ([[1, 2, 3], [4, 5, 6]] if parts == 2 else [[1, 2, 3, 4, 5, 6]])
 
 
-def test_a_photo_of_few_points_has_no_pose():
+def test_a_photo_with_few_points_gets_no_pose():
     tracks = [(40, (1, 2, 3)), (29, (3, 4))]
     assert parts_of(model_of(tracks, 4)) == [[1, 2, 3]]
 
@@ -55,7 +55,7 @@ def test_models_below_the_smallest_size_are_dropped():
     assert parts_of(model_of([], 3)) == []
 
 
-def test_a_sound_model_stays_as_it_is():
+def test_a_sound_model_is_not_changed():
     model = model_of([(40, (1, 2, 3, 4))], 4)
     (same,) = sound_models([model], 3)
     assert same.num_points3D() == 40

@@ -48,7 +48,7 @@ class Shown:
 
 @given(st.floats(0.1, 89.9), st.floats(-179.9, 179.9), st.floats(-400.0, 9000.0), st.booleans())
 @settings(max_examples=50)
-def test_degrees_minutes_and_seconds_are_put_together(latitude, longitude, altitude, south):
+def test_degrees_minutes_and_seconds_are_combined(latitude, longitude, altitude, south):
     latitude = -latitude if south else latitude
 
     def parts(angle):
@@ -99,7 +99,7 @@ def test_photos_of_one_camera_in_one_folder_share_a_calibration(tmp_path):
         assert camera_of(image) == "Kite 1"
 
 
-def test_masks_are_found_by_all_their_names_and_are_no_photos(tmp_path):
+def test_masks_are_found_under_all_supported_names_and_do_not_count_as_photos(tmp_path):
     for number, mask in enumerate(
         ("masks/1.jpg.png", "masks/2.png", "masks/3_mask.png", "4_mask.png"), 1
     ):
@@ -127,13 +127,13 @@ def test_masks_are_paired_by_the_rule_of_the_readers(wanted, tmp_path):
     assert not any("of no photo" in why for why in left_out.values())
 
 
-def test_a_folder_of_masks_that_is_named_has_to_be_there(tmp_path):
+def test_a_named_mask_folder_must_exist(tmp_path):
     save(tmp_path / "1.jpg")
     with pytest.raises(UserError, match="mask folder"):
         found(tmp_path, masks=str(tmp_path / "gone"))
 
 
-def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_reported(tmp_path):
+def test_masks_in_photo_folders_do_not_count_as_photos_and_are_reported(tmp_path):
     """Most files of `a/masks` are named after photos; `b/masks` holds photos of carnival masks."""
     shot = ("a/1.jpg", "a/2.jpg", "b/1.jpg", "b/masks/7.jpg", "b/masks/8.jpg", "c/3.jpg")
     drawn = ("c/masks/3.png", "a/masks/1.jpg.png", "a/masks/2.png", "a/masks/gone.png")
@@ -153,7 +153,7 @@ def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_reported(tmp_p
     }
 
 
-def test_masks_of_no_photo_are_reported(tmp_path):
+def test_masks_without_a_photo_are_reported(tmp_path):
     for name in (
         "1.jpg",
         "2.jpg",
@@ -175,7 +175,7 @@ def test_masks_of_no_photo_are_reported(tmp_path):
 
 
 @pytest.mark.parametrize("linked", [False, True])
-def test_a_mask_folder_within_the_photos_that_is_named_holds_no_photos(linked, tmp_path):
+def test_images_of_a_named_mask_folder_inside_the_photos_do_not_count_as_photos(linked, tmp_path):
     folder = tmp_path / "photos"
     for name in ("1.jpg", "2.jpg", "sky/1.jpg", "sky/deep/9.png"):
         save(folder / name)
@@ -201,7 +201,7 @@ def test_the_folder_of_the_photos_may_also_contain_the_masks(tmp_path):
 
 
 @pytest.mark.parametrize("files", [(), ("other.png", "1.txt")])
-def test_a_mask_folder_that_fits_no_photo_is_refused(files, tmp_path):
+def test_a_mask_folder_without_matching_names_is_refused(files, tmp_path):
     save(tmp_path / "photos" / "a" / "1.jpg")
     save(tmp_path / "photos" / "a" / "2.jpg")
     (tmp_path / "sky").mkdir()
@@ -227,7 +227,7 @@ def mask_of(folder, photo, mask, turn=1):
 
 @pytest.mark.parametrize("turn", range(1, 9))
 @pytest.mark.parametrize("part", [1, 2])
-def test_masks_of_the_photo_as_it_is_shown_are_turned_as_it_is_stored(turn, part, tmp_path):
+def test_masks_in_display_orientation_are_turned_to_the_stored_orientation(turn, part, tmp_path):
     """By Pillow, which turns photos by their EXIF headers; those of the stored photo stay."""
     stored = np.zeros((80, 120), np.uint8)
     stored[:20, :40] = 255
@@ -243,13 +243,13 @@ def test_masks_of_the_photo_as_it_is_shown_are_turned_as_it_is_stored(turn, part
 @pytest.mark.parametrize(
     ("size", "turn"), [((80, 120), 1), ((80, 120), 3), ((120, 90), 6), ((50, 50), 8)]
 )
-def test_masks_that_do_not_fit_are_one_error_at_once(size, turn, tmp_path):
+def test_a_mask_of_another_shape_gives_one_error_at_once(size, turn, tmp_path):
     with pytest.raises(UserError, match="shape of its photo") as caught:
         mask_of(tmp_path, (120, 80), Image.new("L", size), turn)
     assert caught.value.where.endswith("masks/1.png")
 
 
-def test_damaged_masks_are_found_at_once(tmp_path):
+def test_damaged_masks_are_reported_at_once(tmp_path):
     for name in ("1.jpg", "2.jpg", "masks/1.png", "masks/2.png"):
         save(tmp_path / name)
     whole = (tmp_path / "masks" / "2.png").read_bytes()
@@ -288,7 +288,7 @@ def test_transparent_pixels_do_not_count(tmp_path):
 @pytest.mark.parametrize(
     "name", ["a\tb.jpg", "a\nb.jpg", "a\x1b[2Jb.jpg", "a\\b.jpg", "d\te/1.jpg", "x" * 250 + ".jpg"]
 )
-def test_photos_with_names_that_no_scene_can_use_are_left_out_with_a_reason(name, tmp_path):
+def test_photos_with_unusable_names_are_left_out_with_a_reason(name, tmp_path):
     save(tmp_path / "1.jpg")
     save(tmp_path / "2.jpg")
     save(tmp_path / name)
@@ -299,7 +299,7 @@ def test_photos_with_names_that_no_scene_can_use_are_left_out_with_a_reason(name
     assert "control characters or backslashes, is too long or is not UTF-8: rename it" in why
 
 
-def test_photos_whose_names_are_not_text_are_left_out_with_a_reason(tmp_path):
+def test_photos_with_undecodable_names_are_left_out_with_a_reason(tmp_path):
     for name in (b"1.jpg", b"2.jpg", b"\xff.jpg", b"\xfe_mask.png"):
         path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
         with path.open("wb") as file:
@@ -311,7 +311,7 @@ def test_photos_whose_names_are_not_text_are_left_out_with_a_reason(tmp_path):
 
 
 @pytest.mark.parametrize("what", ["photos", "masks"])
-def test_folders_whose_names_are_no_text_are_one_error(what, tmp_path):
+def test_folders_with_undecodable_names_give_one_error(what, tmp_path):
     bad = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     bad.mkdir()
     with pytest.raises(UserError, match="a name that is no text"):
@@ -327,7 +327,7 @@ def test_folders_whose_names_are_no_text_are_one_error(what, tmp_path):
         ("3.tif", {}, 6299),
     ],
 )
-def test_a_photo_that_is_too_large_is_one_error_that_names_it(
+def test_a_photo_that_is_too_large_gives_one_error_with_its_name(
     name, options, most, tmp_path, monkeypatch
 ):
     """JPEG files that can be decoded reduced may have twice as many pixels."""
@@ -348,7 +348,7 @@ def test_a_photo_that_is_too_large_is_one_error_that_names_it(
     assert name not in decoded
 
 
-def test_one_of_two_same_files_is_used(tmp_path):
+def test_one_of_two_identical_files_is_used(tmp_path):
     for name in ("b.jpg", "c.jpg"):
         save(tmp_path / name)
     shutil.copy(tmp_path / "b.jpg", tmp_path / "a.jpg")
@@ -357,7 +357,7 @@ def test_one_of_two_same_files_is_used(tmp_path):
     assert left_out == {"b.jpg": "the same file as a.jpg"}
 
 
-def test_names_with_spaces_and_signs_are_photos_and_hidden_files_are_not(tmp_path):
+def test_names_with_spaces_and_symbols_are_accepted_and_hidden_files_are_ignored(tmp_path):
     save(tmp_path / "a b é.JPG", format="JPEG")
     save(tmp_path / "über uns" / "1,2.png")
     save(tmp_path / ".thumbnails" / "1.jpg")

@@ -36,7 +36,7 @@ def finish(layout):
 BEGUN = (photo("a"), photo("b", mask="m"), photo("c"))
 
 
-def test_the_same_photos_in_another_folder_are_gone_on_with(layout):
+def test_preparation_continues_with_the_same_photos_in_another_folder(layout):
     """Masks, too: a relative folder of them is another one elsewhere."""
     agreed(layout, plan(*BEGUN, masks="sky"))
     moved = [each.model_copy(update={"mask": each.mask and "/new/b.png"}) for each in BEGUN]
@@ -61,7 +61,7 @@ def test_the_same_photos_in_another_folder_are_gone_on_with(layout):
         ),
     ],
 )
-def test_differences_from_the_begun_plan_are_reported_with_a_remedy(photos, settings, told, layout):
+def test_differences_from_the_first_plan_are_reported_with_a_remedy(photos, settings, told, layout):
     first = agreed(layout, plan(*BEGUN))
     with pytest.raises(UserError, match="begun otherwise") as caught:
         agreed(layout, plan(*photos, **settings))
@@ -70,7 +70,7 @@ def test_differences_from_the_begun_plan_are_reported_with_a_remedy(photos, sett
     assert read_plan(layout) == first
 
 
-def test_a_ready_scene_needs_no_photos_and_refuses_new_ones(layout):
+def test_a_finished_scene_needs_no_photos_and_refuses_new_photos(layout):
     first = agreed(layout, plan(*BEGUN))
     finish(layout)
     assert agreed(layout, plan(BEGUN[0], photo("b"), root="/new")) == first
@@ -80,7 +80,7 @@ def test_a_ready_scene_needs_no_photos_and_refuses_new_ones(layout):
     assert read_plan(layout) == first
 
 
-def test_plans_without_digests_of_masks_are_gone_on_with(layout):
+def test_plans_without_checksums_of_masks_can_be_continued(layout):
     agreed(layout, plan(*BEGUN))
     content = json.loads(layout.plan.read_text())
     for each in content["used"]:

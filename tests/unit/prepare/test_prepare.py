@@ -109,7 +109,7 @@ def content(folder):
     return {str(path): path.read_bytes() for path in paths if path.suffix not in {".db", ".lock"}}
 
 
-def test_all_good_photos_have_a_pose(report, scene, truth):
+def test_every_good_photo_gets_a_pose(report, scene, truth):
     assert {Path(name).name for name in report.posed} == set(truth)
     found = ColmapReader().read(scene, SceneOptions())
     assert len(found.views) == COUNT
@@ -117,7 +117,7 @@ def test_all_good_photos_have_a_pose(report, scene, truth):
     assert {view.regime for view in found.views} == {"kite", "mast"}
 
 
-def test_the_scene_lies_where_gps_says(report, scene, truth):
+def test_the_scene_is_placed_by_gps(report, scene, truth):
     """Within the noise that is left: cameras lie at their GPS, in metres east, north, up."""
     georef = json.loads((scene / "georef.json").read_text())
     origin = [georef["origin"][key] for key in ("latitude", "longitude", "altitude")]
@@ -139,7 +139,7 @@ def test_the_scene_lies_where_gps_says(report, scene, truth):
 @pytest.mark.parametrize(
     ("longitudes", "middle"), [((-70.0, -70.2, -70.1), -70.1), ((179.8, -179.6, 179.9), 179.9)]
 )
-def test_the_origin_lies_among_the_photos(report, longitudes, middle):
+def test_the_origin_is_near_the_photos(report, longitudes, middle):
     places = [Position(latitude=-17.0, longitude=each, altitude=5.0) for each in longitudes]
     photos = [
         photo.model_copy(update={"position": place})
@@ -162,7 +162,7 @@ def test_unusable_photos_are_listed_with_the_reason(report):
     assert "dark" in lost.why
 
 
-def test_the_report_is_there_in_all_forms(report, scene):
+def test_the_report_is_written_in_all_formats(report, scene):
     data = json.loads((scene / "report.json").read_text())
     assert data == json.loads(json.dumps(data_of(report)))
     assert (data["used"], data["registered"]) == (COUNT + 1, COUNT)
@@ -185,14 +185,14 @@ def test_masks_are_undistorted_with_their_photos(report, scene):
     assert shares[-100:].min() == 1.0
 
 
-def test_preparing_again_changes_nothing(report, photos, scene):
+def test_preparing_a_scene_again_changes_nothing(report, photos, scene):
     before = content(scene)
     again = prepared(photos, scene, Settings())
     assert data_of(again) == data_of(report)
     assert content(scene) == before
 
 
-def test_hidden_files_of_others_stay_and_leftovers_of_prepare_are_deleted(
+def test_hidden_files_of_other_programs_are_kept_and_temporary_files_of_prepare_are_deleted(
     report, photos, scene, tmp_path
 ):
     (scene / ".git").mkdir()
@@ -213,7 +213,7 @@ def test_hidden_files_of_others_stay_and_leftovers_of_prepare_are_deleted(
     (scene / "prepare" / "models" / ".DS_Store").unlink()
 
 
-def test_redoing_the_last_stages_gives_the_same_scene(report, photos, scene):
+def test_repeating_the_last_stages_gives_the_same_scene(report, photos, scene):
     """What a kill may have left undone is done again, with the same result."""
     before = content(scene)
     (scene / "report.json").unlink()
@@ -227,7 +227,7 @@ def test_redoing_the_last_stages_gives_the_same_scene(report, photos, scene):
     assert model.num_reg_images() == COUNT
 
 
-def test_another_plan_is_refused(report, photos, scene):
+def test_other_settings_for_a_begun_scene_are_refused(report, photos, scene):
     before = content(scene)
     with pytest.raises(UserError, match="begun otherwise") as caught:
         prepared(photos, scene, Settings(max_size=200))
@@ -261,7 +261,7 @@ def test_prepare_continues_after_the_photos_were_moved(copied, scene, photos, tm
     assert names >= {path.relative_to(scene) for path in scene.rglob("*.*")} - {Path("run.lock")}
 
 
-def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
+def test_changed_photos_are_refused_with_a_remedy(copied, photos, tmp_path):
     moved = shutil.copytree(photos, tmp_path / "moved")
     unfinish(copied)
     (gone, changed, *_) = sorted((moved / "kite").glob("img*.jpg"))
@@ -278,7 +278,7 @@ def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
 @pytest.mark.parametrize(
     "lost", ["workshop", "part", "photos", "some photos", "most photos", "all"]
 )
-def test_a_ready_scene_is_read_without_its_intermediate_files_and_photos(
+def test_a_finished_scene_is_read_without_its_intermediate_files_and_photos(
     copied, photos, lost, tmp_path
 ):
     place = shutil.copytree(photos, tmp_path / "photos")
@@ -303,7 +303,7 @@ def test_a_ready_scene_is_read_without_its_intermediate_files_and_photos(
     assert content(copied) == before and not (copied / "run.lock").exists()
 
 
-def test_new_photos_of_a_ready_scene_are_not_left_out_silently(copied, photos, tmp_path):
+def test_new_photos_for_a_finished_scene_are_reported(copied, photos, tmp_path):
     place = shutil.copytree(photos, tmp_path / "photos")
     Image.effect_noise((400, 298), 20).save(place / "kite" / "new.png")
     with pytest.raises(UserError, match="begun otherwise") as caught:
@@ -311,7 +311,7 @@ def test_new_photos_of_a_ready_scene_are_not_left_out_silently(copied, photos, t
     assert caught.value.found == "1 photo new: kite/new.png"
 
 
-def test_a_ready_scene_without_intermediate_files_is_not_prepared_again(copied, photos, capsys):
+def test_a_finished_scene_without_intermediate_files_is_not_prepared_again(copied, photos, capsys):
     shutil.rmtree(copied / "prepare")
     before = content(copied)
     assert ended("prepare", photos, copied) == 2
@@ -359,7 +359,7 @@ def test_run_with_prepare_prepares_the_photos(report, photos, capsys):
     assert (name, len(read.views)) == ("photos-alone", COUNT)
 
 
-def test_poses_that_are_there_already_and_not_used_are_named(copied, tmp_path):
+def test_existing_poses_that_are_not_used_are_reported(copied, tmp_path):
     shutil.rmtree(copied / "prepare")
     place = shutil.copytree(bundled_scene(), tmp_path / "photos")
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
@@ -367,7 +367,7 @@ def test_poses_that_are_there_already_and_not_used_are_named(copied, tmp_path):
     assert "reader colmap" in told and "leave --prepare out" in told
 
 
-def test_a_run_of_photos_says_what_to_do(photos, capsys):
+def test_a_run_on_unprepared_photos_names_the_command(photos, capsys):
     assert ended("run", photos) == 2
     told = capsys.readouterr().err
     assert "crossgrad prepare PHOTOS SCENE" in told and "--prepare" in told
@@ -385,7 +385,7 @@ def test_a_run_of_photos_says_what_to_do(photos, capsys):
         ("one", "file", "cannot make this folder"),
     ],
 )
-def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_at, scene_at, what):
+def test_bad_input_gives_one_error_and_writes_nothing(tmp_path, capsys, photos_at, scene_at, what):
     for name in ("empty", "one", "other"):
         (tmp_path / name).mkdir()
     (tmp_path / "file").write_text("")
@@ -405,7 +405,7 @@ def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_
         (["a.jpg", "b.HEIC"], "repair, convert or leave out what is named"),
     ],
 )
-def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):
+def test_too_few_photos_are_refused_with_a_remedy(names, todo, tmp_path, capsys):
     photos = tmp_path / "photos"
     photos.mkdir()
     for name in names:
@@ -414,7 +414,7 @@ def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):
     assert todo in capsys.readouterr().err
 
 
-def test_photos_of_linked_folders_are_found_once(tmp_path):
+def test_photos_in_linked_folders_are_found_once(tmp_path):
     """One regime lies elsewhere; other links lead to what is there already, back, and further."""
     photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
     source = sorted((bundled_scene() / "images").rglob("*.jpg"))[:4]
@@ -440,14 +440,14 @@ def test_photos_at_the_root_folder_need_an_output_folder(capsys):
 
 
 @pytest.mark.parametrize("given", [("--prepare",), ("--reader", "photos-alone")])
-def test_without_photos_there_is_nothing_to_prepare(given, capsys, tmp_path, monkeypatch):
+def test_prepare_without_photos_is_refused(given, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert ended("run", *given) == 2
     assert "there are no photos to prepare" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):
+def test_photos_without_matches_give_one_error(tmp_path, capfd):
     """And not a line of pycolmap's beside it."""
     rng = np.random.default_rng(0)
     (tmp_path / "my photos").mkdir()
@@ -486,7 +486,7 @@ def test_impossible_prepare_options_are_refused(options, what, tmp_path, capsys)
     assert what in capsys.readouterr().err
 
 
-def test_rows_are_counted_while_the_database_is_written(tmp_path):
+def test_database_rows_are_counted_while_the_database_is_written(tmp_path):
     path = tmp_path / "a b.db"
     assert rows_of(path, "cameras") == 0
     database = pycolmap.Database.open(path)
@@ -510,7 +510,9 @@ def test_rows_are_counted_while_the_database_is_written(tmp_path):
         (2000, 2000, 3, "spatial"),
     ],
 )
-def test_pairs_are_chosen_by_number_gps_and_folders(report, count, located, folders, way):
+def test_the_matching_method_depends_on_number_gps_and_folders(
+    report, count, located, folders, way
+):
     one = next(photo for photo in report.plan.used if photo.position is not None)
     used = tuple(
         one.model_copy(update={"folder": str(n % folders)} | ({} if n < located else NO_GPS))
@@ -528,7 +530,7 @@ def test_pairs_are_chosen_by_number_gps_and_folders(report, count, located, fold
         (1000, 2, "global"),
     ],
 )
-def test_poses_are_found_by_number_and_folders(report, count, folders, way):
+def test_the_mapping_method_depends_on_number_and_folders(report, count, folders, way):
     one = report.plan.used[0]
     used = tuple(one.model_copy(update={"folder": str(n % folders)}) for n in range(count))
     assert mapping.way_of(Plan(photos="", settings=Settings(), used=used, left_out=())) == way

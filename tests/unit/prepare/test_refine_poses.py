@@ -90,7 +90,7 @@ def close_to(pose, truth):
     return np.allclose(pose.matrix(), truth, atol=0.02)
 
 
-def test_a_model_that_pairs_agree_with_stays_as_it_is(made):
+def test_a_model_that_agrees_with_its_pairs_is_not_changed(made):
     before = truth_of(made[0])
     (model,), settled, adjust = looked(made)
     assert adjust.models == [] and settled == frozenset()
@@ -99,7 +99,7 @@ def test_a_model_that_pairs_agree_with_stays_as_it_is(made):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_misplaced_photos_go_where_their_pairs_say(made, count):
+def test_misplaced_photos_move_to_the_pose_of_their_pairs(made, count):
     model, truth = made[0], truth_of(made[0])
     wrong = numbers(model)[:count]
     for number in wrong:
@@ -111,7 +111,7 @@ def test_misplaced_photos_go_where_their_pairs_say(made, count):
         assert close_to(pose, truth[number])
 
 
-def test_a_photo_without_a_pose_gets_one(made, tmp_path):
+def test_a_photo_without_a_pose_gets_a_pose_from_its_pairs(made, tmp_path):
     model, truth = made[0], truth_of(made[0])
     lost = numbers(model)[2]
     model.deregister_frame(model.image(lost).frame_id)
@@ -183,7 +183,7 @@ def test_mapping_continues_if_a_photo_has_no_pair_left(made, tmp_path):
     assert numbers(found) == sorted(others)
 
 
-def test_level_photos_of_flat_ground_tell_directions(made):
+def test_level_photos_of_flat_ground_give_relative_rotations(made):
     """All matches of a pair shift alike, as a watermark would."""
     rays = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2)).astype(np.float32)
     shifted = rays + np.float32([0.1, 0.0])
@@ -194,7 +194,7 @@ def test_level_photos_of_flat_ground_tell_directions(made):
     assert np.allclose(relative.rotation.matrix(), np.eye(3), atol=0.05)
 
 
-def test_one_pair_alone_places_nothing(made):
+def test_a_single_pair_places_no_photo(made):
     model, path = made
     one, other, *_ = numbers(model)
 
@@ -223,7 +223,7 @@ def test_a_photo_moves_from_a_smaller_model_to_the_largest(made, tmp_path):
     assert all(close_to(poses_of(large)[number], truth[number]) for number in truth)
 
 
-def test_a_refinement_round_that_fewer_matches_support_is_discarded(made):
+def test_a_refinement_round_with_fewer_supporting_matches_is_discarded(made):
     """Mapping goes on and throws all photos but two about, as often as it is asked."""
     model, path = made
     truth, lost = truth_of(model), numbers(model)[0]
@@ -246,7 +246,9 @@ def test_a_refinement_round_that_fewer_matches_support_is_discarded(made):
 
 @pytest.mark.parametrize("in_other", [False, True])
 @pytest.mark.parametrize("is_there", [False, True])
-def test_a_camera_that_the_largest_model_lacks_is_as_others_tell(tmp_path, is_there, in_other):
+def test_a_camera_missing_in_the_largest_model_is_calibrated_from_other_models(
+    tmp_path, is_there, in_other
+):
     """Each photo has its own camera; the database only guesses their focal lengths."""
     model, path = made_of(tmp_path, rigs=PHOTOS)
     known = {number: camera.params.copy() for number, camera in model.cameras.items()}
@@ -274,7 +276,7 @@ def test_a_camera_that_the_largest_model_lacks_is_as_others_tell(tmp_path, is_th
     assert found.camera(camera).params == pytest.approx(known[camera])
 
 
-def test_a_mapping_that_fails_leaves_the_model_that_was_there(made, caplog):
+def test_a_failed_mapping_keeps_the_previous_model(made, caplog):
     model, path = made
     misplace(model, numbers(model)[0])
     before = truth_of(model)
@@ -287,7 +289,7 @@ def test_a_mapping_that_fails_leaves_the_model_that_was_there(made, caplog):
     assert "doubtful photos stay where they are" in caplog.text
 
 
-def test_a_photo_whose_camera_no_lens_is_like_is_left_out(tmp_path):
+def test_a_photo_with_an_impossible_camera_is_left_out(tmp_path):
     model, path = made_of(tmp_path, rigs=PHOTOS)
     one, two, strange, *others = numbers(model)
     misplace(model, one)
@@ -311,11 +313,11 @@ def test_no_photo_is_moved_after_a_stop_request(made):
     assert adjust.models == [] and found is model
 
 
-def test_refining_no_models_returns_no_models(tmp_path):
+def test_refining_an_empty_list_of_models_returns_an_empty_list(tmp_path):
     assert looked_again([], tmp_path / "database.db", tmp_path, Adjust()) == ([], frozenset())
 
 
-def test_what_speaks_for_a_place(made):
+def test_the_correct_pose_has_more_support_than_other_poses(made):
     model, path = made
     number = numbers(model)[0]
     database = pycolmap.Database.open(path)
@@ -337,5 +339,5 @@ def test_what_speaks_for_a_place(made):
     ("pairs", "matches", "enough"),
     [(1, 900, False), (2, 99, False), (2, 100, True), (3, 59, False), (3, 60, True)],
 )
-def test_the_support_needed_for_a_pose(pairs, matches, enough):
+def test_the_support_for_a_pose_must_have_enough_pairs_and_matches(pairs, matches, enough):
     assert Support(matches, pairs).enough == enough

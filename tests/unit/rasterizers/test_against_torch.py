@@ -255,7 +255,7 @@ def name(request):
 
 
 @pytest.mark.parametrize("case_name", CASES)
-def test_agrees_with_the_reference(name, case_name):
+def test_each_rasterizer_agrees_with_the_reference(name, case_name):
     made, exact = settled(CASES[case_name]())
     unsettled = exact.pixel_gaps <= MARGIN
     weights = weighting(made, unsettled)
@@ -279,7 +279,7 @@ def test_agrees_with_the_reference(name, case_name):
     assert_same_counts(screen, fast, exact, unsettled)
 
 
-def test_equal_depths_are_drawn_in_the_order_of_rows(name):
+def test_gaussians_of_equal_depth_are_drawn_in_the_order_of_rows(name):
     made, _ = settled(case(30))
     # Every Gaussian a second time at the same place, but the last of the first round is the first
     # of the second in colour and opacity: another order of equal depths is another image.
@@ -362,7 +362,9 @@ def test_marked_pixels_of_random_views_are_counted_exactly(seed, response, size,
     ],
 )
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
-def test_a_gaussian_that_cannot_be_rendered_changes_nothing(name, response, tensor, value):
+def test_a_gaussian_that_cannot_be_rendered_does_not_change_the_image(
+    name, response, tensor, value
+):
     made, _ = settled(case(20, response=response))
     getattr(made.gaussians, tensor)[3] = value
     others = torch.arange(20) != 3
@@ -380,7 +382,7 @@ def test_a_gaussian_that_cannot_be_rendered_changes_nothing(name, response, tens
 
 
 @pytest.mark.parametrize("size", [5e5, 1e6, 1e7])
-def test_radii_of_what_covers_the_world_are_the_largest(name, size):
+def test_gaussians_that_cover_the_world_have_the_largest_radius(name, size):
     camera = Camera(64, 48, 1000.0, 1000.0, 32.0, 24.0, torch.eye(4, dtype=torch.float64))
     one = Gaussians(
         means=torch.tensor([[0.0, 0.0, 1.0]]),
@@ -394,5 +396,5 @@ def test_radii_of_what_covers_the_world_are_the_largest(name, size):
         assert screen.radii.tolist() == [2**30], rasterizer
 
 
-def test_the_default_rasterizer_is_among_those_compared():
+def test_the_default_rasterizer_is_compared_with_the_reference():
     assert "numba" in FAST

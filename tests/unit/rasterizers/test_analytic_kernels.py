@@ -24,7 +24,7 @@ def squared_radius(opacity):
     return analytic.squared_radius(opacity)
 
 
-def test_the_approximate_normal_density_falls_at_least_as_fast_as_tail_says():
+def test_the_approximate_normal_density_decreases_at_least_as_fast_as_its_bound():
     x = np.linspace(-60.0, 60.0, 1_000_001)
     cubic = LINEAR * x + CUBIC * x**3
     slope = np.log(LINEAR + 3 * CUBIC * x**2)
@@ -33,7 +33,7 @@ def test_the_approximate_normal_density_falls_at_least_as_fast_as_tail_says():
 
 
 @pytest.mark.parametrize("sigma", [1e-3, 0.05, 0.3, 1.0, 7.0, 1e4])
-def test_window_is_the_difference_of_the_distribution_over_a_pixel(sigma):
+def test_the_window_is_the_difference_of_the_distribution_over_a_pixel(sigma):
     def distribution(x):
         return 1 / (1 + np.exp(-np.clip(LINEAR * x + CUBIC * x**3, -700, 700)))
 

@@ -53,7 +53,7 @@ def test_bundled_rasterizers_are_chosen_by_device():
     assert choose_rasterizer("auto", Wanted("cuda", "analytic"))[0] == "torch"
 
 
-def test_a_name_is_taken_as_it_is():
+def test_a_named_rasterizer_is_used_as_given():
     assert choose_rasterizer("torch", PLAIN) == ("torch", ("rasterizer torch: asked for",))
 
 
@@ -64,7 +64,7 @@ def test_a_faster_third_party_rasterizer_is_chosen(install):
     assert notes == ("rasterizer fast: the fastest of 3 here on cpu",)
 
 
-def test_one_that_ranks_itself_at_zero_is_never_taken(install):
+def test_a_rasterizer_of_speed_zero_is_never_chosen(install):
     install(SOUND, aaa="made_up_rasterizer:Shy")
     assert choose_rasterizer("auto", PLAIN)[0] == "numba"
 
@@ -89,13 +89,13 @@ def test_the_fastest_rasterizer_is_chosen_if_none_provides_the_outputs(install):
     assert choose_rasterizer("auto", wanted)[0] == "fast"
 
 
-def test_one_that_cannot_be_imported_is_left_out_with_a_note(install):
+def test_a_rasterizer_that_cannot_be_imported_is_left_out_with_a_note(install):
     install(broken="made_up_rasterizer:Broken")
     name, notes = choose_rasterizer("auto", PLAIN)
     assert name == "numba"
     assert notes[0].startswith("rasterizer broken left out: rasterizer broken cannot be imported")
 
 
-def test_a_device_on_which_none_runs_is_refused():
+def test_a_device_without_a_rasterizer_is_refused():
     with pytest.raises(UserError, match="no installed rasterizer runs on device mps"):
         choose_rasterizer("auto", Wanted("mps", "plain"))

@@ -39,7 +39,7 @@ def drawn(gaussians, camera, weights, background=(0.0, 0.0, 0.0), name="torch", 
 
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_reference_bins_what_single_pixels_have(response, seed):
+def test_the_bins_of_the_reference_agree_with_single_pixels(response, seed):
     gaussians = smooth_gaussians(25, CAMERA, seed=seed, response=response)
     weights, background = weighting(CAMERA), (0.3, 0.1, 0.6)
     found = drawn(gaussians, CAMERA, weights, background).directions.numpy()
@@ -53,7 +53,7 @@ def test_the_reference_bins_what_single_pixels_have(response, seed):
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
-def test_the_bins_add_up_to_the_other_statistics(name, response):
+def test_the_bins_add_up_to_the_statistics_without_bins(name, response):
     gaussians = random_gaussians(80, CAMERA, response=response)
     screen = drawn(gaussians, CAMERA, weighting(CAMERA), name=name)
     total = screen.directions.double().sum(1)
@@ -88,7 +88,7 @@ def brighter(camera):
 
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
-def test_a_pulled_apart_gaussian_has_opposite_directions_on_either_side(name):
+def test_a_gaussian_under_opposite_gradients_has_opposite_directions_on_its_sides(name):
     # One standard deviation is 2 px along x; the mean lies on the border of two pixels.
     gaussians, camera = one_gaussian()
     bins = drawn(gaussians, camera, brighter(camera), name=name).directions[0]
@@ -101,7 +101,7 @@ def test_a_pulled_apart_gaussian_has_opposite_directions_on_either_side(name):
 
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
-def test_directions_are_those_of_ndc_units(name):
+def test_directions_refer_to_ndc_units(name):
     # Only the pixel at offset (3.5, 1.5) counts: its gradient is along that, per pixel.
     gaussians, camera = one_gaussian(scales=(0.3, 0.3, 0.3))
     weights = brighter(camera)
@@ -116,7 +116,7 @@ def test_directions_are_those_of_ndc_units(name):
 
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
-def test_an_axis_seen_end_on_has_one_bin(name):
+def test_an_axis_along_the_view_has_one_bin(name):
     # The longest axis points at the camera.
     gaussians, camera = one_gaussian(scales=(0.05, 0.05, 0.2))
     bins = drawn(gaussians, camera, brighter(camera), name=name).directions[0]
@@ -125,7 +125,7 @@ def test_an_axis_seen_end_on_has_one_bin(name):
 
 @pytest.mark.parametrize("name", ["torch", "numba"])
 @pytest.mark.parametrize("factor", [1e-30, 1e25])
-def test_directions_do_not_depend_on_the_size_of_the_loss(name, factor):
+def test_directions_do_not_depend_on_the_scale_of_the_loss(name, factor):
     gaussians = random_gaussians(30, CAMERA)
     weights = weighting(CAMERA)
     usual = drawn(gaussians, CAMERA, weights, name=name).directions

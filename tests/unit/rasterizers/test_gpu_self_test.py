@@ -75,7 +75,7 @@ def test_bundled_rasterizers_pass_the_self_test(rasterizer, footprint):
     self_test(rasterizer.model_copy(update={"footprint": footprint}), "cpu")
 
 
-def test_gsplat_passes_on_its_reference(monkeypatch):
+def test_gsplat_passes_the_self_test_with_its_torch_reference(monkeypatch):
     pytest.importorskip("gsplat")
     gsplat_on_cpu.install(monkeypatch)
     GsplatRasterizer().self_test("cpu")

@@ -71,7 +71,7 @@ def test_gsplat_projection_agrees_with_the_reference(camera):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_are_ours(degree):
+def test_gsplat_spherical_harmonics_agree_with_the_reference(degree):
     directions = torch.nn.functional.normalize(
         torch.randn(100, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64), dim=1
     )
@@ -94,7 +94,7 @@ def test_the_footprint_of_gsplat_is_never_smaller_than_the_reference():
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("sh_degree", [None, 3])
-def test_renders_gradients_and_statistics_are_ours(gsplat, camera, sh_degree):
+def test_gsplat_images_gradients_and_statistics_agree_with_the_reference(gsplat, camera, sh_degree):
     scene = random_gaussians(30, camera, seed=3, sh_degree=sh_degree, opacities=(0.1, 1.0))
     mine, theirs = leaves(scene), leaves(scene)
     ours = drawn(TorchRasterizer(max_alpha=0.999), mine, camera)
@@ -122,7 +122,7 @@ def test_gsplat_radii_equal_the_reference_for_visible_gaussians(gsplat):
     assert 0 < (theirs[~seen] > 0).sum() < 0.25 * len(ours)
 
 
-def test_gsplat_differs_from_the_default_only_by_the_cap_of_0_999(gsplat):
+def test_gsplat_differs_from_the_default_only_by_its_alpha_cap_of_0_999(gsplat):
     """Opacities above 0.99 only, and by 0.009 at most."""
     camera = CAMERAS["middle"]
     at_centre = replace(
@@ -138,7 +138,7 @@ def test_gsplat_differs_from_the_default_only_by_the_cap_of_0_999(gsplat):
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("band", [1 << 19, 3 * 37])
-def test_counts_of_pixels_are_ours(gsplat, monkeypatch, camera, band):
+def test_gsplat_pixel_counts_agree_with_the_reference(gsplat, monkeypatch, camera, band):
     """Of all pixels and of some, of each of two views, however many are looked at at once."""
     monkeypatch.setattr(blended, "PIXELS", band)
     scenes = [leaves(random_gaussians(25, camera, seed=s, opacities=(0.5, 1.0))) for s in (10, 11)]
@@ -153,7 +153,9 @@ def test_counts_of_pixels_are_ours(gsplat, monkeypatch, camera, band):
 
 
 @pytest.mark.parametrize(("sigmas", "most"), [((0.8, 4.0), 1e-5), ((0.05, 0.3), 6e-3)])
-def test_antialiasing_differs_far_below_a_pixel(gsplat, sigmas, most):
+def test_gsplat_antialiasing_differs_noticeably_only_for_gaussians_below_a_pixel(
+    gsplat, sigmas, most
+):
     camera = CAMERAS["middle"]
     scene = leaves(
         random_gaussians(40, camera, seed=5, sigmas=sigmas, response="antialiased", border=0.0)
@@ -163,7 +165,7 @@ def test_antialiasing_differs_far_below_a_pixel(gsplat, sigmas, most):
     assert 0.0 < (theirs - ours).abs().max() < most
 
 
-def test_views_together_are_the_views_one_by_one(gsplat):
+def test_views_rendered_together_equal_views_rendered_one_by_one(gsplat):
     """Two sizes, two numbers of Gaussians: statistics and gradients stay each view's own."""
     small = posed_camera(20, 12)
     moved = replace(CAMERAS["middle"], cx=15.0)
@@ -188,7 +190,7 @@ def test_views_together_are_the_views_one_by_one(gsplat):
             torch.testing.assert_close(a.grad, b.grad, rtol=1e-4, atol=1e-5)
 
 
-def test_no_gaussians_give_the_background(gsplat):
+def test_an_empty_model_gives_the_background(gsplat):
     camera, none = CAMERAS["middle"], leaves(random_gaussians(0, CAMERAS["middle"]))
     some = leaves(random_gaussians(5, camera))
     grey, white = torch.full((3,), 0.5), torch.ones(3)

@@ -132,7 +132,7 @@ def test_gswarp_inputs_and_outputs_agree_with_the_reference(gswarp, camera, sh_d
         assert (one.grad - two.grad).norm() <= 2e-3 * two.grad.norm()
 
 
-def test_the_near_plane_is_where_the_option_says(gswarp):
+def test_the_option_near_sets_the_near_plane_of_gswarp(gswarp):
     """gswarp's own lies at 0.2 of the units that it is given."""
     camera = replace(CAMERA, world_to_camera=torch.eye(4, dtype=torch.float64))
     scene = random_gaussians(2, camera, border=-0.4, sigmas=(2.0, 3.0))
@@ -143,7 +143,7 @@ def test_the_near_plane_is_where_the_option_says(gswarp):
     assert (radii > 0).tolist() == [False, True]
 
 
-def test_the_gradient_by_the_projected_means_is_per_pixel(gswarp):
+def test_the_gradient_of_projected_means_is_per_pixel(gswarp):
     """With the shape held gswarp's differs from ours, which the stand-in moves in space."""
     scene = random_gaussians(20, CAMERA, seed=8, border=-0.1, sigmas=(0.8, 1.2))
     reference = TorchRasterizer(near=0.05, footprint="3-sigma")
@@ -158,7 +158,7 @@ def test_the_gradient_by_the_projected_means_is_per_pixel(gswarp):
     assert (found - ours).norm() < 0.25 * ours.norm()
 
 
-def test_no_gaussians_give_the_background(gswarp):
+def test_an_empty_model_gives_the_background(gswarp):
     scene = leaves(random_gaussians(0, CAMERA))
     render = gswarp.render(scene, CAMERA, torch.tensor([0.2, 0.4, 0.6]))
     assert render.image.shape == (28, 40, 3)
@@ -168,13 +168,13 @@ def test_no_gaussians_give_the_background(gswarp):
     assert scene.means.grad.shape == (*render.screen.mean_gradient.shape[:1], 3)
 
 
-def test_a_package_that_fails_to_start_ends_in_a_message(monkeypatch):
+def test_a_package_that_cannot_be_imported_gives_a_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "gswarp", None)
     with pytest.raises(UserError, match="GswarpRasterizer cannot draw on this machine"):
         GswarpRasterizer().self_test("cpu")
 
 
-def test_matrices_project_a_point_to_the_pixel_that_our_camera_does():
+def test_gswarp_matrices_project_a_point_to_the_same_pixel_as_the_camera():
     points = torch.randn(50, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     points[:, 2] += 4.0
     pixels, depths = OFF_AXIS.project(points.numpy())

@@ -53,14 +53,14 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
     assert refused.value.found.startswith(f"{field} is {list(change(tensor).shape)}, not ")
 
 
-def test_giving_both_or_neither_of_colors_and_sh_is_refused():
+def test_gaussians_with_both_or_neither_of_colors_and_sh_are_refused():
     some = complete(harmonics=True)
     for wrong in (replace(some, colors=some.means), replace(some, sh_dc=None)):
         with pytest.raises(UserError, match="colors and sh_dc"):
             drawn(wrong)
 
 
-def test_a_degree_without_its_coefficients_is_refused():
+def test_an_sh_degree_without_its_coefficients_is_refused():
     some = complete(harmonics=True)
     assert some.sh_rest is not None
     wrong = replace(some, sh_degree=3, sh_rest=some.sh_rest[:, :8])

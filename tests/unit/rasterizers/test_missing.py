@@ -53,7 +53,7 @@ def test_a_missing_package_is_named_with_its_extra(machine):
         assert f"pip install 'crossgrad[{package}]'" in reason
 
 
-def test_gswarp_without_warp_is_not_there(machine):
+def test_gswarp_without_warp_is_not_available(machine):
     machine("gswarp")
     (reason,) = objections(GswarpRasterizer())
     assert "needs the package warp, which is not installed: pip install 'crossgrad[gs" in reason
@@ -68,14 +68,14 @@ def test_gswarp_without_warp_is_not_there(machine):
         ("12.4", None),
     ],
 )
-def test_gsplat_needs_a_compiler_for_the_cuda_of_torch(machine, nvcc, reason):
+def test_gsplat_needs_a_compiler_for_the_cuda_version_of_torch(machine, nvcc, reason):
     machine("gsplat", nvcc=nvcc)
     found = objections(GsplatRasterizer())
     assert (found == []) == (reason is None)
     assert reason is None or reason in found[0]
 
 
-def test_gsplat_with_its_kernels_compiled_needs_no_compiler(machine, tmp_path):
+def test_gsplat_with_compiled_kernels_needs_no_compiler(machine, tmp_path):
     machine("gsplat")
     assert objections(GsplatRasterizer())
     (tmp_path / "package").mkdir()
@@ -83,7 +83,7 @@ def test_gsplat_with_its_kernels_compiled_needs_no_compiler(machine, tmp_path):
     assert objections(GsplatRasterizer()) == []
 
 
-def test_gsplat_needs_a_compiler_for_the_host(machine, monkeypatch):
+def test_gsplat_needs_a_host_compiler(machine, monkeypatch):
     machine("gsplat", nvcc="12.8")
     monkeypatch.setattr(missing.shutil, "which", lambda _name: None)
     assert "no C++ compiler" in objections(GsplatRasterizer())[0]
@@ -102,7 +102,7 @@ def test_gsplat_needs_ninja_on_the_path_or_next_to_python(machine, monkeypatch, 
     assert missing.os.environ["PATH"] == f"/usr/bin{missing.os.pathsep}{tmp_path / 'env'}"
 
 
-def test_torch_looks_for_nvcc_where_cuda_home_points_and_nowhere_else(monkeypatch, tmp_path):
+def test_nvcc_is_searched_only_in_cuda_home_if_set(monkeypatch, tmp_path):
     monkeypatch.setattr(missing.shutil, "which", lambda name: str(tmp_path / name))
     (tmp_path / "nvcc").touch()
     for name in ("CUDA_HOME", "CUDA_PATH"):
@@ -121,7 +121,7 @@ def test_an_nvcc_without_a_readable_version_is_accepted(machine, tmp_path):
     assert objections(GsplatRasterizer()) == []
 
 
-def test_on_a_cpu_the_device_alone_is_objected_to(machine):
+def test_an_unsupported_device_is_the_only_objection_on_a_cpu(machine):
     machine()
     for name, rasterizer in (("gsplat", GsplatRasterizer()), ("gswarp", GswarpRasterizer())):
         assert objections(rasterizer, device="cpu") == []
@@ -140,7 +140,9 @@ def test_on_a_cpu_the_device_alone_is_objected_to(machine):
         ("backbone", "mip", "gswarp", "does not draw the pixel response antialiased"),
     ],
 )
-def test_what_a_rasterizer_does_not_give_is_refused_before_training(slot, name, rasterizer, reason):
+def test_outputs_that_a_rasterizer_lacks_are_refused_before_training(
+    slot, name, rasterizer, reason
+):
     chosen = {slot: build(f"{slot}s", name, {}), "rasterizer": build("rasterizers", rasterizer, {})}
     selection = selection_of(device="cuda", names={slot: name, "rasterizer": rasterizer}, **chosen)
     assert any(reason in objection for objection in objections_to(selection))
@@ -168,7 +170,7 @@ def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(mach
     assert choose_rasterizer("auto", Wanted("cpu", "plain"))[0] == "numba"
 
 
-def test_without_a_compiler_gswarp_is_taken_and_without_both_the_reference(machine):
+def test_gswarp_is_chosen_without_a_compiler_and_the_reference_without_gswarp(machine):
     machine("gsplat", "gswarp", "warp")
     assert choose_rasterizer("auto", CUDA)[0] == "gswarp"
     machine()

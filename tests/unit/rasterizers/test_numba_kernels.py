@@ -116,7 +116,7 @@ def drawn(gaussians, view, background=BLACK, **options):
     return forward(gaussians, view, background, DrawOptions(**options))
 
 
-def test_a_gaussian_is_its_opacity_at_its_centre_and_falls_off_with_the_dilated_variance():
+def test_a_gaussian_has_its_opacity_at_its_centre_and_decays_with_the_dilated_variance():
     one = splats([(20.5, 11.5)], [2.0], [1.5], [0.7], [(0.2, 0.4, 1.0)], (41, 23))
     frame = drawn(one, camera(41, 23), dilation=0.3)
     variance = 1.5**2 + 0.3
@@ -130,7 +130,7 @@ def test_a_gaussian_is_its_opacity_at_its_centre_and_falls_off_with_the_dilated_
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_the_nearer_gaussian_covers_the_farther_one_by_its_alpha(first):
+def test_the_nearer_gaussian_covers_the_farther_gaussian_by_its_alpha(first):
     depths = [1.0, 2.0] if first == 0 else [2.0, 1.0]
     colors = np.array([(1.0, 0.0, 0.25), (0.0, 1.0, 0.5)])
     opacities = np.array([0.6, 0.5])
@@ -150,12 +150,12 @@ def test_the_nearer_gaussian_covers_the_farther_one_by_its_alpha(first):
     )
 
 
-def test_equal_depths_are_drawn_in_the_order_of_the_input():
+def test_gaussians_of_equal_depth_are_drawn_in_the_order_of_the_input():
     two = splats([(8.5, 8.5)] * 2, [1.5, 1.5], [2.0] * 2, [0.9, 0.9], np.eye(3)[:2], (16, 16))
     assert drawn(two, camera(16, 16)).image[8, 8, 0] == pytest.approx(0.9, rel=1e-5)
 
 
-def test_a_capped_alpha_has_no_gradient_but_its_colour_has():
+def test_a_capped_alpha_has_no_gradient_but_its_colour_has_a_gradient():
     one = splats([(8.5, 8.5)], [1.0], [300.0], [1.0], [(0.5, 0.5, 0.5)], (16, 16))
     frame = drawn(one, camera(16, 16), max_alpha=0.8)
     np.testing.assert_allclose(frame.alpha, 0.8, rtol=1e-6)
@@ -165,7 +165,7 @@ def test_a_capped_alpha_has_no_gradient_but_its_colour_has():
     np.testing.assert_allclose(gradients.colors, 0.8 * 256, rtol=1e-5)
 
 
-def test_compositing_stops_before_the_blend_that_leaves_too_little_light():
+def test_compositing_stops_before_the_transmittance_falls_below_the_limit():
     count = 5  # 0.9 each: 0.1, 0.01, 0.001 go through; the fourth would leave 1e-4 (1 - 4e-4)
     many = splats(
         [(4.5, 4.5)] * count, np.arange(1.0, 1.0 + count), [1e5] * count, [0.9001] * count,
@@ -194,7 +194,7 @@ SIZES = [
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_images_of_any_size_equal_the_restatement(size):
+def test_images_of_any_size_agree_with_the_numpy_version(size):
     gaussians, view, options = cloud(60, size), camera(*size), DrawOptions(**EVERYTHING)
     background = np.array([0.3, 0.6, 0.1], np.float32)
     frame = forward(gaussians, view, background, options)
@@ -208,7 +208,7 @@ def test_images_of_any_size_equal_the_restatement(size):
 
 @pytest.mark.parametrize("x", [15.4, 15.5, 16.0, 31.6, 32.0, 32.5, 63.4, 63.5, 64.0, 64.5])
 @pytest.mark.parametrize("y", [7.9, 8.0, 15.5, 16.0, 16.4])
-def test_footprints_cross_patches_and_tiles_without_a_seam(x, y):
+def test_footprints_continue_across_patches_and_tiles_without_a_seam(x, y):
     size = (80, 32)
     one = splats([(x, y)], [1.0], [0.9], [0.8], [(1.0, 1.0, 1.0)], size)
     options = DrawOptions(**EVERYTHING)
@@ -237,7 +237,7 @@ def difference_quotient(gaussians, view, options, v, number, step=1e-5):
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_gradients_equal_difference_quotients(name):
+def test_gradients_agree_with_finite_differences(name):
     size = (24, 20)
     # Faint and wide, so that no pixel is near a threshold that a step could cross.
     gaussians = cloud(3, size, seed=4, opacities=(0.3, 0.6), sigmas=(40.0, 90.0))
@@ -249,7 +249,7 @@ def test_gradients_equal_difference_quotients(name):
         assert gradients[index] == pytest.approx(expected, rel=2e-4, abs=2e-3), index
 
 
-def test_absolute_gradients_are_the_sum_over_pixels_of_what_one_pixel_gives():
+def test_absolute_gradients_are_sums_of_absolute_gradients_over_pixels():
     size = (18, 9)
     gaussians = cloud(6, size, seed=2)
     frame = drawn(gaussians, camera(*size))
@@ -304,7 +304,7 @@ def harmonics(count, degree, seed=0):
     return dc, 0.3 * rest
 
 
-def test_degree_0_is_a_half_plus_the_constant_harmonic_and_clamps_at_zero():
+def test_degree_0_gives_one_half_plus_the_constant_harmonic_clamped_at_zero():
     one = splats([(8.5, 8.5)], [1.0], [3.0], [0.5], [(0.0, 0.0, 0.0)], (16, 16))
     dc = np.array([[[1.0, -5.0, 0.2]]], np.float32)
     one = replace(one, colors=None, dc=dc, rest=np.empty((1, 0, 3), np.float32))
@@ -316,7 +316,7 @@ def test_degree_0_is_a_half_plus_the_constant_harmonic_and_clamps_at_zero():
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_harmonics_gradients_equal_difference_quotients(degree):
+def test_gradients_of_harmonics_agree_with_finite_differences(degree):
     size = (12, 10)
     base = cloud(2, size, seed=5, opacities=(0.4, 0.6), sigmas=(60.0, 90.0))
     dc, rest = harmonics(2, 3)
@@ -342,7 +342,7 @@ def test_harmonics_gradients_equal_difference_quotients(degree):
 
 @pytest.mark.parametrize("rows", [frozenset(), frozenset({"sh_dc", "sh_rest"})], ids=len)
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_leaving_out_gradients_of_sh_changes_no_other_gradient(degree, rows):
+def test_omitting_gradients_of_sh_changes_no_other_gradient(degree, rows):
     size = (40, 30)
     dc, rest = harmonics(200, 3)
     base = cloud(200, size, seed=6)
@@ -364,7 +364,7 @@ def _logarithms(values, found):
         found[k] = log2_of(values[k])
 
 
-def test_the_logarithm_of_opacities_is_right_to_a_float32_and_far_below():
+def test_the_logarithm_of_opacities_is_accurate_to_float32():
     rng = np.random.default_rng(0)
     values = np.concatenate([2.0 ** rng.uniform(-1000, 3, 3000), 2.0 ** rng.uniform(-8, 0, 3000)])
     values = np.array([*values, 1.0, 0.5, 1.0 / 255.0, np.nextafter(1.0, 0.0), math.sqrt(2.0), 0.0])
@@ -432,7 +432,7 @@ def test_bits_do_not_depend_on_the_number_of_threads_or_the_run(threads):
 
 
 @pytest.mark.parametrize("threads", [2, 3, 17])
-def test_bits_do_not_depend_on_who_does_which_job(threads, monkeypatch):
+def test_bits_do_not_depend_on_the_thread_that_does_a_job(threads, monkeypatch):
     size = (150, 90)
     gaussians, v_image = cloud(6000, size), weights(size)[0]
     found = []
@@ -455,7 +455,7 @@ def test_rows_of_sixteen_numbers_fill_cache_lines(count):
     assert count == 0 or room.ctypes.data % 64 == 0
 
 
-def test_two_frames_can_be_kept_at_the_same_time():
+def test_two_frames_can_exist_at_the_same_time():
     size = (40, 30)
     first, second = cloud(50, size, seed=1), cloud(70, size, seed=2)
     v_image = weights(size)[0]
@@ -465,7 +465,7 @@ def test_two_frames_can_be_kept_at_the_same_time():
     same_bits(alone, backward(frame, v_image, absolute=True))
 
 
-def test_nothing_to_draw_gives_the_background():
+def test_a_view_without_visible_gaussians_gives_the_background():
     empty = cloud(0, (8, 8))
     behind = replace(cloud(5, (8, 8)), means=np.full((5, 3), -3.0, np.float32))
     background = np.array([0.1, 0.2, 0.3], np.float32)
@@ -478,7 +478,7 @@ def test_nothing_to_draw_gives_the_background():
 
 
 @pytest.mark.parametrize("response", ["plain", "antialiased", "analytic"])
-def test_extreme_inputs_stay_finite(response):
+def test_extreme_inputs_give_finite_results(response):
     rng = np.random.default_rng(7)
     size, count = (37, 21), 4000
     gaussians = cloud(count, size)
@@ -503,7 +503,7 @@ def test_extreme_inputs_stay_finite(response):
         assert not getattr(gradients, name)[zero_quats].any(), name
 
 
-def test_very_many_gaussians_in_one_pixel():
+def test_compositing_ends_early_with_very_many_gaussians_in_one_pixel():
     count = 200_000
     many = splats(
         np.full((count, 2), 0.5), np.full(count, 2.0), np.full(count, 1e-3), np.full(count, 0.004),

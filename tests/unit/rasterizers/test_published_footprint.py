@@ -93,7 +93,7 @@ def test_every_pixel_follows_the_published_rule(name, seed):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_published_footprint_cuts_pixels_of_the_default_footprint(name):
+def test_the_published_footprint_is_smaller_than_the_default_footprint(name):
     """A round Gaussian whose 3.3 standard deviations reach one tile farther than its 3."""
     scale = torch.full((1, 3), 0.0643)  # 3.9 pixels, dilated
     facing = sample_camera().world_to_camera[2, :3].float()
@@ -115,7 +115,7 @@ def gradients(name, of):
     return drawn.screen.mean_gradient.double()
 
 
-def test_the_backward_pass_sees_the_same_pixels():
+def test_the_backward_pass_uses_the_pixels_of_the_forward_pass():
     one, other = (gradients(name, gaussians(5)) for name in NAMES)
     assert float((one - other).norm() / one.norm()) < 1e-5
 
@@ -137,7 +137,7 @@ def options_of(**settings):
     return selection.rasterizer
 
 
-def test_the_published_recipe_sets_it_in_the_units_of_the_scene():
+def test_the_published_recipe_sets_the_published_footprint_and_near_plane():
     published = options_of(recipe={"name": "published"})
     assert published.footprint == "3-sigma"
     assert published.near == pytest.approx(0.2 * 0.01)
@@ -146,7 +146,7 @@ def test_the_published_recipe_sets_it_in_the_units_of_the_scene():
     assert (default.footprint, default.near) == ("alpha", 1e-3)
 
 
-def test_what_the_user_sets_wins():
+def test_settings_of_the_user_override_the_published_recipe():
     chosen = {"name": "torch", "footprint": "alpha", "near": 0.5}
     assert options_of(recipe={"name": "published"}, rasterizer=chosen).footprint == "alpha"
     assert options_of(recipe={"name": "published"}, rasterizer=chosen).near == 0.5

@@ -44,14 +44,14 @@ def check_gradients(gaussians, names, *, every_entry=True):
 @pytest.mark.parametrize(
     "every_entry", [False, pytest.param(True, marks=pytest.mark.slow, id="every entry")]
 )
-def test_gradcheck_of_geometry_opacity_and_rgb(response, every_entry):
+def test_gradients_of_geometry_opacity_and_rgb_pass_a_numerical_check(response, every_entry):
     gaussians = smooth_gaussians(20, CAMERA, response=response)
     names = ("means", "quats", "scales", "opacities", "colors")
     check_gradients(gaussians, names, every_entry=every_entry)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_gradcheck_of_spherical_harmonics(sh_degree):
+def test_gradients_of_spherical_harmonics_pass_a_numerical_check(sh_degree):
     gaussians = smooth_gaussians(20, CAMERA, sh_degree=sh_degree)
     check_gradients(gaussians, ("means",))
     names = ("sh_dc", "sh_rest") if sh_degree else ("sh_dc",)
@@ -59,7 +59,7 @@ def test_gradcheck_of_spherical_harmonics(sh_degree):
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_gradcheck_where_jacobians_are_clamped_and_alphas_capped(response):
+def test_gradients_at_clamped_jacobians_and_capped_alphas_pass_a_numerical_check(response):
     gaussians = smooth_gaussians(
         24, CAMERA, sigmas=(4.0, 30.0), opacities=(0.5, 1.3), border=1.0, response=response
     )
@@ -79,7 +79,7 @@ def leaves(gaussians):
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_mean_gradients_add_up_to_that_of_the_principal_point(response):
+def test_mean_gradients_add_up_to_the_gradient_of_the_principal_point(response):
     # Moving every projected mean is moving the principal point, where no Jacobian is clamped.
     gaussians, _ = leaves(smooth_gaussians(24, CAMERA, border=0.1, response=response))
     weight = torch.randn(10, 18, 3, generator=torch.Generator().manual_seed(1)).double()
@@ -119,7 +119,7 @@ def test_absolute_gradients_are_sums_over_pixels(response):
     assert (absolute > signed.abs() + 1e-6).any()
 
 
-def test_statistics_are_filled_by_a_backward_pass_to_colours_alone():
+def test_a_backward_pass_to_colours_alone_still_fills_the_statistics():
     gaussians = random_gaussians(20, CAMERA)
     both, _ = leaves(gaussians)
     colors = gaussians.colors.clone().requires_grad_()
@@ -129,7 +129,7 @@ def test_statistics_are_filled_by_a_backward_pass_to_colours_alone():
     assert torch.equal(result.screen.mean_gradient, expected.screen.mean_gradient)
 
 
-def test_absolute_gradients_only_where_asked_for():
+def test_absolute_gradients_are_computed_only_if_requested():
     gaussians, _ = leaves(random_gaussians(20, CAMERA))
     result = render(gaussians, outputs=frozenset())
     result.image.sum().backward()
@@ -138,7 +138,7 @@ def test_absolute_gradients_only_where_asked_for():
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_drawing_tiles_twice_changes_no_bit(response, monkeypatch):
+def test_rendering_tiles_twice_changes_no_bit(response, monkeypatch):
     camera = posed_camera(37, 21)
     gaussians = random_gaussians(40, camera, response=response)
 
@@ -156,7 +156,7 @@ def test_drawing_tiles_twice_changes_no_bit(response, monkeypatch):
         assert torch.equal(once, twice)
 
 
-def test_same_input_gives_the_same_bits():
+def test_the_same_input_gives_the_same_bits():
     camera = posed_camera(64, 48)
     gaussians = random_gaussians(500, camera)
     single = {n: getattr(gaussians, n).float() for n in ("means", "quats", "scales", "opacities")}

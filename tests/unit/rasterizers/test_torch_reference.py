@@ -44,7 +44,7 @@ def render(gaussians, camera, background=BLACK, **options):
     return TorchRasterizer(**options).render(gaussians, camera, background, EVERYTHING)
 
 
-def test_single_gaussian_on_a_pixel_centre():
+def test_a_single_gaussian_on_a_pixel_centre_agrees_with_the_formula():
     sigma2 = (20.0 * 0.1 / 2.0) ** 2 + 0.3
     result = render(stack([2.0], [0.8]), frontal())
     for dx, dy in ((0, 0), (1, 0), (0, -1), (2, 3), (-3, 1)):
@@ -55,7 +55,7 @@ def test_single_gaussian_on_a_pixel_centre():
         assert result.depth[3 + dy, 5 + dx].item() == pytest.approx(2.0 * alpha, rel=1e-12)
 
 
-def test_touches_exactly_the_pixels_at_or_above_the_threshold():
+def test_a_gaussian_touches_exactly_the_pixels_at_or_above_the_threshold():
     sigma2 = (20.0 * 0.1 / 2.0) ** 2 + 0.3
     result = render(stack([2.0], [0.8]), frontal())
     y, x = torch.meshgrid(torch.arange(7) - 3, torch.arange(11) - 5, indexing="ij")
@@ -65,7 +65,7 @@ def test_touches_exactly_the_pixels_at_or_above_the_threshold():
     assert result.screen.radii.tolist() == [ceil(sqrt(2 * log(255 * 0.8) * sigma2))]
 
 
-def test_nearer_gaussian_is_in_front_for_any_order_of_rows():
+def test_the_nearer_gaussian_is_in_front_for_any_order_of_rows():
     # Red and green, the second nearer: green is drawn first.
     result = render(stack([3.0, 2.0], [0.5, 0.6]), frontal())
     expected = torch.tensor([0.4 * 0.5, 0.6, 0.0], dtype=torch.float64)
@@ -74,13 +74,13 @@ def test_nearer_gaussian_is_in_front_for_any_order_of_rows():
     assert result.depth[3, 5].item() == pytest.approx(2.0 * 0.6 + 3.0 * 0.2)
 
 
-def test_equal_depths_are_drawn_in_the_order_of_rows():
+def test_gaussians_of_equal_depth_are_drawn_in_the_order_of_rows():
     result = render(stack([2.0, 2.0], [0.5, 0.6]), frontal())
     expected = torch.tensor([0.5, 0.5 * 0.6, 0.0], dtype=torch.float64)
     torch.testing.assert_close(result.image[3, 5], expected)
 
 
-def test_background_fills_what_is_left():
+def test_the_background_fills_the_remaining_transmittance():
     background = torch.tensor([0.2, 0.4, 1.5], dtype=torch.float64)
     gaussians, camera = random_gaussians(20, posed_camera()), posed_camera()
     over_black = render(gaussians, camera)
@@ -89,7 +89,7 @@ def test_background_fills_what_is_left():
     torch.testing.assert_close(result.image, expected)
 
 
-def test_stops_before_the_blend_that_would_end_below_the_limit():
+def test_compositing_stops_before_the_transmittance_falls_below_the_limit():
     # Transmittance 0.05, 0.0025, 1.25e-4 and then 6.25e-6.
     camera = frontal(1, 1, cx=0.5, cy=0.5)
     result = render(stack([1.0, 2.0, 3.0, 4.0, 5.0], [0.95] * 4 + [0.1]), camera)
@@ -107,7 +107,7 @@ def test_alpha_is_capped_and_the_cap_has_no_gradient():
     assert gaussians.opacities.grad.tolist() == [0.0]
 
 
-def test_principal_point_moves_the_image_by_whole_pixels():
+def test_the_principal_point_moves_the_image_by_whole_pixels():
     gaussians = random_gaussians(20, posed_camera(), border=0.0)
     camera = posed_camera()
     moved = replace(camera, cx=camera.cx + 2, cy=camera.cy - 1)
@@ -115,7 +115,7 @@ def test_principal_point_moves_the_image_by_whole_pixels():
     torch.testing.assert_close(there[:-1, 2:], here[1:, :-2])
 
 
-def test_jacobian_is_clamped_around_the_principal_point():
+def test_the_jacobian_is_clamped_around_the_principal_point():
     # Far to the right of the image the covariance is that of the clamped direction.
     camera = frontal(width=10, focal=20.0, cx=2.0)
     gaussians = stack([2.0], [0.9], sigma=2.0)
@@ -126,7 +126,7 @@ def test_jacobian_is_clamped_around_the_principal_point():
     assert render(gaussians, camera).screen.radii.tolist() == [ceil(radius)]
 
 
-def test_degree_one_harmonics_by_hand():
+def test_harmonics_of_degree_one_agree_with_a_calculation_by_hand():
     gaussians = stack([2.0], [0.5], colors=None, sh_degree=1)
     gaussians.means[0] = torch.tensor([0.3, -0.2, 2.0])
     dc = torch.tensor([[[0.1, -0.2, 0.3]]], dtype=torch.float64)
@@ -152,7 +152,7 @@ def test_clamped_channels_and_inactive_bands_have_zero_gradient():
     assert (gaussians.sh_rest.grad[:, :3] != 0).any()
 
 
-def test_antialiased_takes_the_gain_in_area_off_the_opacity():
+def test_the_antialiased_response_divides_the_opacity_by_the_gain_in_area():
     variance, dilation = (20.0 * 0.02 / 2.0) ** 2, 0.1
     gaussians = stack([2.0], [0.8], sigma=0.02, response="antialiased", dilation=dilation)
     det0, det1 = variance**2, (variance + dilation) ** 2
@@ -161,7 +161,7 @@ def test_antialiased_takes_the_gain_in_area_off_the_opacity():
 
 
 @pytest.mark.parametrize("sigma", [0.0031, 0.0032])
-def test_antialiased_erases_what_is_smaller_than_the_limit(sigma):
+def test_the_antialiased_response_removes_gaussians_below_the_size_limit(sigma):
     # sigma px on either axis: determinants of 0.92e-6 and 1.05e-6 px^4 before dilation.
     pixels = sigma * 10.0
     gaussians = stack([2.0], [1.0], sigma=pixels / 10.0, response="antialiased", dilation=0.0)
@@ -170,7 +170,7 @@ def test_antialiased_erases_what_is_smaller_than_the_limit(sigma):
 
 
 @pytest.mark.parametrize("pixels", [1.0, 2.5, 20.0])
-def test_analytic_integrates_over_the_pixel(pixels):
+def test_the_analytic_response_integrates_over_the_pixel(pixels):
     gaussians = stack([2.0], [0.8], sigma=pixels / 10.0, response="analytic")
     result = render(gaussians, frontal())
 
@@ -184,7 +184,7 @@ def test_analytic_integrates_over_the_pixel(pixels):
         assert result.alpha[3 + dy, 5 + dx].item() == pytest.approx(expected, abs=0.005)
 
 
-def test_analytic_ignores_dilation():
+def test_the_analytic_response_ignores_dilation():
     gaussians = random_gaussians(20, posed_camera(), response="analytic")
     wide = replace(gaussians, dilation=5.0)
     assert torch.equal(render(gaussians, posed_camera()).image, render(wide, posed_camera()).image)
@@ -209,7 +209,7 @@ def test_analytic_ignores_dilation():
     ],
 )
 @pytest.mark.parametrize("response", RESPONSES)
-def test_a_gaussian_that_cannot_be_rendered_changes_nothing(field, value, response):
+def test_a_gaussian_that_cannot_be_rendered_does_not_change_the_image(field, value, response):
     good = stack([2.0, 3.0, 4.0], [0.5, 0.5, 0.5], response=response)
     getattr(good, field)[1] = torch.tensor(value, dtype=torch.float64)
     tensors = [good.means, good.quats, good.scales, good.opacities, good.colors]
@@ -239,7 +239,7 @@ def test_a_flat_gaussian_seen_edge_on_is_dropped_without_dilation():
     assert (gaussians.scales.grad == 0).all()
 
 
-def test_no_gaussians_leave_the_background():
+def test_an_empty_model_gives_the_background():
     gaussians = stack([], [])
     gaussians.means.requires_grad_()
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
@@ -272,7 +272,7 @@ def assert_brute_force_agrees(gaussians, camera):
     ],
     ids=["usual", "tiny", "needles", "stiff"],
 )
-def test_agrees_with_brute_force(response, ranges):
+def test_renders_agree_with_brute_force(response, ranges):
     camera = posed_camera(37, 21)
     assert_brute_force_agrees(random_gaussians(30, camera, response=response, **ranges), camera)
 
@@ -283,7 +283,7 @@ def test_harmonics_agree_with_brute_force(sh_degree):
     assert_brute_force_agrees(random_gaussians(20, camera, sh_degree=sh_degree), camera)
 
 
-def test_type_follows_the_means():
+def test_the_image_has_the_type_of_the_means():
     gaussians = random_gaussians(20, posed_camera())
     single = replace(gaussians, **{n: getattr(gaussians, n).float() for n in FIELDS})
     result, exact = render(single, posed_camera()), render(gaussians, posed_camera())
@@ -291,14 +291,14 @@ def test_type_follows_the_means():
     torch.testing.assert_close(result.image.double(), exact.image, atol=2e-6, rtol=0)
 
 
-def test_optional_outputs_come_only_when_asked_for():
+def test_optional_outputs_are_computed_only_if_requested():
     result = TorchRasterizer().render(stack([2.0], [0.5]), frontal(), BLACK)
     assert result.depth is None
     assert result.screen.pixels is None
     assert result.screen.abs_gradient is None
 
 
-def test_gaussians_without_any_colour_are_refused():
+def test_gaussians_without_a_colour_are_refused():
     with pytest.raises(ValueError, match="`colors` or `sh_dc`"):
         render(stack([2.0], [0.5], colors=None), frontal())
 
@@ -306,7 +306,7 @@ def test_gaussians_without_any_colour_are_refused():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("response", RESPONSES)
-def test_cuda_draws_what_the_cpu_draws(response):
+def test_cuda_renders_agree_with_cpu_renders(response):
     camera = posed_camera(37, 21)
     gaussians = random_gaussians(30, camera, response=response)
     moved = replace(gaussians, **{n: getattr(gaussians, n).cuda() for n in FIELDS})

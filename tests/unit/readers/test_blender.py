@@ -44,7 +44,7 @@ def read(path, options=None, **reading):
     return reader.read(path, SceneOptions(**{"init": "random"} | reading))
 
 
-def test_a_frame_of_lego_looks_at_the_origin_from_four_units(tmp_path):
+def test_a_camera_of_scene_lego_looks_at_the_origin_from_four_units(tmp_path):
     scene = read(write(tmp_path))
     view = next(v for v in scene.views if v.name == "train/r_0.png")
     pixels, depth = view.camera.project(scene.similarity.to_local(np.zeros((1, 3))))
@@ -61,7 +61,7 @@ def test_test_views_are_held_out_and_validation_views_left_out(tmp_path):
     assert {view.regime for view in scene.views} == {"all"}
 
 
-def test_validation_views_are_held_out_where_there_are_no_others(tmp_path):
+def test_validation_views_are_held_out_if_there_are_no_test_views(tmp_path):
     scene = read(write(tmp_path, ("train", "val")))
     assert {view.name for view in scene.test_views} == {"val/r_0.png", "val/r_1.png"}
 
@@ -75,7 +75,7 @@ def test_a_scene_with_training_views_only_uses_the_default_split(tmp_path):
     ("background", "left", "corner"),
     [("white", 255, (233, 194, 155)), ("black", 0, (78, 39, 0))],
 )
-def test_alpha_is_coverage_over_the_background(background, left, corner, tmp_path):
+def test_alpha_blends_a_photo_over_the_background(background, left, corner, tmp_path):
     scene = read(write(tmp_path), {"background": background})
     image, mask = scene.views[0].photo.image(), scene.views[0].photo.mask()
     assert mask is None
@@ -85,14 +85,14 @@ def test_alpha_is_coverage_over_the_background(background, left, corner, tmp_pat
     assert "--background" in scene.notes[0]
 
 
-def test_alpha_may_be_a_mask_instead(tmp_path):
+def test_alpha_can_be_used_as_a_mask(tmp_path):
     mask = read(write(tmp_path), {"background": "none"}).views[0].photo.mask()
     expected = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     expected[:10, 10:] = True
     assert torch.equal(mask, expected)
 
 
-def test_transforms_may_be_in_a_folder(tmp_path):
+def test_the_transforms_files_may_be_in_a_folder(tmp_path):
     # As MatrixCity's pose/block_all, whose photos stand elsewhere in the scene.
     path = write(tmp_path)
     (path / "pose").mkdir()

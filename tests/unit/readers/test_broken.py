@@ -159,14 +159,14 @@ def test_a_broken_field_is_named_with_its_file(keys, value, field, make):
     [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a":' * 100_000, b"3", b'{"frames": 1e999}', b"[]"],
     ids=["empty", "cut", "no UTF-8", "deep lists", "deep objects", "a number", "infinite", "list"],
 )
-def test_files_that_are_no_scene_are_named(reader, content, make):
+def test_files_of_other_content_are_named_in_the_error(reader, content, make):
     path = make(reader)
     (path / FILES[reader]).write_bytes(content)
     refuses(path, reader, FILES[reader])
 
 
 @pytest.mark.parametrize("reader", JSON)
-def test_files_beyond_a_size_are_not_read(reader, make, monkeypatch):
+def test_files_above_a_size_limit_are_not_read(reader, make, monkeypatch):
     path = make(reader)
     monkeypatch.setattr("crossgrad_plugins.readers._json.LARGEST", 50)
     refuses(path, reader, FILES[reader], "more than")
@@ -190,7 +190,7 @@ def name_it(reader, path, name):
 
 @pytest.mark.parametrize("reader", [name for name in FILES if name != "matrixcity"])
 @pytest.mark.parametrize("name", OUT)
-def test_names_that_lead_out_of_the_scene_are_refused(reader, name, make):
+def test_names_that_point_outside_the_scene_are_refused(reader, name, make):
     path = make(reader)
     Image.new("RGB", (24, 16)).save(path.parent.parent / "secret.png")
     name_it(reader, path, name)
@@ -199,7 +199,7 @@ def test_names_that_lead_out_of_the_scene_are_refused(reader, name, make):
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 600 + "b", "a\nb", "\0", "\ud800"])
 @pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path", "train_filenames"])
-def test_names_that_no_file_can_have_are_refused(key, name, make):
+def test_impossible_file_names_are_refused(key, name, make):
     path = make("nerfstudio")
     where = ("frames", 0, key) if key in {"file_path", "mask_path"} else (key,)
     edit(path, "nerfstudio", put(*where, value=[name] if key.endswith("s") else name))
@@ -208,7 +208,7 @@ def test_names_that_no_file_can_have_are_refused(key, name, make):
 
 @pytest.mark.parametrize("reader", [*FILES, "colmap"])
 @pytest.mark.parametrize("what", ["photo", "folder"])
-def test_photos_may_be_links_and_a_note_says_where_they_lie(reader, what, make):
+def test_photos_may_be_links_and_a_note_names_their_location(reader, what, make):
     path = make(reader)
     before = read(path, reader)
     photo = min(path.rglob("0001.png"))
@@ -227,7 +227,7 @@ def test_photos_may_be_links_and_a_note_says_where_they_lie(reader, what, make):
 
 @pytest.mark.parametrize("reader", [*FILES, "colmap"])
 @pytest.mark.parametrize("what", ["a text", "a pipe", "a device", "a folder", "nothing", "itself"])
-def test_anything_else_in_place_of_a_photo_is_refused_at_once(reader, what, make):
+def test_a_photo_path_that_is_not_an_image_file_is_refused_at_once(reader, what, make):
     path = make(reader)
     for photo in path.rglob("*.png"):
         photo.unlink()
@@ -241,7 +241,7 @@ def test_anything_else_in_place_of_a_photo_is_refused_at_once(reader, what, make
 
 @pytest.mark.parametrize("reader", FILES)
 @pytest.mark.parametrize("what", ["a pipe", "a device"])
-def test_a_pipe_or_device_in_place_of_the_poses_is_refused_at_once(reader, what, make):
+def test_a_pipe_or_device_in_place_of_the_pose_file_is_refused_at_once(reader, what, make):
     path = make(reader)
     file = path / FILES[reader]
     file.unlink()
@@ -255,7 +255,7 @@ def test_a_pipe_or_device_in_place_of_the_poses_is_refused_at_once(reader, what,
         refuses(path, reader, FILES[reader], options={"file": FILES[reader]})
 
 
-def test_every_file_may_be_a_link_as_caches_lay_them_out(make):
+def test_every_file_may_be_a_link_into_a_cache(make):
     path = make("nerfstudio")
     before = read(path, "nerfstudio")
     store = path.parent.parent / "blobs"
@@ -270,7 +270,7 @@ def test_every_file_may_be_a_link_as_caches_lay_them_out(make):
     ]
 
 
-def test_only_photos_may_be_reached_through_a_link_out_of_the_scene(make):
+def test_only_photos_may_be_links_to_files_outside_the_scene(make):
     path = make("nerfstudio")
     away = path.parent.parent / "away"
     away.mkdir()
@@ -286,7 +286,7 @@ def test_only_photos_may_be_reached_through_a_link_out_of_the_scene(make):
     assert len(read(path, "nerfstudio").points) == 20
 
 
-def test_too_many_values_for_the_memory_are_not_built(make, monkeypatch):
+def test_a_count_of_values_beyond_the_memory_is_refused(make, monkeypatch):
     path = make("nerfstudio")
     monkeypatch.setattr("crossgrad_plugins.readers._json.LARGEST", 1 << 20)
     (path / "transforms.json").write_bytes(b'{"frames": [' + b"[]," * 100_000 + b"0]}")
@@ -311,12 +311,12 @@ def test_every_file_name_in_a_file_must_stay_inside_the_scene(key, make):
         ("metashape", "images"), ("metashape", "file"), ("metashape", "points"),
     ],
 )  # fmt: skip
-def test_options_name_files_of_the_scene_only(reader, option, make):
+def test_options_accept_files_inside_the_scene_only(reader, option, make):
     path = make(reader)
     refuses(path, reader, f"reader.{option}", options={option: "../elsewhere"})
 
 
-def test_a_name_within_the_scene_may_go_up(make):
+def test_a_name_inside_the_scene_may_contain_parent_folders(make):
     path = make("nerfstudio")
     (path / "poses").mkdir()
     whole = json.loads((path / "transforms.json").read_text())
@@ -329,7 +329,7 @@ def test_a_name_within_the_scene_may_go_up(make):
     assert len(scene.points) == 20
 
 
-def test_nothing_beside_the_scene_is_read(make):
+def test_no_file_outside_the_scene_is_read(make):
     # Smaller copies of photos lie beside their folder, unless that is the scene itself.
     path = make("blender")
     shutil.copytree(path, path.with_name("blender_2"))
@@ -352,7 +352,7 @@ class TestXml:
         ],
         ids=["bomb", "deep", "cut", "empty", "UTF-16", "encoding"],
     )
-    def test_hostile_files_are_refused(self, content, word, make):
+    def test_hostile_xml_files_are_refused(self, content, word, make):
         path = make("metashape")
         (path / "cameras.xml").write_bytes(content)
         refuses(path, "metashape", "cameras.xml", word, options={"file": "cameras.xml"})
@@ -368,7 +368,7 @@ class TestXml:
         ],
         ids=["elements", "attributes", "wide", "comment", "size"],
     )
-    def test_number_and_size_are_bounded(self, content, word, tmp_path, monkeypatch):
+    def test_numbers_and_sizes_are_bounded(self, content, word, tmp_path, monkeypatch):
         bounds = {"_MOST": 1_000, "_LONGEST": 1 << 15, "_PIECE": 1 << 12, "LARGEST": 190_000}
         for name, bound in bounds.items():
             monkeypatch.setattr(_xml, name, bound)
@@ -376,7 +376,7 @@ class TestXml:
         with pytest.raises(UserError, match=word):
             _xml.read_xml(tmp_path / "a.xml")
 
-    def test_entities_cannot_name_files(self, make):
+    def test_xml_entities_cannot_include_files(self, make):
         path = make("metashape")
         content = (path / "cameras.xml").read_text()
         declared = '<!DOCTYPE d [<!ENTITY x SYSTEM "file:///etc/hostname">]>'
@@ -402,7 +402,7 @@ class TestXml:
             ("cameras>", "others>", "cameras"),
         ],
     )
-    def test_a_broken_field_is_named(self, old, new, field, make):
+    def test_a_broken_xml_field_is_named(self, old, new, field, make):
         path = make("metashape")
         content = (path / "cameras.xml").read_text()
         changed = content.replace(old, new)
@@ -423,7 +423,7 @@ class TestCsv:
             (1, "alt", "1_0", "line 2.alt"),
         ],
     )
-    def test_a_broken_cell_is_named(self, line, column, cell, field, make):
+    def test_a_broken_table_cell_is_named(self, line, column, cell, field, make):
         path = make("realitycapture")
         rows = [row.split(",") for row in (path / "cameras.csv").read_text().splitlines()]
         rows[line][rows[0].index(column)] = cell
@@ -441,14 +441,14 @@ class TestCsv:
             (b"#name,x,y,alt,heading,pitch,roll,f\n", "no posed image"),
         ],
     )
-    def test_other_tables_are_refused(self, content, word, make):
+    def test_invalid_tables_are_refused(self, content, word, make):
         path = make("realitycapture")
         (path / "cameras.csv").write_bytes(content)
         refuses(path, "realitycapture", word, options={"file": "cameras.csv"})
 
 
 class TestPoints:
-    def test_points_in_another_frame_are_refused(self, make):
+    def test_points_in_another_coordinate_frame_are_refused(self, make):
         path = make("realitycapture")
         far = np.full((20, 3), 1e6) + np.arange(20)[:, None]
         write_ply(path / "points.ply", far, np.zeros((20, 3), np.uint8))
@@ -460,7 +460,7 @@ class TestPoints:
         (path / "points.ply").write_text(header)
         refuses(path, "realitycapture", "points.ply", "no y, z")
 
-    def test_a_count_that_cannot_be_true_is_refused(self, make):
+    def test_an_impossible_vertex_count_is_refused(self, make):
         path = make("nerfstudio")
         content = (path / "cloud.ply").read_bytes()
         (path / "cloud.ply").write_bytes(content.replace(b"vertex 20", b"vertex 2000000000000"))
@@ -470,7 +470,7 @@ class TestPoints:
         ("kind", "values", "stored"),
         [("float", (0.0, 0.5, 1.0), (0, 128, 255)), ("uchar", (0, 7, 255), (0, 7, 255))],
     )
-    def test_colors_are_fractions_or_whole_numbers(self, kind, values, stored, make):
+    def test_colors_may_be_fractions_or_whole_numbers(self, kind, values, stored, make):
         path = make("nerfstudio")
         names = "".join(f"property {kind} {color}\n" for color in ("red", "green", "blue"))
         axes = "property float x\nproperty float y\nproperty float z\n"
@@ -482,7 +482,7 @@ class TestPoints:
         assert scene.point_colors.tolist() == [list(stored)]
 
     @pytest.mark.parametrize("reader", ["nerfstudio", "blender", "metashape"])
-    def test_points_may_be_missing(self, reader, make):
+    def test_the_file_of_points_may_be_missing(self, reader, make):
         path = make(reader)
         for file in path.glob("*.ply"):
             file.unlink()
@@ -491,7 +491,7 @@ class TestPoints:
         assert len(read(path, reader).points) == 0
 
 
-def test_a_folder_that_may_not_be_read_is_taken_by_no_reader(make):
+def test_a_folder_without_read_permission_is_accepted_by_no_reader(make):
     path = make("metashape")
     path.chmod(0)
     try:

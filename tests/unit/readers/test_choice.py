@@ -18,7 +18,7 @@ def forms(tmp_path):
     return write_formats(scene, tmp_path)
 
 
-def test_two_readers_for_one_folder_are_an_error_that_names_the_option(forms):
+def test_a_folder_that_two_readers_accept_is_refused_with_the_option(forms):
     path = forms["nerfstudio"]
     shutil.copytree(forms["colmap"] / "sparse", path / "colmap" / "sparse")
     with pytest.raises(UserError, match="several ways") as caught:
@@ -29,7 +29,7 @@ def test_two_readers_for_one_folder_are_an_error_that_names_the_option(forms):
         assert read_scene(RunConfig(scene=path, reader={"name": name}), path)[1] == name
 
 
-def test_options_are_those_of_the_reader_that_is_taken(forms):
+def test_reader_options_apply_to_the_selected_reader(forms):
     path = forms["nerfstudio"]
     (path / "transforms.json").rename(path / "other.json")
     (path / "transforms.json").write_text("{}")
@@ -37,7 +37,7 @@ def test_options_are_those_of_the_reader_that_is_taken(forms):
     assert read_scene(config, path)[1] == "nerfstudio"
 
 
-def test_no_reader_says_what_is_missing(tmp_path):
+def test_a_folder_without_a_reader_is_refused_with_the_missing_file(tmp_path):
     with pytest.raises(UserError, match="no COLMAP model") as caught:
         read_scene(RunConfig(scene=tmp_path), tmp_path)
     assert "docs/readers.md" in caught.value.todo
@@ -45,6 +45,6 @@ def test_no_reader_says_what_is_missing(tmp_path):
 
 @pytest.mark.parametrize("name", ["cameras.csv", "notes.xml", "transforms.json"])
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\0", b"<html/>", b"a,b\n1,2\n", b"[]"])
-def test_other_files_are_taken_by_no_reader(name, content, tmp_path):
+def test_unrelated_files_are_accepted_by_no_reader(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     assert not [each for each in entries("readers") if build("readers", each, {}).accepts(tmp_path)]

@@ -84,7 +84,7 @@ def color_error(view, scene):
 
 
 class TestReading:
-    def test_agrees_with_pycolmap(self, masters):
+    def test_poses_and_observations_agree_with_pycolmap(self, masters):
         import pycolmap
 
         path = masters / "two"
@@ -106,7 +106,7 @@ class TestReading:
             seen = {p.point3D_id for p in image.points2D if p.has_point3D()}
             assert {ids[row] for row in view.seen} == seen
 
-    def test_binary_and_text_agree(self, make):
+    def test_binary_and_text_models_agree(self, make):
         binary = make()
         text = read(write_tiny_scene(binary.parent / "text", text=True))
         scene = read(binary)
@@ -118,12 +118,12 @@ class TestReading:
             np.testing.assert_array_equal(ours.seen, theirs.seen)
 
     @pytest.mark.parametrize("name", ["rigs", "frames"])
-    def test_models_of_older_colmap_have_no_rigs(self, make, name):
+    def test_models_of_older_colmap_versions_without_rigs_are_read(self, make, name):
         path = make()
         (model(path) / f"{name}.bin").unlink()
         assert len(read(path).views) == 8
 
-    def test_equal_names_in_two_folders_are_two_images(self, masters):
+    def test_equal_file_names_in_two_folders_are_two_images(self, masters):
         scene = read(masters / "two")
         names = [view.name for view in scene.views]
         assert names == sorted(names)
@@ -156,7 +156,7 @@ class TestReading:
         assert max(color_error(view, scene) for view in scene.views) < 4
         assert sorted(p for p in path.rglob("*") if p.is_file()) == before
 
-    def test_a_radial_camera_without_distortion_is_left_alone(self, tmp_path):
+    def test_a_radial_camera_without_distortion_is_not_undistorted(self, tmp_path):
         path = write_tiny_scene(tmp_path, views=2)
         record = struct.pack("<QIiQQ4d", 1, 1, 2, 48, 32, 57.6, 25.5, 15.0, 0.0)
         (model(path) / "cameras.bin").write_bytes(record)
@@ -164,7 +164,7 @@ class TestReading:
         assert "undistorted" not in notes(scene)
         assert scene.views[0].camera.width == 48
 
-    def test_split_and_notes(self, masters):
+    def test_the_split_and_its_notes_are_reported(self, masters):
         scene = read(masters / "plain")
         assert (scene.train, scene.test) == ((1, 2, 3, 4, 5, 6, 7), (0,))
         assert [view.name for view in scene.test_views] == ["0000.png"]
@@ -181,7 +181,7 @@ class TestReading:
         )
 
     @pytest.mark.parametrize("scale", [1.0, 1000.0])
-    def test_stratified_takes_the_regimes_of_all_views(self, tmp_path, scale):
+    def test_the_stratified_split_uses_the_regimes_of_all_views(self, tmp_path, scale):
         path = write_tiny_scene(tmp_path, views=20, width=24, height=16, scale=scale)
         scene = read(path, split="stratified")
         assert (
@@ -207,7 +207,9 @@ class TestReading:
         ("scale", "offset"),
         [(1000.0, (0, 0, 0)), (0.001, (0, 0, 0)), (1.0, (5e5, 4e6, 100)), (300.0, (5e5, 4e6, 100))],
     )
-    def test_units_and_origin_of_the_input_do_not_matter(self, masters, tmp_path, scale, offset):
+    def test_units_and_origin_of_the_input_do_not_change_the_scene(
+        self, masters, tmp_path, scale, offset
+    ):
         reference = read(masters / "plain")
         path = write_tiny_scene(tmp_path, scale=scale, offset=offset)
         scene = read(path)
@@ -243,7 +245,7 @@ class TestPhotos:
         assert "2 photos without a pose left out: aaa.png, extra/0001.png" in notes(scene)
         assert color_error(scene.views[1], scene) < 8
 
-    def test_photos_under_other_names_are_refused(self, make):
+    def test_photos_with_other_names_than_the_poses_are_refused(self, make):
         path = make()
         (path / "images").rename(path / "moved")
         (path / "images").mkdir()
@@ -251,13 +253,13 @@ class TestPhotos:
         (path / "moved").rename(path / "images" / "cam0")
         refuses(path, "no posed image has a photo", "0000.png", "cam0/0000.png")
 
-    def test_a_scene_without_photo_folder_is_refused(self, make):
+    def test_a_scene_without_a_photo_folder_is_refused(self, make):
         path = make()
         (path / "images").rename(path / "pictures")
         refuses(path, "no folder of photos", "pictures, sparse")
         assert len(read(path, ColmapReader(images="pictures")).views) == 8
 
-    def test_spelling_of_suffix_and_case_may_differ(self, make):
+    def test_photo_names_may_differ_in_suffix_and_case(self, make):
         path = make()
         (path / "images" / "0001.png").rename(path / "images" / "0001.PNG")
         scene = read(path)
@@ -265,13 +267,13 @@ class TestPhotos:
         assert "1 photo paired by a name that differs in suffix or case: 0001.png" in notes(scene)
 
     @pytest.mark.parametrize("share", [0.5, 0.95])
-    def test_a_photo_cut_short_is_refused_before_training(self, make, share):
+    def test_a_truncated_photo_is_refused_before_training(self, make, share):
         path = make("jpeg")
         photo = path / "images" / "0005.jpg"
         photo.write_bytes(photo.read_bytes()[: int(photo.stat().st_size * share)])
         refuses(path, "cut short", photo)
 
-    def test_a_photo_damaged_within_is_named_when_it_is_decoded(self, make):
+    def test_a_photo_damaged_inside_is_named_when_it_is_decoded(self, make):
         path = make()
         photo = path / "images" / "0005.png"
         patch(photo, photo.stat().st_size // 2, b"\xff" * 40)
@@ -279,7 +281,7 @@ class TestPhotos:
         with pytest.raises(UserError, match=r"cannot be decoded(?s:.*)0005\.png"):
             scene.views[5].photo.image()
 
-    def test_reduced_photos_win_over_resizing(self, make):
+    def test_reduced_photos_are_preferred_over_resizing(self, make):
         path = make("two")
         for photo in sorted((path / "images").rglob("*.png")):
             small = path / "images_4" / photo.relative_to(path / "images").with_suffix(".jpg")
@@ -307,7 +309,7 @@ class TestPhotos:
         assert "images_2/ is not used, 1 photo of it missing: 0007.png" in notes(scene)
         assert "24 x 16 px (8) from images/, 8 resized (scikit-image" in notes(scene)
 
-    def test_reduced_photos_without_the_originals_are_enough(self, make):
+    def test_reduced_photos_without_the_originals_are_sufficient(self, make):
         path = make()
         (path / "images").rename(path / "images_4")
         rewrite_camera(path, 192, 128, (230.4, 230.4, 102.0, 60.0))
@@ -321,7 +323,7 @@ class TestPhotos:
         Image.new("RGB", (40, 32)).save(path / "images" / "0002.png")
         refuses(path, "does not have the shape of its camera", "0002.png", "48 x 32", "40 x 32")
 
-    def test_exif_rotation_counts_only_where_the_camera_says_so(self, make):
+    def test_exif_rotation_is_applied_only_if_the_camera_size_requires_it(self, make):
         path = make("jpeg")
         exif = Image.Exif()
         exif[0x0112] = 6
@@ -342,7 +344,7 @@ class TestPhotos:
         assert tuple(turned.views[1].photo.image().shape) == (32, 48, 3)
         assert color_error(turned.views[1], turned) < 8
 
-    def test_grey_and_transparent_photos(self, make):
+    def test_grey_and_transparent_photos_are_read(self, make):
         path = make()
         for name, mode in (("0001", "L"), ("0002", "RGBA")):
             with Image.open(path / "images" / f"{name}.png") as image:
@@ -361,7 +363,7 @@ class TestPhotos:
         assert scene.views[3].photo.mask() is None
 
     @pytest.mark.parametrize("name", ["0002.png.png", "0002.png"])
-    def test_masks_in_both_conventions(self, make, name):
+    def test_masks_are_read_in_both_naming_conventions(self, make, name):
         path = make()
         (path / "masks").mkdir()
         mask = Image.new("L", (48, 32), 255)
@@ -378,7 +380,7 @@ class TestPhotos:
         assert read(path).views[2].photo.mask() is None
         assert read(path, masks=Path("mine")).views[2].photo.mask() is not None
 
-    def test_masks_that_fit_nothing_are_refused(self, make):
+    def test_masks_without_a_matching_photo_are_refused(self, make):
         path = make()
         refuses(path, "mask folder is not there", "mine", masks=Path("mine"))
         (path / "mine").mkdir()
@@ -386,7 +388,7 @@ class TestPhotos:
         Image.new("L", (48, 48)).save(path / "mine" / "0002.png")
         refuses(path, "a mask does not have the shape", "48 x 48", masks=path / "mine")
 
-    def test_photos_beyond_the_memory_are_announced(self, tmp_path):
+    def test_photos_larger_than_the_photo_cache_give_a_note(self, tmp_path):
         path = write_tiny_scene(tmp_path, views=2)
         rewrite_camera(path, 3000, 2000, (3600.0, 3600.0, 1594.0, 938.0))
         for name in ("0000", "0001"):
@@ -395,7 +397,7 @@ class TestPhotos:
 
 
 class TestModels:
-    def test_the_largest_of_several_models_is_taken(self, make):
+    def test_the_largest_of_several_models_is_used(self, make):
         path = make()
         small = write_tiny_scene(path.parent / "small", views=3)
         (path / "sparse" / "0").rename(path / "sparse" / "10")
@@ -408,7 +410,7 @@ class TestModels:
             read(path, ColmapReader(model="sparse/7"))
 
     @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
-    def test_models_in_other_places(self, make, place):
+    def test_models_in_other_folders_are_found(self, make, place):
         path = make()
         files = list(model(path).iterdir())
         (path / place).mkdir(parents=True, exist_ok=True)
@@ -417,7 +419,7 @@ class TestModels:
         assert len(read(path).views) == 8
         assert ColmapReader().accepts(path)
 
-    def test_folders_without_a_model(self, make):
+    def test_folders_without_a_model_are_refused(self, make):
         path = make()
         assert not ColmapReader().accepts(path / "images")
         assert not ColmapReader().accepts(path / "nowhere")
@@ -431,13 +433,13 @@ class TestModels:
         refuses(model(path), "leads into a scene", f"try {path}")
         refuses(path / "sparse", "leads into a scene", f"try {path}")
 
-    def test_paths_that_are_no_scene(self, make):
+    def test_paths_without_a_scene_are_refused_with_a_suggestion(self, make):
         path = make()
         refuses(path.parent / "plane", "not there", f"did you mean {path}?")
         refuses(path.parent / "zzz" / "q", "not there", "check the path")
         refuses(path / "images" / "0000.png", "a scene is a folder, not a file")
 
-    def test_a_folder_that_may_not_be_listed(self, make, monkeypatch):
+    def test_a_folder_without_list_permission_is_refused(self, make, monkeypatch):
         path = make()
 
         def deny(self):
@@ -446,7 +448,7 @@ class TestModels:
         monkeypatch.setattr(Path, "iterdir", deny)
         refuses(path, "cannot be read", "Permission denied")
 
-    def test_a_model_file_that_may_not_be_read(self, make, monkeypatch):
+    def test_a_model_file_without_read_permission_is_refused(self, make, monkeypatch):
         path = make()
         opened = Path.open
 
@@ -460,7 +462,7 @@ class TestModels:
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
     @pytest.mark.parametrize("size", [0, 5, 8, 40, -1, -20])
-    def test_files_cut_short_are_refused(self, make, file, size):
+    def test_truncated_files_are_refused(self, make, file, size):
         path = make()
         content = (model(path) / file).read_bytes()
         (model(path) / file).write_bytes(content[:size])
@@ -481,7 +483,7 @@ class TestModels:
 
     @pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
     @pytest.mark.parametrize("text", ["hello world\nfoo bar\n", "1 PINHOLE 48"])
-    def test_bad_text_models_are_refused(self, make, file, text):
+    def test_invalid_text_models_are_refused(self, make, file, text):
         path = make("jpeg")
         (model(path) / file).write_text(text)
         refuses(path, "text model cannot be read", model(path))
@@ -516,12 +518,12 @@ class TestModels:
         refuses(path, words, "image 0000.png")
 
     @pytest.mark.parametrize("pose", [(np.nan, 0, 0, 0), (0, 0, 0, 0), (1, 0, 0, 0, np.inf, 0, 0)])
-    def test_poses_that_are_not_finite_are_refused(self, make, pose):
+    def test_non_finite_poses_are_refused(self, make, pose):
         path = make()
         patch(model(path) / "images.bin", 12, struct.pack(f"<{len(pose)}d", *pose))
         refuses(path, "a pose is not finite", "0000.png")
 
-    def test_two_poses_of_one_name_are_refused(self, make):
+    def test_two_poses_with_the_same_name_are_refused(self, make):
         path = make()
         content = (model(path) / "images.bin").read_bytes()
         (model(path) / "images.bin").write_bytes(content.replace(b"0001.png", b"0002.png"))
@@ -534,7 +536,7 @@ class TestModels:
         (model(path) / "images.bin").write_bytes(content.replace(b"0001.png", name))
         refuses(path, "leads out of the image folder", name.decode())
 
-    def test_backslashes_in_names_are_slashes(self, make):
+    def test_backslashes_in_names_are_read_as_slashes(self, make):
         path = make("two")
         content = (model(path) / "images.bin").read_bytes()
         (model(path) / "images.bin").write_bytes(content.replace(b"aerial/", b"aerial\\"))
@@ -556,7 +558,7 @@ class TestModels:
         assert all(len(view.seen) == 0 for view in scene.views)
         assert "regimes by footprint: all 8 views (7 train, 1 test)" in notes(scene)
 
-    def test_points_that_are_not_finite_are_left_out(self, make):
+    def test_non_finite_points_are_left_out(self, make):
         path = make()
         patch(model(path) / "points3D.bin", 16, struct.pack("<d", np.nan))
         scene = read(path)
@@ -575,7 +577,7 @@ class TestModels:
         assert len(after.points) == len(before.points) == 199
         assert color_error(after.views[1], after) < 8
 
-    def test_one_view_is_trained_on(self, tmp_path):
+    def test_a_single_view_becomes_a_training_view(self, tmp_path):
         scene = read(write_tiny_scene(tmp_path, views=1))
         assert (scene.train, scene.test) == ((0,), ())
         assert "none held out: too few views" in notes(scene)
@@ -583,7 +585,7 @@ class TestModels:
         assert np.median(np.linalg.norm(scene.points, axis=1)) == pytest.approx(1, rel=1e-6)
 
 
-def test_a_model_may_be_named_with_its_whole_path(tmp_path, monkeypatch):
+def test_a_model_may_be_given_by_its_absolute_path(tmp_path, monkeypatch):
     write_tiny_scene(tmp_path / "scene")
     monkeypatch.chdir(tmp_path)
     scene = read(Path("scene"), ColmapReader(model=str(tmp_path / "scene" / "sparse" / "0")))

@@ -59,7 +59,7 @@ def test_each_format_is_accepted_by_one_reader(reader, forms):
 
 
 @pytest.mark.parametrize("reader", [name for name in FORMATS if name != "colmap"])
-def test_each_form_loads_to_the_same_scene(reader, scenes):
+def test_each_format_loads_to_the_same_scene(reader, scenes):
     scene, colmap = scenes[reader], scenes["colmap"]
     views = {plain(reader, view.name): view for view in scene.views}
     assert len(views) == 8
@@ -83,7 +83,7 @@ def test_each_form_loads_to_the_same_scene(reader, scenes):
 
 
 @pytest.mark.parametrize("reader", EXACT)
-def test_matrices_keep_every_bit(reader, scenes):
+def test_formats_with_matrices_keep_every_bit_of_the_cameras(reader, scenes):
     for ours, theirs in zip(scenes[reader].views, scenes["colmap"].views, strict=True):
         assert torch.equal(ours.camera.world_to_camera, theirs.camera.world_to_camera)
         assert torch.equal(ours.camera.matrix, theirs.camera.matrix)
@@ -91,7 +91,7 @@ def test_matrices_keep_every_bit(reader, scenes):
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
-def test_lenses_are_undistorted_as_those_of_colmap(model, tmp_path):
+def test_lenses_of_each_format_are_undistorted_like_those_of_colmap(model, tmp_path):
     scene = write_tiny_scene(
         tmp_path / "scene", views=2, width=40, height=30, points=40, model=model, mixed=True
     )
@@ -124,7 +124,7 @@ def set_terms(scene):
 
 
 @pytest.mark.parametrize("reader", ["metashape", "nerfstudio", "opensfm", "realitycapture"])
-def test_lists_of_the_user_come_first(reader, forms, tmp_path):
+def test_split_lists_of_the_user_have_priority(reader, forms, tmp_path):
     import shutil
 
     path = shutil.copytree(forms[reader], tmp_path / reader)
@@ -180,14 +180,14 @@ def parameters_after(path, reader):
 
 
 @pytest.mark.parametrize("reader", EXACT)
-def test_matrices_train_to_the_same_bits(reader, trained):
+def test_formats_with_matrices_train_to_the_same_bits(reader, trained):
     ours, theirs = trained(reader), trained("colmap")
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
 @pytest.mark.parametrize("reader", ROUNDED)
-def test_rounded_cameras_train_alike(reader, trained):
+def test_formats_with_rounded_cameras_train_nearly_alike(reader, trained):
     ours, theirs = trained(reader), trained("colmap")
     assert ours.keys() == theirs.keys()
     for name in ours:

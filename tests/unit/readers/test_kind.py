@@ -36,14 +36,14 @@ def read(program, scene, **options):
     return build("readers", program, options).read(scene, SceneOptions())
 
 
-def test_other_files_with_its_suffix_are_passed_over(program, scene):
+def test_other_files_with_the_same_suffix_are_ignored(program, scene):
     file = file_of(scene, program)
     file.with_stem("a_list").write_text("no such columns\n")
     assert build("readers", program, {}).accepts(scene)
     assert len(read(program, scene).views) > 0
 
 
-def test_of_two_files_the_named_file_is_read(program, scene):
+def test_the_named_file_is_read_if_two_files_fit(program, scene):
     file = file_of(scene, program)
     file.with_stem("other").write_bytes(file.read_bytes())
     with pytest.raises(UserError, match=f"several {KINDS[program][0]}s") as caught:
@@ -60,7 +60,7 @@ def test_the_error_for_a_missing_file_names_its_contents(program, scene):
 
 
 @pytest.mark.parametrize("name", ["../cameras.xml", "/etc/hostname", "[", ""])
-def test_a_name_of_no_file_in_the_scene_is_refused(program, scene, name):
+def test_a_file_name_that_is_not_in_the_scene_is_refused(program, scene, name):
     assert not build("readers", program, {"file": name}).accepts(scene)
     with pytest.raises(UserError):
         read(program, scene, file=name)

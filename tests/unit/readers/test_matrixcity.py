@@ -24,12 +24,12 @@ def read(path):
     return MatrixCityReader().read(path, SceneOptions(init="random"))
 
 
-def test_a_block_is_a_scene(blocks):
+def test_a_block_is_read_as_a_scene(blocks):
     assert MatrixCityReader().accepts(blocks)
     assert [view.name for view in read(blocks).views] == [f"{k:04d}.png" for k in range(3)]
 
 
-def test_photos_may_lie_beside_their_poses(blocks):
+def test_photos_may_be_in_the_folder_of_their_poses(blocks):
     for photo in (blocks / "rgb").iterdir():
         photo.rename(blocks / photo.name)
     (blocks / "rgb").rmdir()
@@ -37,7 +37,7 @@ def test_photos_may_lie_beside_their_poses(blocks):
 
 
 @pytest.mark.parametrize("held_out", ["aerial/test/block_2", "aerial/block_1_test"])
-def test_blocks_of_a_city_are_one_scene(held_out, blocks, tmp_path):
+def test_blocks_of_a_city_are_read_as_one_scene(held_out, blocks, tmp_path):
     city = tmp_path / "city"
     places = ("aerial/train/block_1", "street/train/small_city_road_down", held_out)
     for place in places:

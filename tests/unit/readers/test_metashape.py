@@ -40,7 +40,7 @@ def read(path, **options):
     return MetashapeReader.model_validate(options).read(path, SceneOptions())
 
 
-def test_the_terms_of_a_lens_are_agisofts():
+def test_lens_parameters_follow_the_agisoft_convention():
     # x' = x + P1 (r^2 + 2 x^2) + 2 P2 x y; u = w / 2 + cx + x' (f + B1).
     terms = {"f": 100.0, "cx": 2.0, "cy": -3.0, "b1": 5.0, "p1": 0.01, "p2": 0.02, "k1": 0.1}
     fields = metashape.Fields({"width": 40.0, "height": 30.0, **terms}, "cameras.xml")
@@ -57,7 +57,7 @@ def test_the_terms_of_a_lens_are_agisofts():
     np.testing.assert_allclose(camera.img_from_cam(np.array([[x, y, 1.0]]))[0], pixel, rtol=1e-12)
 
 
-def test_the_coordinates_of_the_chunk_can_be_chosen(path):
+def test_the_coordinates_of_the_chunk_can_be_selected(path):
     (path / "points.ply").unlink()
     reader, options = MetashapeReader(frame="chunk"), SceneOptions(init="random")
     own, world = reader.read(path, options), MetashapeReader().read(path, options)
@@ -73,7 +73,7 @@ def test_points_of_the_other_frame_are_refused_with_the_option(path):
     assert "--set reader.frame=chunk" in caught.value.todo
 
 
-def test_a_chunk_on_earth_comes_into_the_local_frame(path):
+def test_a_georeferenced_chunk_is_converted_to_the_local_frame(path):
     """Moved to Berlin by an independent way, the scene comes back as it was: east, north, up."""
     guard_pycolmap()
     import pycolmap
@@ -103,7 +103,7 @@ def test_a_chunk_on_earth_comes_into_the_local_frame(path):
     assert abs(longitude - PLACE[1]) < 1e-3
 
 
-def test_cameras_without_a_pose_and_of_other_components_are_left_out(path):
+def test_cameras_without_a_pose_or_of_other_components_are_left_out(path):
     edit(path, r'component_id="0" label="0002', 'component_id="1" label="0002')
     scene = read(path)
     assert [view.name for view in scene.views] == ["0000.png", "0001.png"]
@@ -113,7 +113,7 @@ def test_cameras_without_a_pose_and_of_other_components_are_left_out(path):
 
 
 @pytest.mark.parametrize(("old", "new"), [(r'(\d{4})\.png"', r'\1"'), (r'"(\d{4})', r'"gone/\1')])
-def test_labels_find_photos_without_suffix_and_in_other_folders(old, new, path):
+def test_labels_match_photos_without_suffix_and_in_other_folders(old, new, path):
     before = read(path)
     edit(path, old, new)
     assert [view.name for view in read(path).views] == [view.name for view in before.views]
@@ -133,7 +133,7 @@ def test_a_disabled_camera_is_left_out(path):
         "<rolling_shutter>true</rolling_shutter>",
     ],
 )
-def test_a_rolling_shutter_is_refused_with_the_way_out(told, path):
+def test_a_compensated_rolling_shutter_is_refused_with_a_remedy(told, path):
     """Its poses are those of one row of each photo, the others have other ones."""
     edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
     with pytest.raises(metashape.UserError, match="rolling shutter") as caught:
@@ -152,7 +152,7 @@ def test_a_rolling_shutter_is_refused_with_the_way_out(told, path):
         "<rolling_shutter/>",
     ],
 )
-def test_a_rolling_shutter_that_is_not_compensated_is_read(told, path):
+def test_a_rolling_shutter_without_compensation_is_read(told, path):
     before = [view.camera.world_to_camera.tolist() for view in read(path).views]
     edit(path, r"(<sensor [^>]*>)", rf"\1{told}")
     assert [view.camera.world_to_camera.tolist() for view in read(path).views] == before

@@ -109,7 +109,7 @@ def test_slave_cameras_are_placed_by_their_master_and_the_offset(order, path):
     assert any("2 slave cameras posed by their masters" in note for note in scene.notes)
 
 
-def test_offsets_may_refer_to_another_sensor_than_the_masters(path):
+def test_offsets_may_refer_to_another_sensor_than_that_of_the_master(path):
     base = np.eye(4)
     base[:3, :3] = Rotation.from_rotvec([0.2, -0.3, 0.1]).as_matrix()
     base[:3, 3] = [0.5, -0.1, 0.2]
@@ -120,7 +120,7 @@ def test_offsets_may_refer_to_another_sensor_than_the_masters(path):
     np.testing.assert_allclose(scene.similarity.to_input(centers), expected, atol=1e-7)
 
 
-def test_a_transform_of_its_own_comes_before_the_masters(path):
+def test_a_slave_camera_with_a_transform_does_not_use_its_master(path):
     poses = make_rig(path, own=True)
     scene = read(path)
     centers = np.stack([view.camera.center.numpy() for view in scene.views])
@@ -129,7 +129,7 @@ def test_a_transform_of_its_own_comes_before_the_masters(path):
     assert not any("slave" in note for note in scene.notes)
 
 
-def test_slaves_without_an_offset_are_left_out_as_without_a_pose(path):
+def test_slave_cameras_without_an_offset_are_left_out(path):
     make_rig(path)
     file = path / "cameras.xml"
     file.write_text(re.sub(r"<(location|rotation)>[^<]*</\1>", "", file.read_text()))
@@ -138,7 +138,7 @@ def test_slaves_without_an_offset_are_left_out_as_without_a_pose(path):
     assert any("without a pose" in note for note in scene.notes)
 
 
-def test_an_offset_that_is_no_rotation_is_refused(path):
+def test_an_offset_without_a_valid_rotation_is_refused(path):
     make_rig(path)
     file = path / "cameras.xml"
     bad = "<rotation>1 0 0 0 1 0 0 0 -1</rotation></sensor>"
@@ -184,7 +184,7 @@ def test_equal_labels_are_resolved_by_folder_group_sensor_or_exclusion(cameras, 
         assert not notes
 
 
-def test_the_size_of_the_photo_tells_them_apart(sizes):
+def test_equal_labels_are_resolved_by_the_size_of_the_photo(sizes):
     sizes["cam0"] = (99, 99)
     assert pairs([("a", "", "x")], TWO)[0] == ["cam1/a.png"]
 
@@ -211,12 +211,12 @@ def test_equal_labels_are_resolved_by_order_as_a_last_resort_with_a_note(of, siz
         ([("a", "", "x"), ("a", "", "y")], ["cam0/a.png"], r"cam0/a\.png"),
     ],
 )
-def test_an_unresolved_label_is_one_error_that_names_it(cameras, names, named, sizes):
+def test_an_unresolved_label_gives_one_error_with_the_label(cameras, names, named, sizes):
     with pytest.raises(UserError, match=rf"a \(sensor x\)(?s:.*){named}"):
         pairs(cameras, names)
 
 
-def test_photos_that_are_missing_keep_names_of_their_own(sizes):
+def test_missing_photos_get_distinct_names(sizes):
     cameras = [("a", "", "cam0"), ("a", "", "cam1"), ("b", "", "cam0")]
     assert pairs(cameras, ["cam0/a.png"])[0] == ["cam0/a.png", "a (camera 2)", "b"]
 

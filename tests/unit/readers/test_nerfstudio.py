@@ -39,7 +39,7 @@ def read(path, options=None, **reading):
     return reader.read(path, SceneOptions(**{"init": "random", "split": "none"} | reading))
 
 
-def test_cameras_look_along_minus_z_with_y_up(tmp_path):
+def test_cameras_look_along_minus_z_and_y_points_up(tmp_path):
     scene = read(write(tmp_path, **LENS))
     # The ground below the camera, one unit to its east, and one to its north.
     ground = np.array([[1.0, 0, 0], [2, 0, 0], [1, 1, 0]])
@@ -71,12 +71,12 @@ def test_lens_values_of_a_frame_override_the_values_of_the_file(tmp_path):
         ({"fl_y": 41.0}, {"fl_x": 30.0, "fl_y": 31.0}, (30.0, 41.0)),
     ],
 )
-def test_a_focal_length_of_a_frame_is_not_completed_in_another_way(own, shared, focal, tmp_path):
+def test_a_focal_length_of_a_frame_is_not_mixed_with_that_of_the_file(own, shared, focal, tmp_path):
     camera = read(write(tmp_path, own, **{"w": 24, "h": 16, **shared})).views[0].camera
     assert (camera.fx, camera.fy) == pytest.approx(focal)
 
 
-def test_half_a_focal_length_of_a_frame_is_an_error_of_the_frame(tmp_path):
+def test_an_incomplete_focal_length_of_a_frame_is_an_error(tmp_path):
     with pytest.raises(UserError, match="a field of the scene") as caught:
         read(write(tmp_path, {"fl_y": 40.0}, camera_angle_x=1.0))
     assert caught.value.where.endswith("transforms.json: frames[0].fl_x")
@@ -98,19 +98,21 @@ def test_half_a_focal_length_of_a_frame_is_an_error_of_the_frame(tmp_path):
         ({"is_fisheye": True}, {"is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (0.1, 0, 0, 0)),
     ],
 )
-def test_distortion_of_a_frame_is_not_completed_in_another_way(own, shared, model, terms, tmp_path):
+def test_distortion_of_a_frame_is_not_mixed_with_that_of_the_file(
+    own, shared, model, terms, tmp_path
+):
     frame, whole = (Fields(each, tmp_path / "transforms.json") for each in (own, LENS | shared))
     lens = read_lens(Inside(tmp_path), frame, whole, "a.png")
     assert (lens.model, lens.params[4:]) == (model, terms)
 
 
-def test_a_360_degree_camera_is_refused_whatever_a_frame_says_of_fisheyes(tmp_path):
+def test_a_360_degree_camera_is_refused_even_if_a_frame_denies_a_fisheye(tmp_path):
     path = write(tmp_path, {"is_fisheye": False}, camera_model="EQUIRECTANGULAR", **LENS)
     with pytest.raises(UserError, match="cannot be undistorted"):
         read(path)
 
 
-def test_what_a_file_leaves_out_comes_from_the_photo(tmp_path):
+def test_missing_camera_values_are_taken_from_the_photo(tmp_path):
     camera = read(write(tmp_path, camera_angle_x=math.pi / 2)).views[0].camera
     assert (camera.width, camera.height, camera.cx, camera.cy) == (24, 16, 12.0, 8.0)
     assert camera.fx == camera.fy == pytest.approx(12.0)
@@ -126,17 +128,17 @@ def test_what_a_file_leaves_out_comes_from_the_photo(tmp_path):
         ({"is_fisheye": True}, "OPENCV_FISHEYE"),
     ],
 )
-def test_lenses_are_those_of_colmap(fields, model, tmp_path):
+def test_lenses_become_camera_models_of_colmap(fields, model, tmp_path):
     notes = "\n".join(read(write(tmp_path, **LENS, **fields)).notes)
     assert f"undistorted to PINHOLE with pycolmap (3 {model})" in notes
 
 
 @pytest.mark.parametrize("fields", [{}, {"camera_model": "PINHOLE", "k1": 0.0, "k4": 0}])
-def test_a_lens_without_distortion_is_left_alone(fields, tmp_path):
+def test_a_lens_without_distortion_is_not_undistorted(fields, tmp_path):
     assert "undistorted" not in "\n".join(read(write(tmp_path, **LENS, **fields)).notes)
 
 
-def test_masks_are_those_that_frames_name(tmp_path):
+def test_masks_named_by_frames_are_used(tmp_path):
     path = write(tmp_path, {"mask_path": "keep/all.png"}, **LENS)
     (path / "keep").mkdir()
     (path / "masks").mkdir()
@@ -158,7 +160,7 @@ def test_masks_are_those_that_frames_name(tmp_path):
         ({"train": (1,), "val": (0,), "test": (2,)}, ["c.png"]),
     ],
 )
-def test_lists_of_the_file_are_the_split(lists, held_out, tmp_path):
+def test_lists_in_the_file_define_the_split(lists, held_out, tmp_path):
     names = {
         f"{part}_filenames": [f"./images/{NAMES[i]}" for i in rows] for part, rows in lists.items()
     }
@@ -167,7 +169,7 @@ def test_lists_of_the_file_are_the_split(lists, held_out, tmp_path):
     assert len(scene.train) == len(lists["train"])
 
 
-def test_lists_may_leave_out_suffixes_as_frames_may(tmp_path):
+def test_split_lists_may_omit_suffixes(tmp_path):
     names = {"train_filenames": ["images/a", "images/b.png"], "test_filenames": ["images/c"]}
     scene = read(write(tmp_path, **LENS, **names), split="auto")
     assert [view.name for view in scene.train_views] == ["a.png", "b.png"]
@@ -206,7 +208,7 @@ def test_invalid_split_lists_are_reported_with_file_and_field(lists, what, where
     assert len(read(path, split="auto").train) == 2
 
 
-def test_photos_of_all_training_views_that_are_missing_are_no_fault_of_a_list_of_ours(tmp_path):
+def test_missing_photos_of_all_training_views_are_not_blamed_on_the_user_list(tmp_path):
     names = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
     path = write(tmp_path, **LENS, **names)
     (path / "images" / "a.png").unlink()
@@ -216,7 +218,7 @@ def test_photos_of_all_training_views_that_are_missing_are_no_fault_of_a_list_of
     assert "add the photos" in caught.value.todo
 
 
-def test_an_applied_transform_is_undone(tmp_path):
+def test_an_applied_transform_is_inverted(tmp_path):
     turned = [[0, 1, 0, 1.0], [-1, 0, 0, 2.0], [0, 0, 1, 3.0]]
     path = write(tmp_path, applied_transform=turned, applied_scale=2.0, **LENS)
     scene = read(path)
@@ -226,13 +228,13 @@ def test_an_applied_transform_is_undone(tmp_path):
     np.testing.assert_allclose(placed[1], original, atol=1e-8)
 
 
-def test_a_crop_that_is_left_out_is_reported(tmp_path):
+def test_an_ignored_crop_is_reported(tmp_path):
     path = write(tmp_path, camera_model="OPENCV_FISHEYE", fisheye_crop_radius=10, **LENS)
     assert "fisheye_crop_radius is left out" in "\n".join(read(path).notes)
 
 
 @pytest.mark.parametrize(("named", "stored"), [("a", "a.png"), ("a.b", "a.b.png"), ("a", "a")])
-def test_names_without_a_suffix_are_those_of_png_files(named, stored, tmp_path):
+def test_names_without_a_suffix_refer_to_png_files(named, stored, tmp_path):
     path = write(tmp_path, **LENS)
     (path / "images" / "a.png").rename(path / "images" / stored)
     whole = json.loads((path / "transforms.json").read_text())

@@ -62,7 +62,7 @@ def raw(monkeypatch):
     return kept
 
 
-def test_points_of_a_real_reconstruction_lie_on_their_features(raw, tmp_path):
+def test_points_of_a_real_reconstruction_project_onto_their_features(raw, tmp_path):
     guard_pycolmap()
     import pycolmap
 
@@ -88,7 +88,7 @@ def test_points_of_a_real_reconstruction_lie_on_their_features(raw, tmp_path):
         ({"projection_type": "fisheye_opencv", "k4": 0.01}, "OPENCV_FISHEYE"),
     ],
 )
-def test_lenses_are_those_of_colmap(kind, model, raw, tmp_path):
+def test_lenses_become_camera_models_of_colmap(kind, model, raw, tmp_path):
     camera = {"width": 3264, "height": 2448, "focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01} | kind
     camera |= {"k1": 0.01, "k2": 0.02}
     OpenSfmReader().read(write(tmp_path, camera), SceneOptions())
@@ -104,7 +104,7 @@ def test_lenses_are_those_of_colmap(kind, model, raw, tmp_path):
 @pytest.mark.parametrize(
     "kind", ["spherical", "equirectangular", "dual", "fisheye62", "fisheye624"]
 )
-def test_other_cameras_are_refused_with_the_way_out(kind, tmp_path):
+def test_unsupported_cameras_are_refused_with_a_remedy(kind, tmp_path):
     write(tmp_path, CAMERA | {"projection_type": kind})
     with pytest.raises(UserError, match=f"projection type {kind}") as caught:
         OpenSfmReader().read(tmp_path, SceneOptions())
@@ -117,7 +117,7 @@ def test_a_project_of_opendronemap_is_read(tmp_path):
     assert len(OpenSfmReader().read(path, SceneOptions()).points) == 5
 
 
-def test_the_reconstruction_with_most_photos_is_taken(tmp_path):
+def test_the_reconstruction_with_most_photos_is_used(tmp_path):
     path = write(tmp_path, shots=("01.jpg", "02.jpg"))
     models = json.loads((path / "reconstruction.json").read_text())
     few = {**models[0], "shots": {"01.jpg": SHOT}}
@@ -128,14 +128,14 @@ def test_the_reconstruction_with_most_photos_is_taken(tmp_path):
 
 
 @pytest.mark.parametrize("vector", [[0, 0, 0], [1e-13, 0, 0], [0, np.pi, 0], [0.3, -2.0, 7.0]])
-def test_rotation_vectors_are_those_of_scipy(vector):
+def test_rotation_vectors_agree_with_scipy(vector):
     from scipy.spatial.transform import Rotation
 
     found = opensfm.rotation_by(np.array(vector, dtype=float))
     np.testing.assert_allclose(found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
 
 
-def test_photos_are_found_in_folders_that_names_lack(tmp_path):
+def test_photos_in_subfolders_are_found_by_names_without_a_folder(tmp_path):
     path = write(tmp_path)
     (path / "images" / "day0").mkdir()
     (path / "images" / "01.jpg").rename(path / "images" / "day0" / "01.jpg")

@@ -86,7 +86,7 @@ def test_photos_are_found_by_the_end_of_their_path(reader, form, make):
         assert old.photo.source.path.resolve() == new.photo.source.path.resolve()
 
 
-def test_some_names_may_have_a_folder_in_front_and_a_note_names_them(make):
+def test_some_names_may_have_an_extra_folder_and_a_note_names_them(make):
     path = make("colmap")
     file = path / FILES["colmap"]
     file.write_text(file.read_text().replace(" 0001.png", " images/0001.png"))
@@ -97,7 +97,7 @@ def test_some_names_may_have_a_folder_in_front_and_a_note_names_them(make):
 
 
 @pytest.mark.parametrize("name", ["0001.png", "images/0001.png"])
-def test_lists_of_views_may_name_photos_in_either_way(name, make):
+def test_view_lists_may_use_names_with_or_without_the_extra_folder(name, make):
     path = make("colmap")
     rename(path, "colmap", lambda _, photo: f"images/{photo}")
     (path / "test_list.txt").write_text(f"{name}\n")
@@ -105,7 +105,7 @@ def test_lists_of_views_may_name_photos_in_either_way(name, make):
     assert [scene.views[index].name for index in scene.test] == ["0001.png"]
 
 
-def test_a_split_of_the_reader_follows_the_names(make):
+def test_a_split_of_the_reader_uses_the_corrected_names(make):
     path = make("colmap")
     (path / "images" / "test").mkdir()
     (path / "images" / "0001.png").rename(path / "images" / "test" / "0001.png")
@@ -139,7 +139,7 @@ def test_an_absolute_name_that_fits_two_photos_is_an_error(make):
     assert caught.value.found == "/home/alice/old/0001.png, which can be a/0001.png, b/0001.png"
 
 
-def test_smaller_copies_and_masks_are_no_photos_of_an_absolute_name(make):
+def test_an_absolute_name_does_not_match_reduced_copies_and_masks(make):
     path = make("nerfstudio")
     for folder in ("images_2", "masks"):
         shutil.copytree(path / "images", path / folder)
@@ -148,7 +148,7 @@ def test_smaller_copies_and_masks_are_no_photos_of_an_absolute_name(make):
     assert {view.photo.source.path.parent for view in scene.views} == {path / "images"}
 
 
-def test_masks_and_points_of_absolute_names_are_found(make):
+def test_masks_and_points_with_absolute_names_are_found(make):
     path = make("nerfstudio")
     before = read(path, "nerfstudio")
     (path / "masks").mkdir()

@@ -75,13 +75,13 @@ def with_gps(plain, tmp_path_factory):
     return located(shutil.copytree(plain, tmp_path_factory.mktemp("gps") / "scene"))
 
 
-def test_without_gps_nothing_is_said(plain):
+def test_a_scene_without_gps_gets_no_note(plain):
     scene = read(plain)
     assert scene.georeference is UNPLACED
     assert not any("georef" in note for note in scene.notes)
 
 
-def test_gps_of_the_photos_puts_the_scene_in_its_place(with_gps):
+def test_gps_of_the_photos_georeferences_the_scene(with_gps):
     scene = read(with_gps)
     assert_in_place(scene, 1e-4)
     assert max(scene.georeference.residuals.values()) < 1e-4
@@ -91,7 +91,7 @@ def test_gps_of_the_photos_puts_the_scene_in_its_place(with_gps):
     assert "1 unit = 7.5 m; residuals: rms horizontal 0.00 m" in note
 
 
-def test_training_is_as_without_gps(with_gps, plain):
+def test_georeferencing_does_not_change_training(with_gps, plain):
     ours, theirs = read(with_gps), read(plain)
     assert [v.name for v in ours.views] == [v.name for v in theirs.views]
     np.testing.assert_array_equal(ours.points, theirs.points)
@@ -140,7 +140,7 @@ def without(*keys):
         (lambda tags: tags_of(ORIGIN), "all at one place"),
     ],
 )
-def test_what_is_missing_is_reported(scene, change, why):
+def test_a_scene_with_incomplete_gps_is_not_georeferenced(scene, change, why):
     found = read(edited(scene, dict.fromkeys(range(10), change)))
     assert isinstance(found.georeference, Unplaced)
     notes = [note for note in found.notes if note.startswith("not georeferenced")]
@@ -149,13 +149,13 @@ def test_what_is_missing_is_reported(scene, change, why):
     assert why in found.georeference.why
 
 
-def test_two_photos_are_too_few(scene):
+def test_two_photos_with_gps_are_too_few(scene):
     found = read(edited(scene, dict.fromkeys(range(8), without(2))))
     assert "GPS of the photos, 2 of 10: there are 2 of them" in found.georeference.why
     assert_in_place(read(edited(scene, dict.fromkeys(range(7), without(2)))), 1e-3)
 
 
-def test_a_flight_line_does_not_tell_how_it_is_rolled(tmp_path):
+def test_a_straight_flight_line_does_not_determine_the_roll(tmp_path):
     guard_pycolmap()
     import pycolmap
 
@@ -171,7 +171,7 @@ def test_a_flight_line_does_not_tell_how_it_is_rolled(tmp_path):
     assert any("not georeferenced" in note for note in found.notes)
 
 
-def test_below_the_sea_and_in_the_west_and_south(tmp_path, plain):
+def test_positions_below_sea_level_and_in_west_and_south_are_read(tmp_path, plain):
     for place in (Place(-33.9, -70.5, -12.5), Place(78.2, 179.99, 3.0)):
         photo = shutil.copy(plain / "images/0000.jpg", tmp_path / "a.jpg")
         write_gps(photo, tags_of(place))
@@ -179,7 +179,7 @@ def test_below_the_sea_and_in_the_west_and_south(tmp_path, plain):
         np.testing.assert_allclose(earth_of(found), earth_of(place), atol=1e-4)
 
 
-def test_photos_as_the_camera_wrote_them_tell_in_place_of_their_copies(with_gps, plain):
+def test_gps_can_be_read_from_the_original_photos(with_gps, plain):
     scene = read(plain, gps=str(with_gps / "images"))
     assert_in_place(scene, 1e-4)
     with pytest.raises(UserError, match="is not there"):
@@ -190,7 +190,7 @@ def test_photos_as_the_camera_wrote_them_tell_in_place_of_their_copies(with_gps,
         assert found.notes[-1] == found.georeference.note
 
 
-def test_smaller_copies_without_gps_do_not_hide_it(with_gps, plain, tmp_path):
+def test_reduced_copies_without_gps_do_not_hide_the_gps_of_the_originals(with_gps, plain, tmp_path):
     scene = shutil.copytree(with_gps, tmp_path / "scene")
     (scene / "images_2").mkdir()
     for path in (plain / "images").iterdir():
@@ -226,14 +226,14 @@ def in_utm(place):
     [("EPSG:4326", in_degrees), ("EPSG:32633", in_utm), ("WGS84 UTM 33N", in_utm),
      ("+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", in_utm)],
 )  # fmt: skip
-def test_a_list_tells_the_places(scene, system, convert):
+def test_a_position_list_georeferences_the_scene(scene, system, convert):
     (scene / "geo.txt").write_text(geo_list(scene, system, convert))
     found = read(scene)
     assert_in_place(found, 1e-5)
     assert "geo.txt, 10 of 10" in found.georeference.note
 
 
-def test_a_list_comes_before_the_photos_and_a_bad_one_is_left_out_with_a_note(scene):
+def test_a_position_list_has_priority_and_an_invalid_list_gives_a_note(scene):
     located(scene, noise=1.0)
     (scene / "geo.txt").write_text(geo_list(scene, "EPSG:4326", in_degrees))
     assert_in_place(read(scene), 1e-5)
@@ -253,7 +253,7 @@ def test_a_list_comes_before_the_photos_and_a_bad_one_is_left_out_with_a_note(sc
     # Of zone 61 the code would be that of a pole.
     ["EPSG:1", "nonsense", "", "+init=/etc/hostname:1", "WGS84 UTM 61N", "+proj=utm +zone=61"],
 )
-def test_a_list_in_no_known_system_is_refused_when_named(scene, system):
+def test_a_named_list_in_an_unknown_coordinate_system_is_refused(scene, system):
     (scene / "mine.txt").write_text(geo_list(scene, system, in_degrees))
     with pytest.raises(UserError, match="PROJ cannot compute"):
         read(scene, gps=str(scene / "mine.txt"))
@@ -278,7 +278,7 @@ def write_priors(scene, path, wgs84=True):
     database.close()
 
 
-def test_priors_in_the_database_tell_and_the_database_stays_as_it_is(scene):
+def test_priors_in_the_database_georeference_the_scene_and_the_database_is_unchanged(scene):
     path = scene / "database.db"
     write_priors(scene, path)
     before = path.read_bytes()
@@ -289,12 +289,12 @@ def test_priors_in_the_database_tell_and_the_database_stays_as_it_is(scene):
     assert sorted(p.name for p in scene.iterdir()) == ["database.db", "images", "sparse"]
 
 
-def test_priors_that_are_no_gps_tell_nothing(scene):
+def test_priors_without_gps_coordinates_are_ignored(scene):
     write_priors(scene, scene / "database.db", wgs84=False)
     assert read(scene).georeference is UNPLACED
 
 
-def test_a_file_that_is_no_database_is_named(scene, tmp_path):
+def test_a_file_that_is_not_a_database_is_named(scene, tmp_path):
     (scene / "database.db").write_bytes(b"no database" * 100)
     found = read(scene)
     assert "database.db tells no places" in found.georeference.why
@@ -325,7 +325,7 @@ def test_priors_that_name_each_other_many_times_are_read_once(tmp_path):
     assert not of_priors(path, ["b.jpg"]).places
 
 
-def test_a_database_that_makes_long_texts_of_short_ones_is_refused(tmp_path):
+def test_a_database_that_expands_to_long_texts_is_refused(tmp_path):
     path = tmp_path / "database.db"
     edit(
         path,
@@ -347,7 +347,7 @@ GEOREF = {
 
 
 @pytest.mark.parametrize("folder", [".", "sparse/0"])
-def test_a_file_beside_the_model_tells(scene, folder):
+def test_a_georef_file_next_to_the_model_georeferences_the_scene(scene, folder):
     located(scene, noise=30.0)
     (scene / folder / "georef.json").write_text(json.dumps(GEOREF))
     found = read(scene)
@@ -368,7 +368,7 @@ def test_a_file_beside_the_model_tells(scene, folder):
         ({"residuals_m": {"max": "far"}}, "residuals_m.max"),
     ],
 )
-def test_a_broken_file_is_refused_with_its_field(scene, change, field):
+def test_a_broken_georef_file_is_refused_with_its_field(scene, change, field):
     path = scene / "georef.json"
     path.write_text(json.dumps({**GEOREF, **change}))
     with pytest.raises(UserError) as caught:
@@ -395,7 +395,7 @@ def moved_to(scene, convert):
     ("code", "convert", "atol"),
     [("epsg:4978", earth_of, 1e-3), ("epsg:32633", in_utm, 0.05)],
 )
-def test_poses_in_a_coordinate_system_are_placed_by_its_code(scene, code, convert, atol):
+def test_poses_in_a_coordinate_system_are_georeferenced_by_its_code(scene, code, convert, atol):
     names = moved_to(scene, convert)
     found = read(scene, crs=code)
     place = found.georeference
@@ -415,7 +415,7 @@ def test_poses_in_a_coordinate_system_are_placed_by_its_code(scene, code, conver
         ({"crs": "epsg:4978", "gps": "."}, "leaves nothing for GPS to tell"),
     ],
 )
-def test_a_coordinate_system_that_cannot_be_is_refused(plain, options, what):
+def test_an_impossible_coordinate_system_is_refused(plain, options, what):
     with pytest.raises(UserError, match=what):
         read(plain, **options)
 
@@ -441,19 +441,19 @@ def with_reference(path, reference, off=(0.0, 0.0)):
     return path
 
 
-def test_the_reference_of_opensfm_tells(opensfm):
+def test_the_reference_of_opensfm_georeferences_the_scene(opensfm):
     scene = read(with_reference(opensfm, REFERENCE, off=(3.0, 4.0)), "opensfm")
     assert_in_place(scene, 1e-6, SAME)
     assert scene.georeference.residuals["rms_horizontal"] == pytest.approx(5.0)
 
 
-def test_a_reference_of_opensfm_without_gps_does_not(opensfm):
+def test_a_reference_of_opensfm_without_gps_does_not_georeference_the_scene(opensfm):
     nowhere = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
     assert read(with_reference(opensfm, nowhere), "opensfm").georeference is UNPLACED
 
 
 @pytest.mark.parametrize("frame", ["local", "chunk"])
-def test_a_chunk_of_metashape_on_earth_tells(plain, tmp_path, frame):
+def test_a_georeferenced_metashape_chunk_georeferences_the_scene(plain, tmp_path, frame):
     path = tmp_path / "metashape"
     path.mkdir()
     as_metashape(Written.of(plain), path)
@@ -476,19 +476,19 @@ def test_a_chunk_of_metashape_on_earth_tells(plain, tmp_path, frame):
     np.testing.assert_allclose(here, own, atol=1e-6)
 
 
-def test_a_list_of_other_suffixes_and_case_is_of_these_photos(scene):
+def test_a_position_list_may_differ_in_suffix_and_case(scene):
     text = geo_list(scene, "EPSG:4326", in_degrees).replace(".jpg", ".JPG")
     (scene / "geo.txt").write_text(text)
     assert "geo.txt, 10 of 10" in read(scene).georeference.note
 
 
-def test_a_list_of_other_photos_is_reported(scene):
+def test_a_position_list_for_other_photos_is_reported(scene):
     (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
     found = read(scene)
     assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note
 
 
-def test_the_row_of_a_photo_comes_before_one_that_only_looks_like_it(scene):
+def test_an_exact_name_in_a_position_list_has_priority_over_a_similar_name(scene):
     text = geo_list(scene, "EPSG:4326", in_degrees)
     (scene / "geo.txt").write_text(text + "0001.TIF 11 51 200\n/ 11 51 200\n. 11 51 200\n")
     assert_in_place(read(scene), 1e-5)

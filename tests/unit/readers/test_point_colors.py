@@ -17,13 +17,13 @@ from crossgrad_core.scene.point_cloud import _colors
         (np.array([10.0, np.nan, 255.0]), (10, 0, 255)),
     ],
 )
-def test_the_range_follows_the_largest_value(stored, expected):
+def test_the_colour_range_follows_the_largest_value(stored, expected):
     columns = dict(zip(("red", "green", "blue"), stored[:, None], strict=True))
     assert tuple(_colors(columns, 1)[0]) == expected
 
 
 @pytest.mark.parametrize("odd", [np.inf, 600.0])
-def test_one_odd_value_does_not_change_the_others(odd):
+def test_one_outlier_value_does_not_change_other_colours(odd):
     stored = np.tile([10.0, 200.0, 30.0], (1000, 1))
     stored[7, 1] = odd
     found = _colors(dict(zip(("red", "green", "blue"), stored.T, strict=True)), 1000)

@@ -61,7 +61,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("form", CHANGES)
-def test_the_table_is_read_in_all_its_forms(form, scene):
+def test_the_table_is_read_in_all_saved_forms(form, scene):
     (file,) = scene.glob("*.csv")
     before, _ = read(scene)
     changed = CHANGES[form](file.read_text())
@@ -73,7 +73,7 @@ def test_the_table_is_read_in_all_its_forms(form, scene):
     assert not [note for note in after.notes if "unused" in note or "left out" in note]
 
 
-def test_the_suffix_may_be_in_capitals(scene):
+def test_the_file_suffix_may_be_in_capitals(scene):
     (file,) = scene.glob("*.csv")
     file.rename(file.with_suffix(".CSV"))
     assert read(scene)[1] == "realitycapture"
@@ -87,7 +87,7 @@ def test_the_suffix_may_be_in_capitals(scene):
         ("#name", "image", "a column #name"),
     ],
 )
-def test_a_table_that_lacks_a_column_is_named(old, new, missing, scene):
+def test_a_table_without_a_required_column_is_reported(old, new, missing, scene):
     (file,) = scene.glob("*.csv")
     file.write_text(file.read_text().replace(old, new))
     with pytest.raises(UserError, match="CSV of RealityCapture") as caught:
@@ -95,7 +95,7 @@ def test_a_table_that_lacks_a_column_is_named(old, new, missing, scene):
     assert caught.value.where == str(file) and caught.value.expected == missing
 
 
-def test_a_table_in_utf_16_is_named(scene):
+def test_a_table_in_utf_16_is_reported(scene):
     (file,) = scene.glob("*.csv")
     file.write_bytes(file.read_text().encode("utf-16"))
     with pytest.raises(UserError, match="CSV of RealityCapture") as caught:
@@ -103,14 +103,14 @@ def test_a_table_in_utf_16_is_named(scene):
     assert caught.value.where == str(file)
 
 
-def test_a_quote_in_a_comment_ends_in_an_error(scene):
+def test_a_quote_in_a_comment_gives_an_error(scene):
     (file,) = scene.glob("*.csv")
     file.write_text('"a comment\n' + file.read_text())
     with pytest.raises(UserError, match="CSV of RealityCapture"):
         read(scene)
 
 
-def test_a_table_that_nearly_fits_does_not_keep_another_reader_from_the_scene(tmp_path):
+def test_a_similar_table_does_not_prevent_another_reader(tmp_path):
     path = write_tiny_scene(tmp_path, views=2, width=24, height=16, points=20)
     (path / "gps.csv").write_text("name,x,y,alt,heading\n")
     assert read(path)[1] == "colmap"

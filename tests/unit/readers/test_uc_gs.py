@@ -27,7 +27,7 @@ def test_photos_of_test_folders_are_held_out(tmp_path):
     assert len(scene.train) == 6
 
 
-def test_lists_of_the_user_come_first(tmp_path):
+def test_split_lists_of_the_user_have_priority(tmp_path):
     path = write_tiny_scene(
         tmp_path, views=2, width=24, height=16, points=60, folders=("train1", "test1")
     )
@@ -52,7 +52,7 @@ def test_held_out_photos_are_recognised_by_name(name, held_out):
     assert is_held_out(name) is held_out
 
 
-def test_other_scenes_are_left_to_colmap(tmp_path):
+def test_scenes_with_other_folders_are_read_by_colmap(tmp_path):
     path = write_tiny_scene(tmp_path, views=2, width=24, height=16, points=20)
     assert not UcGsReader().accepts(path)
     assert ColmapReader().accepts(path)

@@ -45,7 +45,7 @@ def test_a_recipe_has_the_settings_of_its_arm(name):
     assert settings_of(found) == settings_of(wanted)
 
 
-def test_what_the_user_sets_wins_and_his_length_replaces_that_of_the_recipe():
+def test_settings_of_the_user_override_the_recipe_and_its_length():
     recipe = {"recipe": {"name": "paper/crossgrad"}, "scene": "sample"}
     config = configured({**recipe, "operator": {"name": "cagrad", "c": 0.3}, "steps": 50})
     assert (config.operator.name, config.operator.options["c"]) == ("cagrad", 0.3)

@@ -33,7 +33,7 @@ def finished(tmp_path_factory):
     return cg.run(scene, steps=30, out=folder / "run", threads=1, quiet=True)
 
 
-def test_a_finished_run_has_written_down_every_decided_value(finished):
+def test_a_finished_run_records_every_decided_value(finished):
     written = yaml.safe_load((finished.folder / "config.yaml").read_text(encoding="utf-8"))
     assert not [name for name in DECIDED if written[name] is None]
     assert {*DECIDED, "densifier.division"} <= written["decided"].keys()
@@ -61,7 +61,7 @@ def test_a_run_is_repeated_bit_for_bit_after_the_constants_of_the_recipe_changed
     assert (other / "point_cloud.ply").read_bytes() != cloud
 
 
-def test_there_is_no_curve_to_a_budget_at_the_published_length():
+def test_growth_is_unbounded_at_the_published_length():
     for steps, growth in ((29_999, "budget"), (30_000, "unbounded")):
         setup = assembled(steps=steps)
         assert setup.numbers.growth == growth
@@ -71,7 +71,7 @@ def test_there_is_no_curve_to_a_budget_at_the_published_length():
 
 
 @pytest.mark.parametrize(("steps", "short"), [(14_999, True), (15_000, False), (29_999, False)])
-def test_a_run_of_two_views_per_step_is_short_or_long_as_a_whole(steps, short):
+def test_a_run_with_two_views_per_step_is_short_or_long_in_all_settings(steps, short):
     setup = assembled(steps=steps, views_per_step=2, operator={"name": "mean"})
     numbers = setup.numbers
     assert (numbers.rate_factor > 1.0) == short
@@ -82,7 +82,7 @@ def test_a_run_of_two_views_per_step_is_short_or_long_as_a_whole(steps, short):
     assert (numbers.reset_every == 0) == short
 
 
-def test_a_value_that_looks_like_the_published_one_is_not_reported():
+def test_a_value_that_rounds_to_the_published_value_is_not_reported():
     setup = assembled(max_views=29_999, views_per_step=2, operator={"name": "mean"})
     assert 0.899 < setup.numbers.beta1 < 0.9
     assert not [line for line in short_lines(setup.decisions) if line.startswith("beta1 ")]
@@ -110,7 +110,7 @@ def test_the_terminal_shows_a_few_short_lines(steps, backbone):
     assert all(len(line) <= WIDTH for line in lines)
 
 
-def test_a_new_length_on_top_of_a_file_is_decided_anew_and_a_value_stays(tmp_path):
+def test_a_new_length_for_a_file_is_decided_again_and_user_values_are_kept(tmp_path):
     written = resolved(assembled(steps=30, rate_factor=2.0)).model_dump(mode="json")
     file = tmp_path / "config.yaml"
     file.write_text(yaml.safe_dump(written), encoding="utf-8")
@@ -124,7 +124,7 @@ def test_a_new_length_on_top_of_a_file_is_decided_anew_and_a_value_stays(tmp_pat
     assert own.beta1 == 0.5 and "beta1" not in own.decided
 
 
-def test_with_seconds_nothing_is_taken_over_from_a_length_that_was_not_planned():
+def test_a_run_in_seconds_reuses_no_decision_of_an_unplanned_length():
     dry = assembled(seconds=60.0)
     again = assemble(resolved(dry), dry.scene, "none")
     planned = again.decide(Length(500, 500))

@@ -122,7 +122,7 @@ def spectra(draw):
     st.sampled_from([1.5, 4.0, 50.0]),
     st.integers(1, 40),
 )
-def test_scales_are_those_of_the_definition(kept, shorter, coarsest, ratio, levels):
+def test_scales_agree_with_the_definition(kept, shorter, coarsest, ratio, levels):
     resolution = Spectral(coarsest=coarsest, ratio=ratio, levels=levels)
     scales = resolution._scales(group_of(kept, shorter))
     least = min(1.0, max(1 / coarsest, 96 / shorter))
@@ -133,7 +133,7 @@ def test_scales_are_those_of_the_definition(kept, shorter, coarsest, ratio, leve
     assert (np.diff(scales) >= 0).all()
 
 
-def test_the_published_rule_on_a_spectrum_that_is_flat():
+def test_scales_of_a_flat_spectrum_follow_the_published_rule():
     # All scales alike in frequency: X(F_r) / X(F) = 1 / r^2, so that 1/r = 1/2 has a quarter.
     kept = (np.arange(GRID + 1) / GRID) ** 2
     scales = Spectral(levels=4)._scales(group_of(kept, 10_000))
@@ -149,7 +149,7 @@ def test_the_published_rule_on_a_spectrum_that_is_flat():
         (APART, "never", ["all"]),
     ],
 )
-def test_regimes_have_scales_of_their_own_where_their_spectra_differ(scene, per_regime, names):
+def test_regimes_get_separate_scales_if_their_spectra_differ(scene, per_regime, names):
     resolution = Spectral(per_regime=per_regime).fitted_to(scene)
     assert sorted(resolution.courses) == names
     photos = {name: each.photos for name, each in resolution.courses.items()}
@@ -177,12 +177,12 @@ def test_a_fitted_resolution_is_read_back_without_a_new_measurement():
         assert known == asked(Spectral(), schedule, step)[0]
 
 
-def test_a_regime_that_was_not_there_has_scales_too():
+def test_an_unknown_regime_also_gets_scales():
     resolution = Spectral(courses={"street": Scales(photos=3, scales=(0.5,))})
     assert asked(resolution, Schedule.for_run(1000), 1)[0] == (0.5, 0.5)
 
 
-def test_a_bounded_number_of_photos_is_looked_at():
+def test_a_limited_number_of_photos_is_measured():
     scene = scene_of(4, 4, views=7)
     assert len(scene.train_views) == 84 > MOST_PHOTOS
     Spectral(per_regime="never").fitted_to(scene)
@@ -201,7 +201,7 @@ def test_a_step_does_not_read_photos(resolution, monkeypatch):
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (97, 300), (101, 101), (250, 130)])
 @pytest.mark.parametrize("resolution", [Spectral().fitted_to(APART), Octaves()])
-def test_the_shorter_side_keeps_its_pixels(resolution, width, height):
+def test_the_shorter_side_keeps_a_minimum_of_pixels(resolution, width, height):
     views = [replace(v, camera=v.camera.resized(width, height)) for v in APART.views]
     scene, schedule = replace(APART, views=tuple(views)), Schedule.for_run(1000)
     for step in range(1, 1001, 37):
@@ -214,7 +214,7 @@ def test_the_shorter_side_keeps_its_pixels(resolution, width, height):
 @pytest.mark.parametrize("name", ["adc", "mcmc", "revising", "none"])
 @pytest.mark.parametrize(("total", "mode"), [(20, "scaled"), (3000, "scaled"), (30_000, "scaled"),
                                              (700, "absolute"), (30_000, "absolute")])  # fmt: skip
-def test_views_have_their_full_size_from_the_end_of_density_control_on(name, total, mode):
+def test_views_have_full_size_after_the_end_of_density_control(name, total, mode):
     schedule = build("densifiers", name, {}).window(Schedule.for_run(total, mode))
     window = window_of(schedule, None)
     if schedule.grows:
@@ -244,7 +244,7 @@ PLANS = [ViewsPerStepSpec(), ViewsPerStepSpec((3,)), ViewsPerStepSpec((1, 4), (0
         Octaves(quarter_until=0, half_until=0),
     ],
 )
-def test_a_budget_counts_the_pixels_that_are_rendered(resolution, unit, plan):
+def test_a_budget_counts_the_rendered_pixels(resolution, unit, plan):
     schedule = Schedule.for_run(400, counting=Counting(unit, plan, 10))
     drawn, done = 0.0, [0.0]
     for step in range(1, 401):
@@ -263,7 +263,7 @@ def test_a_budget_counts_the_pixels_that_are_rendered(resolution, unit, plan):
 @pytest.mark.parametrize("resolution", [Spectral().fitted_to(APART), Octaves()])
 @settings(max_examples=25, deadline=None)
 @given(lengths=st.lists(st.integers(50, 4000), min_size=1, max_size=5), seed=st.integers(0, 99))
-def test_no_scale_falls_when_the_length_of_a_run_changes(resolution, lengths, seed):
+def test_no_scale_decreases_when_the_length_of_a_run_changes(resolution, lengths, seed):
     rng = np.random.default_rng(seed)
     schedule, state, last = Schedule.for_run(lengths[0]), PluginState(), (0.0, 0.0)
     step = 0
@@ -278,7 +278,7 @@ def test_no_scale_falls_when_the_length_of_a_run_changes(resolution, lengths, se
     assert asked(resolution, schedule, schedule.total, state)[0] == (1.0, 1.0)
 
 
-def test_octaves_are_a_quarter_then_a_half_then_all():
+def test_octaves_use_a_quarter_then_a_half_then_the_full_size():
     resolution, schedule = Octaves(quarter_until=0.2, half_until=0.5), Schedule.for_run(100)
     scene = replace(APART, views=tuple(
         replace(v, camera=v.camera.resized(800, 600)) for v in APART.views))  # fmt: skip
@@ -298,7 +298,7 @@ def test_octaves_are_a_quarter_then_a_half_then_all():
         ({"quarter_until": 0.0, "half_until": 0.0}, "full size"),
     ],
 )
-def test_a_size_may_be_left_out(options, text):
+def test_a_size_of_octaves_may_be_omitted(options, text):
     (told,) = Octaves(**options).messages(Schedule.for_run(100))
     assert told == f"resolution: {text}; no side is below 96 pixels"
 
@@ -308,7 +308,7 @@ def test_sizes_out_of_order_are_refused():
         build("resolutions", "octaves", {"quarter_until": 0.5, "half_until": 0.3})
 
 
-def test_the_steps_of_the_note_are_those_of_the_scales():
+def test_the_note_names_the_steps_at_which_the_scales_change():
     resolution, schedule = Spectral().fitted_to(APART), Schedule.for_run(2000)
     (text,) = resolution.messages(schedule)
     told = dict(zip(("far", "near"), text.removeprefix("resolution: ").split("; "), strict=True))

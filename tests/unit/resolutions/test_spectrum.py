@@ -55,7 +55,7 @@ def by_definition(grey, scale):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 999))
-def test_sums_are_those_of_the_definition(height, width, seed):
+def test_sums_of_amplitudes_agree_with_the_definition(height, width, seed):
     grey = np.random.default_rng(seed).uniform(0, 255, (height, width))
     found = amplitudes_within(grey)
     assert found.shape == (GRID + 1,)
@@ -66,7 +66,7 @@ def test_sums_are_those_of_the_definition(height, width, seed):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(1, 3), st.integers(0, 999))
-def test_shares_grow_from_the_mean_colour_s_to_1(height, width, photos, seed):
+def test_shares_grow_from_the_share_of_the_mean_colour_to_one(height, width, photos, seed):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (photos, height, width, 3), dtype=np.uint8)
     shares = kept_shares(views_of(*(Given(torch.from_numpy(each)) for each in pixels)))
@@ -80,12 +80,12 @@ def test_shares_grow_from_the_mean_colour_s_to_1(height, width, photos, seed):
 
 
 @pytest.mark.parametrize("grey", [0, 90])
-def test_a_photo_that_shows_nothing_is_kept_whole(grey):
+def test_a_photo_of_one_colour_keeps_all_its_shares(grey):
     photo = Given(torch.full((9, 12, 3), grey, dtype=torch.uint8))
     assert kept_shares(views_of(photo)) == pytest.approx(np.ones(GRID + 1), abs=1e-9)
 
 
-def test_pixels_that_do_not_count_do_not_matter():
+def test_masked_pixels_do_not_change_the_shares():
     rng = np.random.default_rng(0)
     image = torch.from_numpy(rng.integers(0, 256, (16, 24, 3), dtype=np.uint8))
     mask = torch.from_numpy(rng.random((16, 24)) < 0.7)
@@ -97,7 +97,7 @@ def test_pixels_that_do_not_count_do_not_matter():
     assert (nothing == 1.0).all()
 
 
-def test_of_a_large_photo_the_middle_is_looked_at_in_its_own_pixels(monkeypatch):
+def test_the_middle_of_a_large_photo_is_measured_at_full_resolution(monkeypatch):
     monkeypatch.setattr(spectral, "_WINDOW", 8)
     image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (13, 20, 3), dtype=np.uint8))
     expected = image[2:10, 6:14].double().mean(2).numpy()
@@ -106,7 +106,7 @@ def test_of_a_large_photo_the_middle_is_looked_at_in_its_own_pixels(monkeypatch)
     assert grey_window(image, mask).shape == (8, 8)
 
 
-def test_a_part_keeps_the_shares_of_the_whole_and_a_copy_of_half_the_size_does_not():
+def test_a_crop_keeps_the_shares_of_the_whole_and_a_half_size_copy_does_not():
     rng = np.random.default_rng(0)
     size = 256
     # A photo that is blurred: of amplitudes like 1 / frequency a copy would keep the same.
@@ -120,7 +120,7 @@ def test_a_part_keeps_the_shares_of_the_whole_and_a_copy_of_half_the_size_does_n
     assert (whole - copy > 0.08).all()
 
 
-def test_no_bit_depends_on_threads(monkeypatch):
+def test_bits_do_not_depend_on_the_number_of_threads(monkeypatch):
     rng = np.random.default_rng(0)
     photos = [Given(torch.from_numpy(rng.integers(0, 256, (31, 47, 3), dtype=np.uint8)))] * 5
     before = torch.get_num_threads()

@@ -29,7 +29,7 @@ def views_above(heights, seen=range(10)):
     return [posed_view((0.1, 0.2, h), f"{h}.png", **ways) for h in heights], points
 
 
-def test_a_zoom_path_comes_nearer_by_equal_factors():
+def test_a_zoom_path_approaches_by_equal_factors():
     views, points = views_above([2.0, 40.0, 5.0, 0.5])
     cameras = zoom_path(views, points, FRAMES)
     heights = np.array([float(camera.center[2]) for camera in cameras])
@@ -40,7 +40,7 @@ def test_a_zoom_path_comes_nearer_by_equal_factors():
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
 
 
-def test_a_zoom_path_begins_and_ends_with_photos_that_show_the_same():
+def test_a_zoom_path_starts_and_ends_at_photos_of_the_same_points():
     views, points = views_above([40.0, 41.0, 0.5, 0.6, *[5.0] * 6])
     apart = {"forward": (0.0, 0.3, -1.0), "seen": range(8)}
     views[0] = posed_view((9, 9, 40.0), "far.png", **apart)
@@ -74,12 +74,12 @@ def test_the_ends_of_a_zoom_path_agree_with_a_search_of_all_pairs():
         assert any(found == pytest.approx(pair) for pair in best)
 
 
-def test_views_at_one_distance_give_a_ladder_too():
+def test_views_at_one_distance_also_give_a_zoom_path():
     views, points = views_above([3.0, 3.0])
     assert {round(float(camera.center[2]), 9) for camera in zoom_path(views, points, 5)} == {3.0}
 
 
-def test_photos_that_observe_nothing_give_none():
+def test_photos_without_observations_give_no_zoom_path():
     views, points = views_above([1.0, 2.0], seen=range(3))
     with pytest.raises(UserError, match="give no zoom path"):
         zoom_path(views, points, FRAMES)
@@ -136,13 +136,13 @@ def test_a_camera_path_is_read_in_input_coordinates(tmp_path):
         ({"camera_path": [{"camera_to_world": FAR_AWAY, "fov": 50}]}, "too far from the scene"),
     ],
 )
-def test_a_wrong_camera_path_names_its_field(tmp_path, changes, message):
+def test_an_invalid_camera_path_names_its_field(tmp_path, changes, message):
     with pytest.raises(UserError, match=message):
         camera_path(scene_with(Similarity(np.zeros(3), 1.0)), path_of(tmp_path, **changes), FRAMES)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"[[[", b"\xff", b"[" * 10_000])
-def test_a_file_that_is_no_camera_path_is_refused(tmp_path, content):
+def test_a_file_that_is_not_a_camera_path_is_refused(tmp_path, content):
     path = tmp_path / "tour.json"
     if content is not None:
         path.write_bytes(content)
@@ -151,19 +151,19 @@ def test_a_file_that_is_no_camera_path_is_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("width", [30, 30.0])
-def test_a_whole_number_of_pixels_may_have_a_point(tmp_path, width):
+def test_a_whole_number_of_pixels_may_be_written_with_a_decimal_point(tmp_path, width):
     path = path_of(tmp_path, render_width=width)
     camera = camera_path(scene_with(Similarity(np.zeros(3), 1.0)), path, FRAMES).cameras[0]
     assert (camera.width, type(camera.width)) == (30, int)
 
 
-def test_a_file_in_place_of_the_frames_folder_is_refused(tmp_path):
+def test_a_file_with_the_name_of_the_frames_folder_is_refused(tmp_path):
     (tmp_path / "renders").touch()
     with pytest.raises(UserError, match="something else is in the way"):
         video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")
 
 
-def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypatch):
+def test_frames_become_an_animated_image_without_an_encoder(tmp_path, monkeypatch):
     monkeypatch.setattr(video.shutil, "which", lambda _: None)
     images = [torch.full((6, 8, 3), level) for level in (0.0, 0.5, 1.5)]
     frames = video.write_frames(images, tmp_path / "frames")
@@ -181,7 +181,7 @@ def test_frames_become_an_animated_picture_without_an_encoder(tmp_path, monkeypa
     assert video.write_video(wide, 10.0) is None
 
 
-def test_an_encoder_gets_the_frames_and_its_failure_is_one_error(tmp_path, monkeypatch):
+def test_an_encoder_receives_the_frames_and_its_failure_gives_one_error(tmp_path, monkeypatch):
     encoder = tmp_path / "ffmpeg"
     encoder.write_text('#!/bin/sh\nfor last; do :; done\necho "$@" > "$last"\n')
     encoder.chmod(0o755)

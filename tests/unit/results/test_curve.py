@@ -37,7 +37,7 @@ def _figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 100])
-def test_draws_psnr_and_ssim_overall_and_per_regime(tmp_path: Path, figures, count: int):
+def test_the_curve_shows_psnr_and_ssim_overall_and_per_regime(tmp_path: Path, figures, count: int):
     path = draw_curve(tmp_path, make_rows(count), "title", {"overall": 3, "near": 1, "far": 2})
     with Image.open(path) as image:
         assert image.format == "PNG"
@@ -64,7 +64,7 @@ def test_lines_differ_in_more_than_colour(tmp_path: Path, figures):
     assert len({line.get_marker() for line in lines}) == 4
 
 
-def test_rendered_views_stand_where_they_were_reached(tmp_path: Path, figures):
+def test_rendered_views_are_marked_at_the_time_they_were_reached(tmp_path: Path, figures):
     draw_curve(tmp_path, make_rows(10), "title", {"far": 1, "near": 1})
     above = figures[0].axes[0].child_axes[0]
     ticks = {
@@ -81,7 +81,7 @@ def test_one_regime_is_not_drawn_twice(tmp_path: Path, figures):
     assert len(figures[0].axes[0].get_lines()) == 1
 
 
-def test_without_held_out_views_the_loss_is_drawn(tmp_path: Path, figures):
+def test_the_loss_is_drawn_if_there_are_no_held_out_views(tmp_path: Path, figures):
     rows = [{**row, "psnr": None, "ssim": None} for row in make_rows(4, ())]
     draw_curve(tmp_path, rows, "title")
     (ax,) = figures[0].axes
@@ -90,11 +90,11 @@ def test_without_held_out_views_the_loss_is_drawn(tmp_path: Path, figures):
 
 
 @pytest.mark.parametrize("rows", [[], [{**make_rows(1)[0], "psnr": float("inf")}]])
-def test_nothing_to_draw_is_no_error(tmp_path: Path, rows: list[Row]):
+def test_a_curve_without_data_is_not_an_error(tmp_path: Path, rows: list[Row]):
     assert draw_curve(tmp_path, rows, "title").is_file()
 
 
-def test_names_are_shown_as_they_are(tmp_path: Path, figures):
+def test_names_are_shown_without_interpretation(tmp_path: Path, figures):
     draw_curve(tmp_path, make_rows(2, ("_raw", "a$b$")), "scene $x_1$", {"_raw": 1, "a$b$": 1})
     labels = [text.get_text().split(":")[0] for text in figures[0].legends[0].get_texts()]
     assert labels == ["overall", "'_raw' (1 view)", r"a\$b\$ (1 view)"]

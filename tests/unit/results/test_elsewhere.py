@@ -28,7 +28,7 @@ def moved(view, shift, angle, rng):
     return replace(view, camera=replace(view.camera, world_to_camera=pose))
 
 
-def test_a_view_is_that_of_training_where_place_and_direction_are():
+def test_a_view_counts_as_trained_if_position_and_direction_match():
     rng = np.random.default_rng(0)
     trained = [posed_view(rng.normal(size=3), forward=rng.normal(size=3)) for _ in range(20)]
     shares = [(s, a) for s in (0.0, 0.5, 0.999, 1.001, 2.0) for a in (0.0, 0.5, 0.999, 1.001, 9.0)]
@@ -39,19 +39,19 @@ def test_a_view_is_that_of_training_where_place_and_direction_are():
     assert _are_trained(views, trained) == expected
 
 
-def test_a_view_that_looks_back_from_the_same_place_is_another():
+def test_a_view_in_the_opposite_direction_does_not_count_as_trained():
     rng = np.random.default_rng(1)
     trained = [posed_view(rng.normal(size=3), forward=rng.normal(size=3)) for _ in range(100)]
     assert not any(_are_trained([moved(each, 0.0, np.pi, rng) for each in trained], trained))
 
 
-def test_place_and_direction_are_those_of_one_view():
+def test_position_and_direction_must_match_the_same_view():
     here, there = posed_view((0, 0, 0)), posed_view((1, 0, 0), forward=(1, 0, 0))
     mixed = posed_view((1, 0, 0))
     assert _are_trained([here, mixed, there], [here, there]) == [True, False, True]
 
 
-def test_a_stray_camera_does_not_let_a_capture_of_another_place_in():
+def test_an_outlier_camera_does_not_admit_a_capture_of_another_place():
     rng = np.random.default_rng(2)
     centers = [*rng.normal(size=(20, 3)), np.array([1e4, 1e4, 1e4])]
     points = rng.normal(size=(300, 3))

@@ -13,7 +13,7 @@ def git(folder, *arguments):
     return done.stdout.strip()
 
 
-def test_the_commit_of_a_checkout_and_whether_files_differ_from_it(tmp_path):
+def test_the_recorded_commit_marks_changed_files(tmp_path):
     package = tmp_path / "crossgrad_core"
     package.mkdir()
     for name in ("pyproject.toml", "crossgrad_core/a.py"):
@@ -29,7 +29,7 @@ def test_the_commit_of_a_checkout_and_whether_files_differ_from_it(tmp_path):
     assert commit(package) == f"{head}+"
 
 
-def test_an_installed_package_has_none_whatever_repository_it_lies_in(tmp_path):
+def test_an_installed_package_has_no_commit_even_inside_a_repository(tmp_path):
     git(tmp_path, "init", "-q")
     package = tmp_path / "venv" / "site-packages" / "crossgrad_core"
     package.mkdir(parents=True)

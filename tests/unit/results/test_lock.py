@@ -45,7 +45,7 @@ def test_a_second_process_is_refused_with_the_holder_and_its_start_time(tmp_path
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_lock_dies_with_its_process(tmp_path, holder, number):
+def test_the_lock_ends_with_its_process(tmp_path, holder, number):
     os.kill(holder.pid, number)
     holder.wait()
     assert (tmp_path / FILE).is_file()
@@ -65,7 +65,7 @@ def test_the_lock_works_within_one_process_and_ends_with_the_block(tmp_path):
         assert held
 
 
-def test_a_holder_that_has_not_written_yet(tmp_path):
+def test_a_lock_whose_holder_has_not_written_its_name_is_respected(tmp_path):
     with (tmp_path / FILE).open("wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(RunInUseError, match="a process that holds"), locked(tmp_path, "x"):
@@ -73,7 +73,7 @@ def test_a_holder_that_has_not_written_yet(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL])
-def test_where_there_are_no_locks_the_run_goes_on(tmp_path, monkeypatch, number):
+def test_a_run_continues_if_the_file_system_has_no_locks(tmp_path, monkeypatch, number):
     def unsupported(file, operation):
         raise OSError(number, os.strerror(number))
 
@@ -102,7 +102,7 @@ def test_a_full_disk_is_reported_once(tmp_path, monkeypatch):
         assert not writes
 
 
-def test_a_folder_that_may_not_be_written_to(tmp_path: Path, monkeypatch):
+def test_a_folder_without_write_permission_is_refused(tmp_path: Path, monkeypatch):
     def refuse(*args):
         raise OSError(errno.EROFS, "Read-only file system")
 

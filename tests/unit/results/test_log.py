@@ -16,7 +16,7 @@ def record(step: int, losses: tuple[float, ...] = (0.1, 0.3), seconds: float = 0
     return StepRecord(step, (0,) * len(losses), names, None, losses, 1234, {}, step * seconds)
 
 
-def test_progress_shows_loss_rate_and_time_left():
+def test_the_progress_line_shows_loss_rate_and_time_left():
     pace = Pace(total=1000)
     assert progress_line(pace) == ""
     for step in (1, 2, 3):
@@ -26,13 +26,13 @@ def test_progress_shows_loss_rate_and_time_left():
     )
 
 
-def test_loss_is_smoothed():
+def test_the_loss_is_smoothed():
     pace = Pace(total=10).after(record(1, (1.0,)))
     assert pace.loss == 1.0
     assert pace.after(record(2, (0.0,))).loss == pytest.approx(0.95)
 
 
-def test_a_resumed_run_begins_where_it_stopped():
+def test_progress_of_a_resumed_run_begins_at_its_step():
     pace = Pace(total=1000).after(record(701))
     assert pace.first == 700
     assert pace.steps_per_second is None
@@ -44,7 +44,7 @@ def test_progress_is_measured_against_the_newest_length():
     assert "step 300/600 (50 %)" in progress_line(pace)
 
 
-def test_last_evaluation_is_remembered():
+def test_the_last_evaluation_is_shown_in_later_lines():
     pace = Pace(total=10).after(record(1))
     assert pace.evaluated(EvaluationReport(1, {"psnr": None})).psnr is None
     assert "PSNR 21.50" in progress_line(pace.evaluated(EvaluationReport(1, {"psnr": 21.5})))
@@ -71,18 +71,20 @@ def test_last_evaluation_is_remembered():
         ({"psnr": None, "ssim": None, "train_seconds": 3}, (), "no PSNR, no SSIM, 3.0 s training"),
     ],
 )
-def test_evaluation_line(row: dict[str, float | None], regimes: tuple[str, ...], expected: str):
+def test_the_evaluation_line_shows_metrics_overall_and_per_regime(
+    row: dict[str, float | None], regimes: tuple[str, ...], expected: str
+):
     assert evaluation_line(EvaluationReport(7, row, regimes)) == f"evaluated at step 7: {expected}"
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1:00"), (11_229, "3:07:09")]
 )
-def test_duration(seconds: float, text: str):
+def test_durations_are_formatted_readably(seconds: float, text: str):
     assert duration(seconds) == text
 
 
-def test_log_holds_what_the_run_says(tmp_path: Path):
+def test_the_log_contains_all_messages_of_a_run(tmp_path: Path):
     log = RunLog(tmp_path, clock=lambda: datetime(2026, 3, 5, 9, 8, 7).astimezone())
     hook = make_manager({"log": log}).hook
     run = SimpleNamespace(
@@ -122,7 +124,7 @@ def test_a_resumed_run_continues_its_log(tmp_path: Path):
     assert [line[10:] for line in lines] == ["first session", "second session"]
 
 
-def test_a_log_that_cannot_be_written_ends_no_run_and_shows_its_gap(tmp_path: Path, monkeypatch):
+def test_a_log_that_cannot_be_written_marks_the_gap_and_ends_no_run(tmp_path: Path, monkeypatch):
     log = RunLog(tmp_path)
     log.write("first")
 

@@ -21,11 +21,11 @@ HEADER = (
 )
 
 
-def test_columns_of_a_run_with_regimes():
+def test_the_table_has_columns_for_every_regime():
     assert ",".join(columns(["near", "far"])) == HEADER
 
 
-def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
+def test_a_row_is_written_in_the_documented_format(tmp_path: Path, result, totals):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(totals, result))
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
@@ -36,14 +36,14 @@ def test_a_row_as_it_stands_in_the_file(tmp_path: Path, result, totals):
     ]
 
 
-def test_numbers_come_back_exactly(tmp_path: Path, result, totals):
+def test_numbers_are_read_back_exactly(tmp_path: Path, result, totals):
     row = metrics_row(totals, result)
     MetricsCsv.create(tmp_path, columns(["near", "far"])).append(row)
     assert read_metrics(tmp_path) == (row,)
     assert row["lpips"] is None
 
 
-def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
+def test_the_metrics_of_a_run_without_held_out_views_are_empty(tmp_path: Path, empty, totals):
     table = MetricsCsv.create(tmp_path, columns([]))
     table.append(metrics_row(totals, empty))
     assert (
@@ -54,12 +54,12 @@ def test_no_views_leave_the_metrics_empty(tmp_path: Path, empty, totals):
     )
 
 
-def test_an_unknown_column_is_a_mistake(tmp_path: Path):
+def test_an_unknown_column_is_a_programming_error(tmp_path: Path):
     with pytest.raises(ValueError, match="typo"):
         MetricsCsv.create(tmp_path, columns([])).append({"typo": 1})
 
 
-def test_resuming_drops_rows_beyond_the_step(tmp_path: Path, result, totals):
+def test_resuming_removes_rows_after_the_step(tmp_path: Path, result, totals):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     for step in (100, 200, 300):
         table.append(metrics_row(replace(totals, step=step), result))
@@ -72,7 +72,7 @@ def test_resuming_drops_rows_beyond_the_step(tmp_path: Path, result, totals):
     ]
 
 
-def test_resuming_drops_a_row_that_a_crash_cut_short(tmp_path: Path, result, totals):
+def test_resuming_removes_a_truncated_row(tmp_path: Path, result, totals):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(replace(totals, step=100), result))
     with table.path.open("a") as file:
@@ -82,7 +82,7 @@ def test_resuming_drops_a_row_that_a_crash_cut_short(tmp_path: Path, result, tot
     assert [row["step"] for row in read_metrics(tmp_path)] == [100, 300]
 
 
-def test_resuming_without_a_table_starts_one(tmp_path: Path):
+def test_resuming_without_a_table_creates_a_table(tmp_path: Path):
     MetricsCsv.resume(tmp_path, columns([]), step=5)
     assert read_metrics(tmp_path) == ()
 
@@ -95,7 +95,7 @@ def test_the_table_of_another_run_is_refused(tmp_path: Path, text: str):
     assert (tmp_path / "metrics.csv").read_text() == text
 
 
-def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
+def test_regime_names_with_commas_are_read_back(tmp_path: Path, totals, result):
     regimes = {'a,"b"': result.regimes["far"], "c": result.regimes["near"]}
     odd = replace(result, regimes=regimes)
     MetricsCsv.create(tmp_path, columns(list(regimes))).append(metrics_row(totals, odd))
@@ -120,7 +120,7 @@ def test_regime_names_with_commas_survive(tmp_path: Path, totals, result):
         b"step,psnr,ssim\nnan,2,3\n",
     ],
 )
-def test_unreadable_tables_are_explained(tmp_path: Path, content: bytes):
+def test_unreadable_tables_are_reported_with_a_remedy(tmp_path: Path, content: bytes):
     (tmp_path / "metrics.csv").write_bytes(content)
     with pytest.raises(UserError, match=r"metrics\.csv(?s:.*)to do"):
         read_metrics(tmp_path)
@@ -128,7 +128,7 @@ def test_unreadable_tables_are_explained(tmp_path: Path, content: bytes):
 
 @pytest.mark.parametrize("cell", ["x", "1e", "٣", "inf3"])
 @pytest.mark.parametrize("column", ["step", "psnr"])
-def test_a_damaged_table_is_refused_when_the_run_resumes_and_not_when_it_ends(
+def test_a_damaged_table_is_refused_on_resume(
     tmp_path: Path, totals, result, cell: str, column: str
 ):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
@@ -139,19 +139,19 @@ def test_a_damaged_table_is_refused_when_the_run_resumes_and_not_when_it_ends(
     assert table.path.read_bytes() == before
 
 
-def test_figures_that_are_not_finite_are_read(tmp_path: Path):
+def test_infinite_and_nan_metrics_are_read(tmp_path: Path):
     (tmp_path / "metrics.csv").write_text("step,psnr,ssim\n1,inf,nan\n")
     (row,) = read_metrics(tmp_path)
     assert row["psnr"] == float("inf")
     assert row["ssim"] != row["ssim"]
 
 
-def test_a_missing_table_is_explained(tmp_path: Path):
+def test_a_missing_table_is_reported(tmp_path: Path):
     with pytest.raises(UserError, match=r"no metrics\.csv"):
         read_metrics(tmp_path)
 
 
-def test_a_row_that_was_cut_within_its_last_number_is_dropped(tmp_path: Path, result, totals):
+def test_a_row_truncated_within_its_last_number_is_removed(tmp_path: Path, result, totals):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append(metrics_row(totals, result))
     whole = table.path.read_bytes()
@@ -188,7 +188,7 @@ class Nearly:
 
 
 @pytest.mark.parametrize("room", [0, 1, 20, 10**6])
-def test_a_full_disk_leaves_no_half_of_a_row(
+def test_a_full_disk_leaves_no_partial_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, *, result, totals
 ):
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))

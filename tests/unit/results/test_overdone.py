@@ -25,5 +25,5 @@ def test_a_better_earlier_evaluation_is_reported_with_step_and_time():
     [(), (19.0,), (18.0, 19.0), (19.0, 19.0 - WORSE + 1e-9), (None, None), (19.0, None), (nan, 9.0),
      (19.0, nan)],
 )  # fmt: skip
-def test_ending_at_or_near_the_best_or_without_metrics_is_not_reported(figures):
+def test_a_final_evaluation_near_the_best_or_without_metrics_is_not_reported(figures):
     assert overdone(rows_of(*figures)) == []

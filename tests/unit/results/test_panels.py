@@ -34,11 +34,11 @@ from crossgrad_core.run.results.panels import (
         (["x" * 300 + ".jpg"], ["x" * 120]),
     ],
 )
-def test_flat_names_are_unique_and_safe(names: list[str], expected: list[str]):
+def test_panel_file_names_are_unique_and_safe(names: list[str], expected: list[str]):
     assert list(flat_names(names).values()) == expected
 
 
-def test_views_are_spread_over_regimes_and_within_them(make_view):
+def test_chosen_views_are_spread_over_regimes_and_within_them(make_view):
     views = [make_view(f"far/{i:02}", "far") for i in range(10)]
     views += [make_view(f"near/{i:02}", "near") for i in range(2)]
     assert [view.name for view in chosen_views(views, 4)] == [
@@ -71,7 +71,7 @@ def find_image(canvas: np.ndarray, image: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize(("width", "height", "factor"), [(400, 60, 1), (24, 16, 15), (1, 1, 360)])
-def test_shows_photo_render_and_error_pixel_for_pixel(
+def test_a_panel_shows_photo_render_and_error_pixel_for_pixel(
     make_view, width: int, height: int, factor: int
 ):
     view = make_view("a.jpg", "all", width, height)
@@ -82,7 +82,7 @@ def test_shows_photo_render_and_error_pixel_for_pixel(
         assert find_image(canvas, image.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
-def test_error_colours_are_fixed_and_grow_brighter():
+def test_error_colours_are_fixed_and_get_brighter_with_the_error():
     photo = np.zeros((1, 4, 3), dtype=np.uint8)
     render = np.array([0, 20, 64, 255], dtype=np.uint8)[None, :, None].repeat(3, axis=2)
     colors = error_map(photo, render).astype(int)
@@ -105,7 +105,7 @@ def test_masked_pixels_are_hatched_in_the_error_only(make_view):
     assert not find_image(canvas, error[:, :101])
 
 
-def test_writer_writes_the_chosen_views_only(tmp_path: Path, make_view):
+def test_only_the_chosen_views_get_a_panel(tmp_path: Path, make_view):
     views = [make_view(name, name[0]) for name in ("a/1.jpg", "a/2.jpg", "b/1.jpg")]
     writer = PanelWriter.of(tmp_path, 700, views, count=2)
     for view in views:
@@ -117,7 +117,7 @@ def test_writer_writes_the_chosen_views_only(tmp_path: Path, make_view):
 
 
 @pytest.mark.parametrize("link", [False, True])
-def test_something_else_in_place_of_the_folder_of_panels(tmp_path: Path, make_view, link):
+def test_a_file_with_the_name_of_the_panel_folder_is_refused(tmp_path: Path, make_view, link):
     place = tmp_path / "renders"
     place.symlink_to(tmp_path / "nowhere") if link else place.touch()
     view = make_view("a/1.jpg", "a")
@@ -128,7 +128,7 @@ def test_something_else_in_place_of_the_folder_of_panels(tmp_path: Path, make_vi
 
 
 @pytest.mark.parametrize(("width", "height"), [(400, 60), (24, 16), (989, 3), (1300, 700), (1, 1)])
-def test_photo_render_and_error_are_found_again_in_a_panel(
+def test_photo_render_and_error_can_be_read_from_a_panel(
     make_view, tmp_path: Path, width: int, height: int
 ):
     view = make_view("a/b.jpg", "all", width, height)
@@ -146,7 +146,7 @@ def test_photo_render_and_error_are_found_again_in_a_panel(
 
 
 @pytest.mark.parametrize("content", [b"no picture", None], ids=["no picture", "another size"])
-def test_another_file_is_no_panel(tmp_path: Path, content: bytes | None):
+def test_another_image_file_is_not_a_panel(tmp_path: Path, content: bytes | None):
     path = tmp_path / "a.png"
     Image.new("RGB", (200, 10)).save(path)
     if content is not None:

@@ -49,7 +49,7 @@ def _folder(tmp_path: Path, result, totals) -> Path:
     return folder
 
 
-def test_sixty_runs_are_read_without_torch(folder: Path):
+def test_sixty_runs_are_read_without_importing_torch(folder: Path):
     for number in range(1, RUNS):
         shutil.copytree(folder, folder.with_name(f"run-{number:02}"))
     ended = subprocess.run(
@@ -60,7 +60,7 @@ def test_sixty_runs_are_read_without_torch(folder: Path):
     assert {"torch", "numba", "scipy"}.isdisjoint(modules.split())
 
 
-def test_a_run_by_figure_and_regime(folder: Path, result):
+def test_metrics_of_a_run_are_read_by_name_and_regime(folder: Path, result):
     run = read_run(folder)
     assert run.config["steps"] == 700
     assert run.figure("psnr") == result.overall["psnr"]
@@ -82,7 +82,7 @@ def test_a_run_by_figure_and_regime(folder: Path, result):
         ("name,regime,psnr\na,b,high\n", "not a number"),
     ],
 )
-def test_a_damaged_table_of_views_is_named(folder: Path, content: str, found: str):
+def test_a_damaged_per_view_table_is_named(folder: Path, content: str, found: str):
     (folder / "per_view.csv").write_text(content)
     with pytest.raises(UserError, match=r"unreadable per_view.csv") as error:
         read_run(folder)
@@ -90,14 +90,14 @@ def test_a_damaged_table_of_views_is_named(folder: Path, content: str, found: st
     assert str(folder) in error.value.where
 
 
-def test_regimes_come_by_name_and_not_from_columns(folder: Path):
+def test_regimes_are_read_from_the_summary_and_not_from_column_names(folder: Path):
     summary = json.loads((folder / "summary.json").read_text())
     summary["overall"]["psnr_cc"] = 1.0
     (folder / "summary.json").write_text(json.dumps(summary))
     assert read_run(folder).regimes == ("far", "near")
 
 
-def test_a_run_that_has_not_ended_has_rows_and_no_figures(folder: Path):
+def test_an_unfinished_run_has_rows_and_no_final_metrics(folder: Path):
     (folder / "summary.json").unlink()
     run = read_run(folder)
     assert (run.summary, run.regimes, run.figure("psnr")) == (None, (), None)
@@ -109,12 +109,12 @@ def test_runs_are_found_at_any_depth(folder: Path):
     assert find_runs(folder) == (folder,)
 
 
-def test_another_folder_is_refused(tmp_path: Path):
+def test_another_folder_is_refused_as_a_run(tmp_path: Path):
     with pytest.raises(UserError, match="not the folder of a run"):
         read_run(tmp_path)
 
 
-def test_phases_of_a_step_add_up_and_leave_out_what_is_left_out():
+def test_phases_of_a_step_add_up_without_the_excluded_time():
     clock, laps = Clock(), PhaseTimer()
     laps.lap("decode")
     laps.lap("render")

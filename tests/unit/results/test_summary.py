@@ -36,7 +36,7 @@ def _summary(result, totals) -> Summary:
     )
 
 
-def test_says_all_that_is_needed(tmp_path: Path, summary: Summary):
+def test_the_summary_contains_status_metrics_and_configuration(tmp_path: Path, summary: Summary):
     write_summary(tmp_path, summary)
     found = read_summary(tmp_path)
     assert found["status"] == "finished"
@@ -71,7 +71,7 @@ def test_says_all_that_is_needed(tmp_path: Path, summary: Summary):
     assert found["config"]["scene"] == "scenes/boruszyn"
 
 
-def test_is_strict_json(tmp_path: Path, summary: Summary):
+def test_the_summary_is_strict_json(tmp_path: Path, summary: Summary):
     write_summary(tmp_path, replace(summary, totals=replace(summary.totals, loss=float("inf"))))
 
     def refuse(constant: str) -> None:
@@ -82,7 +82,7 @@ def test_is_strict_json(tmp_path: Path, summary: Summary):
     assert found["loss"] is None
 
 
-def test_a_run_without_held_out_views_says_why(tmp_path: Path, summary: Summary, empty):
+def test_a_run_without_held_out_views_records_the_reason(tmp_path: Path, summary: Summary, empty):
     write_summary(tmp_path, replace(summary, result=empty, rows=[]))
     found = read_summary(tmp_path)
     assert found["overall"]["psnr"] is None
@@ -91,7 +91,7 @@ def test_a_run_without_held_out_views_says_why(tmp_path: Path, summary: Summary,
     assert found["best"] is None
 
 
-def test_a_failed_run_says_why(tmp_path: Path, summary: Summary):
+def test_a_failed_run_records_the_error(tmp_path: Path, summary: Summary):
     write_summary(
         tmp_path, replace(summary, status="failed", error="means is not finite", result=None)
     )
@@ -103,16 +103,14 @@ def test_a_failed_run_says_why(tmp_path: Path, summary: Summary):
 @pytest.mark.parametrize(
     ("text", "message"), [(None, "no summary.json"), ("{", "unreadable summary.json")]
 )
-def test_missing_and_damaged_summaries_are_explained(
-    tmp_path: Path, text: str | None, message: str
-):
+def test_missing_and_damaged_summaries_are_reported(tmp_path: Path, text: str | None, message: str):
     if text is not None:
         (tmp_path / "summary.json").write_text(text)
     with pytest.raises(UserError, match=message):
         read_summary(tmp_path)
 
 
-def test_environment_names_machine_and_versions():
+def test_the_environment_contains_machine_and_versions():
     found = environment()
     # Some builds name theirs only in torch itself: 2.3.0+cu121.
     assert torch.__version__.startswith(found["packages"]["torch"])
@@ -123,7 +121,7 @@ def test_environment_names_machine_and_versions():
     json.dumps(found)
 
 
-def test_per_view_has_every_view(tmp_path: Path, result):
+def test_the_per_view_table_contains_every_view(tmp_path: Path, result):
     write_per_view(tmp_path, result)
     with (tmp_path / "per_view.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -138,7 +136,7 @@ def test_per_view_has_every_view(tmp_path: Path, result):
     }
 
 
-def test_final_table(result, totals):
+def test_the_final_table_shows_metrics_overall_and_per_regime(result, totals):
     assert final_table(result, totals).splitlines() == [
         "         views   PSNR    SSIM  SSIM (skimage)",
         "overall      3  24.00  0.7000          0.7833",
@@ -149,7 +147,7 @@ def test_final_table(result, totals):
     ]
 
 
-def test_final_table_shows_one_regime_once_and_lpips_where_measured(result, totals):
+def test_the_final_table_shows_a_single_regime_once_and_measured_lpips(result, totals):
     one = replace(
         result,
         regimes={"far": result.regimes["far"]},
@@ -163,7 +161,7 @@ def test_final_table_shows_one_regime_once_and_lpips_where_measured(result, tota
     assert len(lines) == 3
 
 
-def test_final_table_without_held_out_views(empty, totals):
+def test_the_final_table_of_a_run_without_held_out_views_shows_costs_only(empty, totals):
     text = final_table(empty, totals)
     assert "no psnr: no held-out views" in text
     assert "38.2 s training" in text
@@ -171,7 +169,7 @@ def test_final_table_without_held_out_views(empty, totals):
 
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"[1]", b"null", b"\xff", b"", b"9" * 9999])
-def test_an_unreadable_summary_is_explained(tmp_path: Path, content: bytes):
+def test_an_unreadable_summary_is_reported(tmp_path: Path, content: bytes):
     (tmp_path / "summary.json").write_bytes(content)
     with pytest.raises(UserError, match=r"unreadable summary\.json(?s:.*)to do"):
         read_summary(tmp_path)

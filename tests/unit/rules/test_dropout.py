@@ -47,7 +47,7 @@ def with_photos(count):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
-def test_a_share_is_left_out_and_the_others_are_as_much_more_opaque(share):
+def test_dropout_removes_a_share_of_gaussians_and_increases_the_other_opacities(share):
     setup = setup_of(rules={"dropout": {"share": share}})
     state = first_state(setup)
     whole = decoded(setup, state)
@@ -79,7 +79,7 @@ def test_nearly_opaque_gaussians_still_get_a_gradient_under_dropout():
     torch.testing.assert_close(gradient, torch.where(part.opacities > 0.0, slope, 0.0))
 
 
-def test_without_the_rule_there_is_no_change_and_no_generator():
+def test_a_run_without_the_dropout_rule_is_unchanged():
     setup = setup_of(rules={"dropout": False})
     state = first_state(setup)
     whole = decoded(setup, state)
@@ -111,20 +111,20 @@ def test_dropped_gaussians_get_no_gradient_and_plugins_see_all_gaussians():
         (1, {"recipe": {"name": "published"}, "rules": {"dropout": {"share": 0.2}}}, 0.2),
     ],
 )
-def test_few_photos_have_it_unless_the_user_says_otherwise(photos, given, share):
+def test_dropout_is_the_default_for_scenes_with_few_photos(photos, given, share):
     setup = setup_of(with_photos(photos), **given)
     assert resolved(setup).rules.get("dropout", False) == (share > 0.0 and {"share": share})
     noted = [row for row in setup.decisions if row.setting == "rules.dropout" and row.override]
     assert len(noted) == (share > 0.0 and "rules" not in given)
 
 
-def test_the_documented_dropout_default_is_the_default():
+def test_the_documented_dropout_default_is_correct():
     said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
     row = next(line for line in said.splitlines() if line.startswith("| `rules.dropout`"))
     assert f"{DROPOUT}" in row and f"{FEW_PHOTOS} training photos" in row
 
 
-def test_a_run_goes_on_with_the_same_bits():
+def test_a_resumed_run_has_the_same_bits():
     setup = setup_of(rules={"dropout": {"share": 0.3}})
     whole = first_state(setup)
     for _ in range(5):
@@ -136,7 +136,7 @@ def test_a_run_goes_on_with_the_same_bits():
     assert all(torch.equal(part.parameters[n], t) for n, t in whole.parameters.items())
 
 
-def test_photos_of_a_point_are_those_in_whose_image_it_lies():
+def test_photos_per_point_counts_the_photos_whose_image_contains_the_point():
     points = [(0.0, 5.0, 0.0), (0.1, 5.0, 0.0), (0.0, 5.0, 0.1), (0.0, -5.0, 0.0), (90.0, 1.0, 0.0)]
     ahead = [posed_view((0, 0, 0), f"{i}.png") for i in range(3)]
     behind = [posed_view((0, 0, 0), "b.png", forward=(0, -1, 0))]

@@ -95,7 +95,7 @@ def expected(setup, state):
 
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("seed", range(3))
-def test_what_floats_is_what_the_whole_models_photos_leave_out(backbone, seed):
+def test_floaters_are_the_primitives_near_a_camera_that_no_training_photo_shows(backbone, seed):
     setup = setup_of(backbone)
     state = scattered(setup, seed)
     want = expected(setup, state)
@@ -129,7 +129,7 @@ def test_removing_floaters_does_not_change_the_renders_of_photos(backbone):
     assert state.primitives(setup) == primitives - len(gone)
 
 
-def test_moments_states_and_the_average_come_along():
+def test_moments_states_and_the_average_are_reduced_together():
     setup = setup_of(rules={"weight-averaging": {"share": 1.0}})
     state = scattered(setup)
     for _ in range(3):
@@ -150,7 +150,7 @@ def test_moments_states_and_the_average_come_along():
     take_step(setup, state)
 
 
-def test_it_is_the_average_that_is_looked_at_where_it_is_shown():
+def test_floaters_are_searched_in_the_averaged_parameters():
     setup = setup_of(rules={"weight-averaging": {"share": 1.0}})
     state = scattered(setup)
     take_step(setup, state)
@@ -161,7 +161,7 @@ def test_it_is_the_average_that_is_looked_at_where_it_is_shown():
     assert torch.equal(floaters(setup, state), gone)
 
 
-def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
+def test_a_failed_removal_does_not_change_the_state():
     setup = setup_of()
     state = scattered(setup)
     take_step(setup, state)
@@ -173,7 +173,7 @@ def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
     assert {len(t) for t in moments.exp_avg.values()} == {before}
 
 
-def test_nothing_is_removed_if_all_gaussians_are_floaters():
+def test_no_primitive_is_removed_if_all_are_floaters():
     setup = setup_of(initializer=ComponentChoice(name="points"))
     state = first_state(setup)
     behind = setup.train_views[0].camera
@@ -189,7 +189,7 @@ def looking(name, points, seen=None, forward=(0, 1, 0)):
     return posed_view((0, 0, 0), name, forward=forward, seen=rows)
 
 
-def test_the_empty_space_is_a_share_of_the_way_to_the_nearest_point():
+def test_the_empty_space_of_a_camera_is_a_share_of_the_distance_to_its_nearest_point():
     points = [(0.1 * x, 2.0 + 0.01 * x, 0.0) for x in range(FEWEST_SEEN)]
     scene = posed_scene([looking("one.png", points)], points)
     near, far = 1.99 * EMPTY, 2.01 * EMPTY
@@ -199,7 +199,7 @@ def test_the_empty_space_is_a_share_of_the_way_to_the_nearest_point():
     assert not in_empty_space(places, few).any()
 
 
-def test_a_point_at_a_wrong_place_and_points_that_others_see_do_not_count():
+def test_outlier_points_and_points_of_other_photos_do_not_shrink_the_empty_space():
     points = [(0.01 * x, 2.0, 0.0) for x in range(200)]
     points[7] = (0.0, 0.1, 0.0)  # Half a percent.
     others = [(0.0, 0.2, 0.1 * x) for x in range(50)]
@@ -211,7 +211,7 @@ def test_a_point_at_a_wrong_place_and_points_that_others_see_do_not_count():
     assert not in_empty_space(places, backwards).any()
 
 
-def test_ground_below_a_level_camera_stays():
+def test_ground_below_a_level_camera_is_not_in_empty_space():
     # 1.6 high, with a vertical field of view of 50 degrees, it sees the ground from 3.4 on.
     ground = [(x, 1.6 / np.tan(np.radians(25.0)) + y, -1.6) for x in (-1, 0, 1) for y in range(30)]
     scene = posed_scene([looking("level.png", ground)], ground)
@@ -245,11 +245,11 @@ def test_no_floaters_are_found_without_observations():
         ({"densifier": ComponentChoice(name="none"), "rules": {"floaters": {}}}, True),
     ],
 )
-def test_the_default_of_the_floaters_rule(given, what):
+def test_the_floaters_rule_is_selected_by_default(given, what):
     assert bool(resolved(setup_of(**given)).rules.get("floaters")) == what
 
 
-def test_only_none_keeps_its_set():
+def test_densifier_none_is_the_only_one_without_removal_of_floaters():
     never = {n for n in entries("densifiers") if not build(Densifier, n, {}).edits}
     assert never == {"none"}
     said = (Path(__file__).parents[3] / "docs" / "rules.md").read_text(encoding="utf-8")
@@ -257,6 +257,6 @@ def test_only_none_keeps_its_set():
     assert "none" in row
 
 
-def test_one_and_many_in_words():
+def test_the_message_uses_singular_and_plural():
     assert removed(1).startswith("floaters: 1 primitive was removed")
     assert removed(1200).startswith("floaters: 1,200 primitives were removed")

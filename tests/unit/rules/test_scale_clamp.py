@@ -89,7 +89,7 @@ def expected(setup, state, bound):
     ("seed", "bound", "at_once"),
     [(0, None, 1), (1, None, 2**20), (2, 0.2, 1), (3, 0.2, 2**20), (4, 3.0, 1), (5, 3.0, 2**20)],
 )
-def test_axes_are_as_long_as_they_may_be(seed, bound, at_once, monkeypatch):
+def test_axes_are_clamped_to_the_allowed_length(seed, bound, at_once, monkeypatch):
     monkeypatch.setattr(scale_clamp, "_AT_ONCE", at_once)
     setup = setup_of(rules=using(bound))
     state = at_random(setup, seed)
@@ -131,7 +131,7 @@ def test_scales_below_the_bound_are_not_clamped():
         assert torch.equal(scales, torch.full_like(scales, size))
 
 
-def test_a_run_within_seconds_is_reported_once_its_length_is_planned(tmp_path, capsys):
+def test_a_run_in_seconds_reports_the_rule_after_its_length_is_planned(tmp_path, capsys):
     command = ("run", "--seconds", 1, "--max-size", 48, "--threads", 1, "--out", tmp_path / "run")
     assert ended(*command) == 0
     assert (
@@ -148,7 +148,7 @@ def test_scales_are_clamped_at_fixed_intervals_only():
 
 
 @pytest.mark.parametrize("backbone", AXES)
-def test_a_step_bounds_sizes(backbone):
+def test_a_step_clamps_only_scales_above_the_bound(backbone):
     """Adam's moments stay, and all that is not too long has the bits of a step without a bound."""
     found = {}
     for bound in (None, 0.0):
@@ -183,7 +183,7 @@ def test_a_step_bounds_sizes(backbone):
     ],
     ids=str,
 )
-def test_the_default_of_the_scale_clamp_rule(settings, bound):
+def test_the_scale_clamp_rule_is_selected_by_default(settings, bound):
     setup = setup_of(**settings)
     rule = setup.selection.rules.get("scale-clamp")
     assert (0.0 if rule is None else rule.ratio) == bound
@@ -194,7 +194,7 @@ def test_the_default_of_the_scale_clamp_rule(settings, bound):
 @pytest.mark.parametrize(
     "settings", [{"options": {"lr_scales": 0.0}}, *({"backbone": name} for name in ANCHORS)]
 )
-def test_a_bound_is_refused_where_no_sizes_learn(settings):
+def test_the_scale_clamp_rule_is_refused_for_a_backbone_without_trained_scales(settings):
     setup = setup_of(**settings)
     config = setup.config.model_copy(update={"rules": using(0.5)})
     with pytest.raises(UserError, match="no Gaussians with axes that learn"):

@@ -46,7 +46,7 @@ def file_of(tmp_path, rules):
     return path
 
 
-def test_a_run_without_any_rule_trains_and_asks_no_hook_of_theirs():
+def test_a_run_without_rules_trains_and_calls_no_rule_hook():
     setup = setup_of(recipe={"name": "published"})
     assert setup.selection.rules == {} == resolved(setup).rules
     state = first_state(setup)
@@ -59,7 +59,7 @@ def test_a_run_without_any_rule_trains_and_asks_no_hook_of_theirs():
     assert not list(final_edits(setup, state))
 
 
-def test_a_finished_run_has_written_down_all_rules_with_all_options(tmp_path):
+def test_a_finished_run_records_all_rules_with_all_options(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=6)
     command = ("run", scene, "--steps", 3, "--threads", 1, "--no-rule", "scale-clamp", "--rule")
     more = ("weight-averaging", "--set", "rules.lr-tail.share=0.5", "-q", "--out", tmp_path / "run")
@@ -72,7 +72,7 @@ def test_a_finished_run_has_written_down_all_rules_with_all_options(tmp_path):
     assert "rules.floaters" in written["decided"] and "rules.lr-tail" not in written["decided"]
 
 
-def test_the_override_of_a_decided_rule_leaves_it_out():
+def test_the_reported_override_of_a_rule_removes_the_rule():
     setup = setup_of(densifier={"name": "adc"})
     rows = [row for row in setup.decisions if row.setting.startswith("rules.") and row.override]
     assert len(rows) >= 3
@@ -97,13 +97,13 @@ def test_the_override_of_a_decided_rule_leaves_it_out():
         ({"a": None}, {"rules": {"b": False}}, ["rules.c=true"], {"a": {}, "b": False, "c": {}}),
     ],
 )
-def test_rules_are_added_and_left_out_on_top_of_a_file(
+def test_rules_can_be_added_to_and_removed_from_a_file(
     tmp_path, before, options, assignments, after
 ):
     assert parsed(merged(file_of(tmp_path, before), options, assignments)).rules == after
 
 
-def test_a_rule_that_the_user_sets_is_decided_no_longer(tmp_path):
+def test_a_rule_set_by_the_user_is_no_longer_marked_as_decided(tmp_path):
     path = tmp_path / "config.yaml"
     settings = {"rules": {"dropout": False}, "decided": {"rules.dropout": "many photos"}}
     path.write_text(yaml.safe_dump(settings), encoding="utf-8")
@@ -123,13 +123,13 @@ def test_a_misspelt_rule_is_refused_with_the_right_name(option):
         check_names(parsed(merged(None, {option: ["floater"]}, ())))
 
 
-def test_a_wrong_option_of_a_rule_is_refused_at_its_place():
+def test_an_invalid_option_of_a_rule_is_refused_with_its_name():
     with pytest.raises(UserError) as caught:
         setup_of(rules={"dropout": {"share": 2.0}})
     assert caught.value.where == "rules.dropout.share"
 
 
-def test_the_rules_follow_the_length_that_is_planned_from_seconds():
+def test_rules_follow_the_length_planned_from_seconds():
     setup = setup_of(steps=None, seconds=60.0, densifier={"name": "adc"})
     assert "scale-clamp" in setup.selection.rules
     for steps, clamps in ((500, True), (40_000, False)):
@@ -157,7 +157,7 @@ class HalvesAgain(Halves):
     """A second rule of that kind."""
 
 
-def test_rules_change_what_the_rule_before_them_answered():
+def test_each_rule_receives_the_result_of_the_previous_rule():
     found = []
     for rules in ((), (Halves(),), (Halves(), HalvesAgain())):
         setup = setup_of(rules=dict.fromkeys(OURS, False)).with_rules(
@@ -212,7 +212,7 @@ def removing(rows):
         ("crossgrad_final_edit", DensifyResult(removing(3))),
     ],
 )
-def test_an_answer_that_a_run_cannot_use_is_refused_with_the_hook(hook, answer):
+def test_an_unusable_result_of_a_rule_is_refused_with_the_hook(hook, answer):
     setup = setup_of(answering(hook, answer))
     state = first_state(setup)
     with pytest.raises(UserError, match=hook) as caught:
@@ -220,7 +220,7 @@ def test_an_answer_that_a_run_cannot_use_is_refused_with_the_hook(hook, answer):
     assert caught.value.todo
 
 
-def test_a_final_edit_that_does_not_fit_leaves_the_state_as_it_was():
+def test_a_final_edit_that_does_not_fit_does_not_change_the_state():
     values = Edit(values={"gone": Rows(torch.zeros(1))})
     setup = setup_of(answering("crossgrad_final_edit", FinalEdit(values, "gone")))
     state = first_state(setup)
@@ -230,7 +230,7 @@ def test_a_final_edit_that_does_not_fit_leaves_the_state_as_it_was():
     assert all(state.tensors[name] is tensor for name, tensor in tensors.items())
 
 
-def test_a_run_with_all_our_rules_goes_on_with_the_same_bits():
+def test_a_resumed_run_with_all_bundled_rules_has_the_same_bits():
     setup = setup_of(rules=dict.fromkeys(OURS, True), densifier={"name": "adc"})
     assert sorted(setup.selection.rules) == OURS
     whole = first_state(setup)
@@ -245,7 +245,7 @@ def test_a_run_with_all_our_rules_goes_on_with_the_same_bits():
     assert all(torch.equal(one[name], two[name]) for name in one)
 
 
-def test_a_rule_that_is_added_and_left_out_is_refused():
+def test_a_rule_that_is_both_added_and_removed_is_refused():
     with pytest.raises(UserError, match="added and left out") as caught:
         merged(None, {"rule": ["dropout"], "no_rule": ["floaters", "dropout"]}, ())
     assert caught.value.found == "dropout"

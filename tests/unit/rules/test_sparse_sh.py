@@ -74,7 +74,9 @@ def changes(setup):
     ],
     ids=str,
 )
-def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(settings, plugins):
+def test_higher_bands_change_in_their_update_steps_and_other_tensors_in_every_step(
+    settings, plugins
+):
     setup = setup_of(rules=RULES, **settings)
     for plugin in plugins:
         setup.manager.register(plugin())
@@ -87,7 +89,7 @@ def test_higher_bands_change_where_they_learn_and_all_else_in_every_step(setting
     assert all(steps == list(range(1, last + 1)) for steps in found.values())
 
 
-def test_sh_bands_that_do_not_learn_in_a_step_are_passed_without_gradient(monkeypatch):
+def test_sh_bands_without_an_update_in_a_step_get_no_gradient(monkeypatch):
     setup = setup_of(rules=RULES, views_per_step=2)
     due = [step for step in range(1, STEPS + 1) if learns_in(step, EVERY)]
     decoded, worked_out = [], []
@@ -122,7 +124,7 @@ class Together(NumbaRasterizer):
         return [self.render(*view, background, outputs) for view, background in pairs]
 
 
-def test_views_that_are_drawn_together_give_the_same_parameters():
+def test_views_rendered_together_give_the_same_parameters():
     apart = setup_of(rules=RULES, views_per_step=2)
     selection = replace(apart.selection, rasterizer=Together())
     ours, theirs = changes(replace(apart, selection=selection)), changes(apart)
@@ -131,12 +133,12 @@ def test_views_that_are_drawn_together_give_the_same_parameters():
         torch.testing.assert_close(ours[1].parameters[name], tensor)
 
 
-def test_a_run_writes_down_in_which_steps_its_bands_learn():
+def test_a_run_records_the_update_interval_of_its_sh_bands():
     assert resolved(setup_of(rules=RULES)).rules["sparse-sh"] == {"every": EVERY}
     assert "sparse-sh" not in resolved(setup_of()).rules
 
 
-def test_without_the_rule_all_learn_in_every_step_at_their_own_rate():
+def test_all_tensors_change_in_every_step_without_the_sparse_sh_rule():
     plain, every = setup_of(), setup_of(rules=RULES)
     assert changes(plain)[0]["f_rest"] == list(range(1, STEPS + 1))
     ours, theirs = rates_at(every, 1), rates_at(plain, 1)
@@ -144,6 +146,6 @@ def test_without_the_rule_all_learn_in_every_step_at_their_own_rate():
     assert ours == theirs
 
 
-def test_backbones_without_harmonics_are_not_concerned():
+def test_the_sparse_sh_rule_is_not_selected_for_backbones_without_harmonics():
     setup = setup_of("scaffold", rules=RULES)
     assert not any(setup.resting(step) for step in range(1, STEPS + 1))

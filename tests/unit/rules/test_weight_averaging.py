@@ -74,7 +74,7 @@ def same(one, two):
         (1e-9, 1000, 0.01),
     ],
 )
-def test_constant_rates_fade_log_linearly_over_the_last_share(share, step, left):
+def test_constant_learning_rates_decay_log_linearly_over_the_last_share(share, step, left):
     setup = setup_of(**using("lr-tail", share=share), steps=1000)
     assert rate_factor(setup, CONSTANT, step) == pytest.approx(left, rel=1e-12)
     assert rate_factor(setup, DECAYING, step) == 1.0
@@ -114,7 +114,7 @@ def runs(request):
     return SimpleNamespace(setups=setups, again=trained(setups["both"], state=again)[0], **found)
 
 
-def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(runs):
+def test_learning_rates_are_the_published_ones_until_they_decay(runs):
     blocks = runs.setups["plain"].trained_blocks
     of = {name: block.lr for block in blocks for name in block.tensors}
     published, fading = runs.plain[2], runs.both[2]
@@ -129,7 +129,7 @@ def test_the_rates_of_a_run_are_the_published_ones_until_they_fade(runs):
     assert constant and all(published[0][n] == published[-1][n] for n in constant)
 
 
-def test_the_average_is_that_of_the_last_steps_and_changes_no_training(runs):
+def test_the_average_covers_the_last_steps_and_does_not_change_training(runs):
     (plain, _, _), (state, seen, _) = runs.plain, runs.averaged
     assert same(plain.parameters, state.parameters)
     assert NAME not in plain.states
@@ -155,7 +155,7 @@ def test_evaluation_renders_the_averaged_parameters(runs):
     assert torch.equal(drawn, expected) and not torch.equal(drawn, other)
 
 
-def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
+def test_a_run_resumed_from_a_checkpoint_ends_with_the_same_bits(runs):
     whole = runs.both[0]
     assert same(whole.parameters, runs.again.parameters)
     (one, two) = (each.states[NAME] for each in (whole, runs.again))
@@ -163,7 +163,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_ends_with_the_same_bits(runs):
     assert same(one.tensors, two.tensors) and same(one.per_primitive, two.per_primitive)
 
 
-def test_a_snapshot_keeps_the_average_of_its_moment():
+def test_a_snapshot_keeps_its_average():
     setup = setup_of(**using(NAME, share=1.0))
     state, _ = trained(setup, steps=4)
     before = {name: tensor.clone() for name, tensor in eval_parameters(setup, state).items()}
@@ -209,7 +209,7 @@ class Counted:
         (30_000, 0.5, 100),
     ],
 )
-def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, share, count):
+def test_at_most_a_hundred_states_including_the_last_are_averaged(total, share, count):
     run = Counted(total, share)
     taken = [step for step in range(1, total + 1) if run.take(step)]
     assert len(taken) == run.held.values["count"] == count
@@ -217,7 +217,7 @@ def test_at_most_a_hundred_states_are_averaged_the_last_one_included(total, shar
     assert len(set(np.diff(taken))) == 1
 
 
-def test_no_length_and_share_has_more_than_a_hundred():
+def test_no_length_and_share_averages_more_than_a_hundred_states():
     for total in (99, 100, 1000, 1490, 2001):
         for share in np.linspace(0.01, 1.0, 12):
             window = sum(step > (1.0 - share) * total for step in range(1, total + 1))
@@ -226,7 +226,7 @@ def test_no_length_and_share_has_more_than_a_hundred():
             assert min(window, 50) <= taken <= 100
 
 
-def test_sums_of_many_states_lose_nothing():
+def test_sums_of_many_states_keep_their_precision():
     run = Counted(10_000, 1.0)
     for step in range(1, 10_001):
         run.parameters = {"x": torch.tensor([1.0 + 1e-3 * np.sin(step / 100)])}
@@ -258,7 +258,7 @@ def test_a_longer_length_discards_an_average_that_began_too_early():
     ],
     ids=["fewer", "other-order", "reset", "nothing", "a-count"],
 )
-def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeypatch):
+def test_an_edit_of_density_control_restarts_the_average(edit, count, monkeypatch):
     """Of ten steps the last six are averaged, and the edit comes in the eighth."""
     setup = setup_of(**using(NAME, share=0.6))
 
@@ -273,7 +273,7 @@ def test_an_edit_of_density_control_begins_the_average_anew(edit, count, monkeyp
     assert torch.allclose(eval_parameters(setup, state)["opacities"], expected, atol=1e-6)
 
 
-def test_noise_after_every_step_does_not_keep_the_average_from_growing():
+def test_noise_after_every_step_does_not_restart_the_average():
     setup = setup_of(densifier="mcmc", densify_until=2, **using(NAME, share=0.5))
     state, _ = trained(setup)
     assert state.states[NAME].values["count"] == 5
@@ -287,7 +287,7 @@ def test_the_published_recipe_has_no_rate_tail_and_no_averaging():
     assert resolved(setup_of(**published, rules=both)).rules == wanted
 
 
-def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
+def test_the_configuration_of_a_run_without_constant_rates_repeats_the_run():
     names = ("lr_features_final", "lr_scales_final", "lr_cov_final")
     config = RunConfig(
         steps=10, backbone=ComponentChoice(name="scaffold", **dict.fromkeys(names, 1e-5))
@@ -299,14 +299,14 @@ def test_a_run_without_constant_rates_is_repeated_by_its_configuration():
     assert resolved(assemble(again, sample_scene(), "none")).rules == written.rules
 
 
-def test_a_run_says_what_it_does_at_its_end():
+def test_a_run_reports_the_learning_rate_tail():
     shown = {row.setting: row.value for row in setup_of().decisions if row.override}
     assert shown["rules.lr-tail"] == {"share": 0.25}
     without = setup_of(rules={"lr-tail": False})
     assert "rules.lr-tail" not in {row.setting for row in without.decisions}
 
 
-def test_an_average_of_other_primitives_is_refused():
+def test_an_average_with_another_number_of_primitives_is_refused():
     setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
     state.commit({NAME: PluginState({"count": 2}, {}, {"means": torch.zeros(1, 3)})})
@@ -315,7 +315,7 @@ def test_an_average_of_other_primitives_is_refused():
 
 
 @pytest.mark.parametrize("sums", [{"gone": torch.zeros(1)}, {"means": torch.zeros(1)}], ids=str)
-def test_an_average_of_other_tensors_is_not_shown(sums):
+def test_an_average_of_other_tensors_is_refused(sums):
     setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
     state.commit({NAME: PluginState({"count": 2}, sums)})

@@ -39,7 +39,7 @@ def objections(sampler, name, views):
 
 
 @pytest.mark.parametrize("name", ADMITTED)
-def test_other_numbers_of_views_are_refused_with_the_reason(name):
+def test_unsupported_numbers_of_views_are_refused_with_the_reason(name):
     sampler = build("samplers", name, {})
     for views in range(1, 7):
         refused = objections(sampler, name, views)
@@ -48,29 +48,29 @@ def test_other_numbers_of_views_are_refused_with_the_reason(name):
 
 
 @pytest.mark.parametrize("name", ADMITTED)
-def test_the_usual_number_of_views_is_admitted(name):
+def test_the_default_number_of_views_is_accepted(name):
     sampler = build("samplers", name, {})
     assert sampler.view_counts.admits(sampler.resolved_views)
 
 
-def test_alternating_takes_one_view_only():
+def test_the_alternating_sampler_accepts_one_view_only():
     sampler = NearFar(alternating=True)
     assert sampler.resolved_views == 1
     assert not objections(sampler, "near-far", 1)
     assert objections(sampler, "near-far", 2)
 
 
-def test_alternating_begins_near():
+def test_the_alternating_sampler_starts_with_a_near_view():
     run = SamplerRun(NearFar(alternating=True), scene(4), ("near", "near", "far", "far"))
     assert [draw.labels for draw in run.draws(3)] == [("near",), ("far",), ("near",)]
 
 
-def test_a_pair_is_near_first_and_further_pairs_follow():
+def test_a_pair_starts_with_the_near_view_and_further_pairs_follow():
     run = SamplerRun(NearFar(), scene(4), ("far", "near", "far", "near"), 4)
     assert run.draw().labels == ("near", "far", "near", "far")
 
 
-def test_other_labels_take_turns_in_alphabetical_order():
+def test_other_labels_alternate_in_alphabetical_order():
     run = SamplerRun(NearFar(), scene(4), ("street", "aerial", "street", "aerial"))
     draw = run.draw()
     assert draw.labels == ("aerial", "street")
@@ -86,7 +86,7 @@ def test_missing_groups_are_a_user_error(name, groups):
 
 
 @pytest.mark.parametrize("name", ["epoch", "fps"])
-def test_more_different_views_than_there_are_is_a_user_error(name):
+def test_more_different_views_than_training_views_are_a_user_error(name):
     with pytest.raises(UserError, match="3 different views of 2"):
         SamplerRun(build("samplers", name, {}), scene(2), views_per_step=3).draw()
 
@@ -106,12 +106,12 @@ def test_a_scene_without_training_views_is_a_user_error(name):
 
 
 @pytest.mark.parametrize("name", ONE_VIEW)
-def test_one_camera_is_enough_for_one_view(name):
+def test_one_camera_is_sufficient_for_one_view(name):
     run = SamplerRun(build("samplers", name, {}), scene(1), views_per_step=1)
     assert [draw.views for draw in run.draws(3)] == [(0,)] * 3
 
 
-def test_independent_draws_may_repeat_the_only_camera():
+def test_independent_draws_may_repeat_a_single_camera():
     run = SamplerRun(build("samplers", "random", {}), scene(1))
     assert run.draw().views == (0, 0)
 
@@ -121,7 +121,7 @@ def test_random_halves_need_two_cameras():
         SamplerRun(build("samplers", "random-split", {}), scene(1)).draw()
 
 
-def test_horizon_may_show_a_small_group_twice_in_a_step():
+def test_the_horizon_sampler_may_use_a_small_group_twice_in_a_step():
     run = SamplerRun(Horizon(), scene(3), ("near", "near", "far"), 3)
     draw = run.draw()
     assert draw.views[:2] == (2, 2)
@@ -129,23 +129,23 @@ def test_horizon_may_show_a_small_group_twice_in_a_step():
 
 
 @pytest.mark.parametrize("name", ["epoch", "random", "fps"])
-def test_labels_are_passed_on_where_there_are_groups(name):
+def test_samples_have_labels_if_there_are_groups(name):
     run = SamplerRun(build("samplers", name, {}), scene(4), ("a", "b", "c", "d"), 2)
     for draw in run.draws(5):
         assert draw.labels == tuple("abcd"[view] for view in draw.views)
     assert SamplerRun(build("samplers", name, {}), scene(4)).draw().labels is None
 
 
-def test_farthest_points_spread():
+def test_the_farthest_point_order_spreads_points():
     line = np.array([[0.0], [1.0], [2.0], [3.0], [8.0]])
     assert farthest_point_order(line, 0) == [0, 4, 3, 1, 2]
 
 
-def test_equally_far_points_come_by_index():
+def test_equally_far_points_are_ordered_by_index():
     assert farthest_point_order(np.zeros((4, 2)), 2) == [2, 0, 1, 3]
 
 
-def test_cameras_at_one_place_differ_by_direction():
+def test_cameras_at_one_position_are_distinguished_by_direction():
     forwards = [(1, 0, 0), (1, 0.1, 0), (-1, 0, 0), (0, 1, 0)]
     views = [posed_view((0, 0, 0), f"{i}.png", forward=f) for i, f in enumerate(forwards)]
     run = SamplerRun(FarthestPoint(), posed_scene(views), views_per_step=4)
@@ -154,12 +154,12 @@ def test_cameras_at_one_place_differ_by_direction():
         assert opposite.get(draw.views[0], draw.views[1]) == draw.views[1]
 
 
-def test_every_built_in_sampler_is_covered_here():
+def test_these_tests_cover_every_bundled_sampler():
     ours = {n for n, e in entries("samplers").items() if "crossgrad_plugins" in e.value}
     assert ours == set(ADMITTED)
 
 
-def test_a_stray_camera_does_not_set_the_unit_of_pose_space():
+def test_an_outlier_camera_does_not_determine_the_unit_of_pose_space():
     def poses(places):
         cameras = posed_scene([posed_view((x, 0, 0), f"{x}.png") for x in places])
         return FarthestPoint()._poses(SimpleNamespace(scene=cameras, centers=cameras.centers))

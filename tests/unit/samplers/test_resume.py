@@ -34,7 +34,7 @@ def start(name):
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("stop", [1, 7, 20])
-def test_resumed_draws_are_the_same(name, stop):
+def test_a_resumed_sampler_continues_with_the_same_views(name, stop):
     straight = start(name)
     expected = [draw.views for draw in straight.draws(stop + 30)][stop:]
     first = start(name)
@@ -49,7 +49,7 @@ def test_resumed_draws_are_the_same(name, stop):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_state_that_was_handed_in_is_left_as_it_was(name):
+def test_sampling_does_not_change_the_given_state(name):
     run = start(name)
     list(run.draws(5))
     before = json.dumps(dict(run.state.values))
@@ -59,7 +59,7 @@ def test_the_state_that_was_handed_in_is_left_as_it_was(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_equal_seeds_draw_equally_and_others_do_not(name):
+def test_only_equal_seeds_give_equal_views(name):
     def views(seed):
         run = start(name)
         run.rng = np.random.default_rng(seed)

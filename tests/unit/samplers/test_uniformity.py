@@ -52,7 +52,7 @@ def test_views_are_drawn_with_the_promised_probability(case):
 @pytest.mark.parametrize(
     "case", ["random", "random distinct", "near-far", "near-far four", "three-way"]
 )
-def test_the_check_notices_a_bias(case):
+def test_the_uniformity_check_detects_a_bias(case):
     sampler, groups, k, expected = CASES[case]
     run = SamplerRun(sampler, scene(), groups, k)
     counts = np.bincount([v for draw in run.draws(STEPS) for v in draw.views], minlength=9)
@@ -62,7 +62,7 @@ def test_the_check_notices_a_bias(case):
 
 @pytest.mark.parametrize("k", [1, 2, 3, 4, 9])
 @pytest.mark.parametrize("sampler", [Epoch(), FarthestPoint()])
-def test_an_epoch_holds_every_view_once(sampler, k):
+def test_an_epoch_contains_every_view_once(sampler, k):
     run = SamplerRun(sampler, scene(), views_per_step=k)
     order = [view for draw in run.draws(9 * 4) for view in draw.views]
     epochs = np.array(order[: len(order) // 9 * 9]).reshape(-1, 9)
@@ -76,7 +76,7 @@ def test_the_views_of_a_step_are_different(sampler, k):
     assert all(len(set(draw.views)) == k for draw in run.draws(60))
 
 
-def test_epochs_begin_anywhere_and_differ():
+def test_epochs_start_at_any_view_and_differ():
     run = SamplerRun(Epoch(), scene())
     epochs = [tuple(draw.views[0] for draw in run.draws(9)) for _ in range(300)]
     assert len(set(epochs)) > 290
@@ -98,13 +98,13 @@ def test_near_and_far_views_of_a_pair_are_independent():
     assert chisquare(table.ravel()).pvalue > 1e-3
 
 
-def test_near_far_in_epochs_shows_every_near_view_before_any_again():
+def test_near_far_in_epochs_uses_every_near_view_before_any_is_repeated():
     run = SamplerRun(NearFar(order="epoch"), scene(), UNEQUAL)
     near = [draw.views[0] for draw in run.draws(30)]
     assert all(sorted(near[i : i + 3]) == [0, 1, 2] for i in range(0, 30, 3))
 
 
-def test_anchors_meet_the_other_side_and_the_middle_meets_itself():
+def test_anchors_pair_near_with_far_views_and_middle_with_middle_views():
     run = SamplerRun(Anchors30(), scene(), THREE)
     pairs = {draw.labels for draw in run.draws(300)}
     assert pairs == {("near", "far"), ("far", "near"), ("middle", "middle")}
@@ -113,7 +113,7 @@ def test_anchors_meet_the_other_side_and_the_middle_meets_itself():
 
 
 @pytest.mark.parametrize("k", [1, 2, 3])
-def test_horizon_keeps_its_ratios_exactly(k):
+def test_the_horizon_sampler_keeps_its_ratios_exactly(k):
     run = SamplerRun(Horizon(), scene(), UNEQUAL, k, steps=200)
     coarse = [label for draw in run.draws(120) for label in draw.labels]
     fine = [label for draw in run.draws(80) for label in draw.labels]
@@ -123,7 +123,7 @@ def test_horizon_keeps_its_ratios_exactly(k):
 
 
 @pytest.mark.parametrize("percent", range(1, 100))
-def test_horizon_takes_its_first_stage_to_the_end(percent):
+def test_the_horizon_sampler_completes_its_first_stage(percent):
     # All of it far, then all near: 0.29 of 100 steps are 29, though not in binary numbers.
     sampler = Horizon(coarse=(99, 1), fine=(1, 99), coarse_share=percent / 100)
     run = SamplerRun(sampler, scene(), UNEQUAL, 1, steps=100)
@@ -132,13 +132,13 @@ def test_horizon_takes_its_first_stage_to_the_end(percent):
     assert labels[percent : percent + 2] == ["far", "near"][: 100 - percent]
 
 
-def test_horizon_shows_every_view_of_a_group_before_any_again():
+def test_the_horizon_sampler_uses_every_view_of_a_group_before_any_is_repeated():
     run = SamplerRun(Horizon(coarse=(1, 1)), scene(), UNEQUAL)
     far = [draw.views[0] for draw in run.draws(48) if draw.labels == ("far",)]
     assert all(sorted(far[i : i + 6]) == [3, 4, 5, 6, 7, 8] for i in range(0, 24, 6))
 
 
-def test_random_halves_are_drawn_once_and_have_nothing_to_do_with_the_groups():
+def test_random_halves_are_drawn_once_and_do_not_depend_on_the_groups():
     halves = set()
     for seed in range(200):
         run = SamplerRun(RandomSplit(), scene(), UNEQUAL, rng=np.random.default_rng(seed))
@@ -151,13 +151,13 @@ def test_random_halves_are_drawn_once_and_have_nothing_to_do_with_the_groups():
     assert len(halves) > 60
 
 
-def test_active_renders_every_view_before_it_compares_losses():
+def test_the_active_sampler_renders_every_view_before_it_compares_losses():
     run = SamplerRun(Active(), scene(), UNEQUAL)
     seen = [view for draw in run.draws(6) for view in draw.views]
     assert set(seen) == set(range(9))
 
 
-def test_active_prefers_the_partner_with_the_largest_disparity():
+def test_the_active_sampler_prefers_the_partner_with_the_largest_disparity():
     losses = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.9]
     run = SamplerRun(Active(), scene(), UNEQUAL, losses=losses)
     list(run.draws(50))
@@ -171,7 +171,7 @@ def test_active_prefers_the_partner_with_the_largest_disparity():
     assert chisquare(counts[3:], expected).pvalue > 1e-3
 
 
-def test_active_leaves_out_all_but_the_top_candidates():
+def test_the_active_sampler_uses_the_top_candidates_only():
     losses = [0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     run = SamplerRun(Active(top=2), scene(), UNEQUAL, losses=losses)
     list(run.draws(100))
@@ -179,7 +179,7 @@ def test_active_leaves_out_all_but_the_top_candidates():
     assert partners == {7, 8}
 
 
-def test_active_averages_the_losses_of_a_view():
+def test_the_active_sampler_averages_the_losses_of_a_view():
     run = SamplerRun(Active(decay=0.5), scene(), UNEQUAL, losses=[1.0] * 9)
     list(run.draws(20))
     run.losses = [3.0] * 9
@@ -189,7 +189,7 @@ def test_active_averages_the_losses_of_a_view():
     assert {run.state.values["losses"][str(view)] for view in draw.views} == {2.0}
 
 
-def test_active_ignores_a_loss_that_is_not_finite():
+def test_the_active_sampler_ignores_a_non_finite_loss():
     run = SamplerRun(Active(), scene(), UNEQUAL, losses=[float("nan")] * 9)
     list(run.draws(20))
     assert run.state.values["losses"] == {}

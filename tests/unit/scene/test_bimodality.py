@@ -26,7 +26,7 @@ def test_two_equal_points_stay_below_one_in_the_finite_sample_form(n, expected):
 
 
 @pytest.mark.parametrize("share", [0.5, 0.2, 0.01])
-def test_any_law_on_two_points_has_population_form_one(share):
+def test_every_distribution_on_two_points_has_a_population_coefficient_of_one(share):
     values = np.array([0.0] * round(1000 * share) + [1.0] * round(1000 * (1 - share)))
     assert bimodality(values).population == pytest.approx(1.0)
 
@@ -39,14 +39,14 @@ def test_any_law_on_two_points_has_population_form_one(share):
         pytest.param(quantiles(expon), 5 / 9, id="exponential"),
     ],
 )
-def test_known_limits(values, expected):
+def test_known_distributions_reach_their_limits(values, expected):
     found = bimodality(values)
     assert found.population == pytest.approx(expected, abs=2e-3)
     assert found.sample == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_forms_are_built_from_the_usual_moments(seed):
+def test_both_coefficients_are_computed_from_standard_moments(seed):
     values = np.random.default_rng(seed).gamma(2.0, size=23)
     n = len(values)
     g1, g2 = skew(values, bias=False), kurtosis(values, bias=False)
@@ -57,7 +57,7 @@ def test_the_forms_are_built_from_the_usual_moments(seed):
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-150, 0.0), (1e150, 0.0), (-3.0, 1e6)])
-def test_units_do_not_matter(scale, shift):
+def test_units_do_not_change_the_coefficient(scale, shift):
     values = np.random.default_rng(0).normal(size=40)
     found, moved = bimodality(values), bimodality(scale * values + shift)
     assert moved.sample == pytest.approx(found.sample, rel=1e-6)

@@ -42,7 +42,7 @@ def trained(path, **options):
     return names(found, found.train)
 
 
-def test_a_training_photo_masked_as_a_whole_is_left_out_and_named(scene):
+def test_a_fully_masked_training_photo_is_left_out_and_named(scene):
     before = read(scene)
     mask(scene, "0001.png", black())
     after = read(scene)
@@ -59,23 +59,23 @@ def test_a_transparent_training_photo_is_left_out(scene):
 
 
 @pytest.mark.parametrize("count", [1, 40, 800])
-def test_a_photo_with_some_pixels_that_count_stays(scene, count):
+def test_a_photo_with_some_unmasked_pixels_is_kept(scene, count):
     mask(scene, "0001.png", black(count))
     assert "0001.png" in trained(scene)
 
 
-def test_a_photo_whose_last_pixels_are_lost_by_resizing_is_left_out(scene):
+def test_a_photo_that_loses_its_last_unmasked_pixels_by_resizing_is_left_out(scene):
     mask(scene, "0001.png", black(1))
     assert "0001.png" not in trained(scene, max_size=16)
 
 
-def test_a_held_out_photo_masked_as_a_whole_stays(scene):
+def test_a_fully_masked_held_out_photo_is_kept(scene):
     before = read(scene)
     mask(scene, names(before, before.test)[0], black())
     assert len(read(scene).test) == len(before.test)
 
 
-def test_nothing_but_masked_photos_is_refused(scene):
+def test_a_scene_of_fully_masked_photos_is_refused(scene):
     for photo in (scene / "images").iterdir():
         mask(scene, photo.name, black())
     with pytest.raises(UserError, match="every pixel of every training photo") as refused:

@@ -28,7 +28,7 @@ def test_impossible_cameras_are_refused(calibration, message):
         calibration.check("here")
 
 
-def test_pinholes_are_taken_as_they_are():
+def test_pinhole_cameras_are_used_unchanged():
     simple = Calibration("SIMPLE_PINHOLE", 96, 64, (110.0, 40.0, 30.0))
     simple.check("here")
     assert simple.is_pinhole
@@ -46,7 +46,7 @@ def test_pinholes_are_taken_as_they_are():
         ("OPENCV_FISHEYE", (110.0, 111.0, 49.0, 31.0, 0.0, 0.0, 0.0, 0.0), False),
     ],
 )
-def test_models_without_distortion_are_pinholes(model, params, pinhole):
+def test_models_with_zero_distortion_become_pinholes(model, params, pinhole):
     assert Calibration(model, 96, 64, params).is_pinhole == pinhole
 
 
@@ -80,7 +80,7 @@ def test_undistortion_agrees_with_the_camera_model():
         (Calibration("OPENCV_FISHEYE", 60, 40, (6.0, 6.0, 30.0, 20.0, 0.0, 0.0, 0.0, 0.0)), True),
     ],
 )
-def test_blank_borders_are_known_without_undistorting(calibration, fills):
+def test_blank_borders_are_predicted_without_undistortion(calibration, fills):
     white = np.full((calibration.height, calibration.width), 255, dtype=np.uint8)
     assert calibration.fills_frame == fills == (calibration.undistort(white).min() == 255)
 

@@ -29,7 +29,7 @@ def test_16_bit_photos_are_rounded_to_8_bits(tmp_path):
     np.testing.assert_array_equal(decode_photo(tmp_path / "a.tif")[0], rgb)
 
 
-def test_alpha_comes_apart(tmp_path):
+def test_alpha_is_returned_separately(tmp_path):
     Image.fromarray(np.dstack([RGB, GREY])).save(tmp_path / "a.png")
     rgb, alpha = decode_photo(tmp_path / "a.png")
     np.testing.assert_array_equal(rgb, RGB)
@@ -71,7 +71,7 @@ def test_a_damaged_photo_is_named(decode, tmp_path):
         (GREY > 127, "1"),
     ],
 )
-def test_masks_keep_white(mask, mode, tmp_path):
+def test_masks_keep_their_white_pixels(mask, mode, tmp_path):
     image = Image.fromarray(mask)
     assert image.mode == mode
     image.save(tmp_path / "m.png")
@@ -79,7 +79,7 @@ def test_masks_keep_white(mask, mode, tmp_path):
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14])
-def test_white_of_a_mask_is_that_of_the_bits_it_uses(bits, tmp_path):
+def test_the_white_value_of_a_mask_follows_its_number_of_bits(bits, tmp_path):
     wide = np.where(GREY > 127, 2**bits - 1, 0).astype(np.uint16)
     Image.fromarray(wide).save(tmp_path / "m.png")
     np.testing.assert_array_equal(decode_mask(tmp_path / "m.png"), np.where(GREY > 127, 255, 0))
@@ -94,7 +94,7 @@ def test_the_mask_is_the_alpha_if_only_alpha_is_black_and_white(colors, tmp_path
 
 
 @pytest.mark.parametrize("alpha", [255, 128, GREY])
-def test_a_mask_in_black_and_white_is_no_matter_of_its_alpha(alpha, tmp_path):
+def test_alpha_of_a_black_and_white_mask_is_ignored(alpha, tmp_path):
     mask = np.where(GREY > 127, 255, 0).astype(np.uint8)
     layers = np.dstack([mask, mask, mask, np.broadcast_to(alpha, mask.shape)])
     Image.fromarray(layers.astype(np.uint8)).save(tmp_path / "m.png")
@@ -107,22 +107,22 @@ def test_a_black_mask_keeps_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", [1, 5, 6, 7, 8])
-def test_quarter_turns_are_those_of_exif(orientation):
+def test_quarter_turns_agree_with_exif_orientations(orientation):
     image = Image.fromarray(RGB)
     image.getexif()[0x0112] = orientation
     np.testing.assert_array_equal(turn(RGB, orientation), ImageOps.exif_transpose(image))
 
 
-def test_resize_is_the_anti_aliased_resize_of_scikit_image():
+def test_resizing_agrees_with_the_anti_aliased_resize_of_scikit_image():
     expected = skimage_resize(RGB, (13, 20), anti_aliasing=True) * 255
     assert np.abs(resize(RGB, 20, 13) - expected).max() <= 0.51
 
 
-def test_resize_to_its_own_size_changes_nothing():
+def test_resizing_to_the_same_size_changes_nothing():
     assert resize(RGB, 60, 40) is RGB
 
 
-def test_blend_puts_a_colour_behind():
+def test_blending_adds_a_background_colour():
     alpha = np.zeros((40, 60), dtype=np.uint8)
     alpha[:20] = 255
     mixed = blend(RGB, alpha, (1.0, 0.5, 0.0))
@@ -140,7 +140,7 @@ def test_blend_puts_a_colour_behind():
 @example((90, 90), (45, 30), "noise", 0)
 @example((61, 1), (60, 1), "noise", 0)
 @example((7, 90), (1, 2), "mask", 1)
-def test_photos_are_made_smaller_to_the_bits_of_skimage(old, new, kind, seed):
+def test_reducing_photos_gives_the_bits_of_scikit_image(old, new, kind, seed):
     height, width = (min(pair) for pair in zip(old, new, strict=True))
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, old if kind == "grey" else (*old, 3), dtype=np.uint8)
@@ -150,6 +150,6 @@ def test_photos_are_made_smaller_to_the_bits_of_skimage(old, new, kind, seed):
     np.testing.assert_array_equal(resize(image, width, height), np.rint(whole).clip(0, 255))
 
 
-def test_one_side_may_grow():
+def test_resizing_may_enlarge_one_side_of_a_photo():
     whole = skimage_resize(RGB.astype(np.float32), (50, 30), anti_aliasing=True)
     np.testing.assert_array_equal(resize(RGB, 30, 50), np.rint(whole).clip(0, 255))

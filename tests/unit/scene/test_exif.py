@@ -22,7 +22,7 @@ def photo(path, tags):
     return path
 
 
-def test_time_sensitivity_and_aperture_make_a_value(tmp_path):
+def test_time_sensitivity_and_aperture_give_an_exposure_value(tmp_path):
     value = _of_file(photo(tmp_path / "a.jpg", WHOLE))
     assert value == pytest.approx(log2(200 / 250 / 64))
 
@@ -42,12 +42,12 @@ def test_impossible_exif_values_give_no_exposure_value(tmp_path, changes):
 
 
 @pytest.mark.parametrize("missing", [TIME, APERTURE, SENSITIVITY])
-def test_a_part_alone_is_no_value(tmp_path, missing):
+def test_incomplete_exif_values_give_no_exposure_value(tmp_path, missing):
     tags = {tag: value for tag, value in WHOLE.items() if tag != missing}
     assert _of_file(photo(tmp_path / "a.jpg", tags)) is None
 
 
-def test_without_exif_without_a_file_or_damaged_there_is_none(tmp_path):
+def test_a_photo_without_readable_exif_has_no_exposure_value(tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "plain.png")
     assert _of_file(tmp_path / "plain.png") is None
     (tmp_path / "cut.jpg").write_bytes(photo(tmp_path / "a.jpg", WHOLE).read_bytes()[:60])

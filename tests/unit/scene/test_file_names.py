@@ -29,7 +29,7 @@ def pair(files, *names, **options):
         (("e\u0301.png",), "images/\u00e9.png", "e\u0301.png"),
     ],
 )
-def test_a_name_stands_for_the_file_whose_path_is_most_alike(files, name, expected):
+def test_a_name_is_matched_with_the_most_similar_path(files, name, expected):
     assert pair(files, name).files == {name: expected}
 
 
@@ -40,17 +40,17 @@ def test_a_name_that_fits_two_files_is_ambiguous(name):
     assert {name: sorted(found.ambiguous[name])} == {name: list(TWO)}
 
 
-def test_two_names_that_fit_one_file_alike_are_ambiguous():
+def test_two_names_that_fit_one_file_equally_are_ambiguous():
     found = pair(("p0.png",), "/x/a/p0.png", "/x/b/p0.png")
     assert not found.files and set(found.ambiguous) == {"/x/a/p0.png", "/x/b/p0.png"}
 
 
-def test_a_file_belongs_to_the_name_that_is_more_like_its_path():
+def test_a_file_is_matched_with_the_name_most_similar_to_its_path():
     found = pair(("a/p0.png",), "/x/a/p0.png", "/x/b/p0.png")
     assert found.files == {"/x/a/p0.png": "a/p0.png"} and not found.ambiguous
 
 
-def test_a_file_with_a_name_of_its_own_stands_for_no_other_name():
+def test_a_file_with_an_exact_name_is_matched_with_no_other_name():
     assert pair(TWO, "cam1/p0.png", "/data/p0.png").files == {
         "cam1/p0.png": "cam1/p0.png",
         "/data/p0.png": "cam0/p0.png",
@@ -58,12 +58,12 @@ def test_a_file_with_a_name_of_its_own_stands_for_no_other_name():
 
 
 @pytest.mark.parametrize("name", ["cam0/p0.png", "/data/cam0/p0.png"])
-def test_a_photo_that_is_missing_in_its_folder_is_not_taken_from_another(name):
+def test_a_photo_missing_in_its_folder_is_not_replaced_by_one_of_another_folder(name):
     found = pair(("cam0/p1.png", "cam1/p0.png"), name)
     assert not found.files and not found.ambiguous
 
 
-def test_files_set_aside_stand_for_names_of_their_own_folder_only():
+def test_excluded_files_match_only_names_in_their_own_folder():
     def aside(name):
         return name.startswith("masks/")
 
@@ -72,10 +72,10 @@ def test_files_set_aside_stand_for_names_of_their_own_folder_only():
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "a/..", "\0", "\ud800", "\\"])
-def test_names_of_nothing_stand_for_nothing(name):
+def test_empty_and_meaningless_names_match_no_file(name):
     assert not pair(("p0.png",), name).files
 
 
-def test_spelling_is_suffix_case_and_unicode_form():
+def test_names_may_differ_in_suffix_case_and_unicode_form():
     assert same_spelling("a/P0.PNG", "A/p0.jpg")
     assert not same_spelling("images/p0.png", "p0.png")

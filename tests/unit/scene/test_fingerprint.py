@@ -49,13 +49,13 @@ def told(folder: Path, was) -> list[tuple[Weight, str]]:
     return [(each.weight, each.text) for each in differences(was, taken(folder))]
 
 
-def test_the_same_scene_in_another_place_and_touched_is_the_same(pristine, scene):
+def test_a_copied_scene_with_new_time_stamps_is_recognised(pristine, scene):
     for path in scene.rglob("*.*"):
         path.touch()
     assert told(scene, taken(pristine)) == []
 
 
-def test_a_missing_photo_shifts_the_split(scene):
+def test_a_missing_photo_that_shifts_the_split_is_reported(scene):
     """Held out is each eighth photo by name: 0000 and 0008, then 0000 and 0009."""
     was = taken(scene)
     (scene / "images" / "0002.png").unlink()
@@ -68,7 +68,7 @@ def test_a_missing_photo_shifts_the_split(scene):
     ]
 
 
-def test_a_missing_held_out_photo_where_lists_split(scene):
+def test_a_missing_held_out_photo_of_a_list_is_reported(scene):
     names = [f"{index:04}.png" for index in range(10)]
     (scene / "train_list.txt").write_text("\n".join(names[2:]))
     (scene / "test_list.txt").write_text("\n".join(names[:2]))
@@ -79,14 +79,14 @@ def test_a_missing_held_out_photo_where_lists_split(scene):
     assert told(scene, was)[1] == (Weight.HELD_OUT, "test_list.txt changed")
 
 
-def test_a_list_that_says_the_same_in_other_words_is_no_difference(scene):
+def test_a_list_with_another_layout_but_the_same_views_is_no_difference(scene):
     (scene / "test_list.txt").write_text("0001.png\n0004.png\n")
     was = taken(scene)
     (scene / "test_list.txt").write_text("# held out\n0004.png\n0001.png\n")
     assert told(scene, was) == []
 
 
-def test_changed_photos(scene):
+def test_changed_photos_are_reported(scene):
     was = taken(scene)
     for index in range(5):
         path = scene / "images" / f"{index:04}.png"
@@ -97,7 +97,7 @@ def test_changed_photos(scene):
 
 
 @pytest.mark.parametrize("change", ["changed", "new", "missing"])
-def test_masks(scene, change):
+def test_changed_new_and_missing_masks_are_reported(scene, change):
     was = taken(scene)
     if change == "missing":
         shutil.rmtree(scene / "masks")
@@ -118,7 +118,7 @@ def test_masks(scene, change):
         ({"points": 150}, "other SfM points (150; there were 200)"),
     ],
 )
-def test_another_reconstruction(pristine, tmp_path, other, text):
+def test_another_reconstruction_is_reported(pristine, tmp_path, other, text):
     write_tiny_scene(tmp_path / "other", **{"views": 10, **other})
     shutil.copytree(pristine / "masks", tmp_path / "other" / "masks")
     found = told(tmp_path / "other", taken(pristine))
@@ -127,7 +127,7 @@ def test_another_reconstruction(pristine, tmp_path, other, text):
     assert max(weight for weight, _ in found) is heavy
 
 
-def test_another_scene_in_its_place(pristine, tmp_path):
+def test_another_scene_in_the_same_folder_is_reported(pristine, tmp_path):
     write_tiny_scene(tmp_path / "other", views=10, seed=1)
     found = told(tmp_path / "other", taken(pristine))
     assert [text.partition(":")[0] for _, text in found] == [
@@ -135,7 +135,7 @@ def test_another_scene_in_its_place(pristine, tmp_path):
     ]  # fmt: skip
 
 
-def test_what_another_machine_rounds_otherwise_is_no_difference():
+def test_rounding_differences_between_machines_are_no_difference():
     scene = sample_scene()
     was = fingerprint_of(scene, Path())
     jitter = np.random.default_rng(0).uniform(-1e-9, 1e-9, scene.points.shape)
@@ -150,14 +150,14 @@ def test_what_another_machine_rounds_otherwise_is_no_difference():
     assert differences(was, now) == []
 
 
-def test_photos_that_come_from_no_file_are_known_by_their_cameras():
+def test_photos_without_a_file_are_identified_by_their_cameras():
     found = fingerprint_of(sample_scene(), Path())
     assert all(view.photo is None for view in found.views.values())
     assert sum(view.trained for view in found.views.values()) == len(sample_scene().train)
 
 
 @pytest.mark.parametrize("size", [0, 1, END - 1, END, END + 1, 2 * END, 5 * END])
-def test_both_ends_of_a_file_count(tmp_path, size):
+def test_the_checksum_of_a_file_covers_its_start_and_end(tmp_path, size):
     path = tmp_path / "photo"
     content = bytearray(size)
     path.write_bytes(content)
@@ -177,7 +177,7 @@ def test_a_photo_that_cannot_be_read_is_named(tmp_path):
     assert "gone.png" in str(error.value)
 
 
-def test_the_file_is_read_back_and_small(pristine, tmp_path):
+def test_the_fingerprint_file_is_small_and_read_back(pristine, tmp_path):
     was = taken(pristine)
     write_scene(tmp_path, was)
     assert read_scene_file(tmp_path) == was
@@ -187,7 +187,7 @@ def test_the_file_is_read_back_and_small(pristine, tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{", '{"format": 2}', "\udc80"])
-def test_a_run_without_a_readable_fingerprint_goes_on_with_a_note(tmp_path, caplog, content):
+def test_a_run_without_a_readable_fingerprint_is_resumed_with_a_note(tmp_path, caplog, content):
     if content is not None:
         (tmp_path / FILE).write_text(content, errors="surrogateescape")
     now = fingerprint_of(sample_scene(), Path())
@@ -216,7 +216,7 @@ def made(states: dict[str, str]):
 
 
 @given(st.dictionaries(st.sampled_from("abcdef"), st.tuples(STATES, STATES)))
-def test_the_heaviest_difference_decides(changes):
+def test_the_most_severe_difference_decides(changes):
     was = made({name: before for name, (before, _) in changes.items()})
     now = made({name: after for name, (_, after) in changes.items()})
     found = differences(was, now)
@@ -232,7 +232,7 @@ def test_the_heaviest_difference_decides(changes):
     assert len({each.text for each in found}) == len(found)
 
 
-def test_a_bit_in_the_middle_of_a_large_file_is_noticed(tmp_path):
+def test_a_changed_bit_in_the_middle_of_a_large_file_is_detected(tmp_path):
     path = tmp_path / "large"
     path.write_bytes(bytes(300_000))
     before = mark_of(path)

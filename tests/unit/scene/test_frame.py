@@ -8,14 +8,14 @@ CENTERS = RNG.normal(size=(20, 3)) * [30, 20, 5]
 POINTS = RNG.normal(size=(2000, 3)) * [60, 60, 8]
 
 
-def test_unit_is_the_extent_of_the_training_cameras():
+def test_the_unit_is_the_extent_of_the_training_cameras():
     centers = np.array([[1.0, 0, 0], [3.0, 0, 0], [2.0, 2, 0], [2.0, -2, 0]])
     frame = make_frame(centers, POINTS)
     np.testing.assert_allclose(frame.similarity.offset, [2, 0, 0])
     assert 1 / frame.similarity.scale == pytest.approx(1.1 * 2)
 
 
-def test_points_come_back_through_the_similarity():
+def test_points_are_recovered_through_the_similarity():
     frame = make_frame(CENTERS, POINTS)
     back = frame.similarity.to_input(frame.points(POINTS))
     extent = 1 / frame.similarity.scale
@@ -23,7 +23,7 @@ def test_points_come_back_through_the_similarity():
 
 
 @pytest.mark.parametrize("factor", [1000.0, 0.001, 7.3e-5])
-def test_scaling_the_input_changes_nearly_no_bit(factor):
+def test_scaling_the_input_changes_almost_no_bit(factor):
     reference = make_frame(CENTERS, POINTS).points(POINTS)
     scaled = make_frame(CENTERS * factor, POINTS * factor).points(POINTS * factor)
     assert np.mean(scaled == reference) > 0.999
@@ -38,7 +38,7 @@ def moved_pose(pose, move):
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_moved_by_a_million_units_cameras_and_points_stay_to_2e_9(seed):
+def test_a_scene_moved_by_a_million_units_is_the_same_to_2e_9(seed):
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(12, 3, 3)))[0]
@@ -59,7 +59,7 @@ def test_moved_by_a_million_units_cameras_and_points_stay_to_2e_9(seed):
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e-9])
-def test_cameras_in_one_place_take_their_distance_to_the_points(spread):
+def test_cameras_at_one_position_use_the_distance_to_the_points_as_unit(spread):
     centers = np.array([4e6, 5e5, 100]) + spread * CENTERS
     points = centers[0] + 7 * POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
     frame = make_frame(centers, points)
@@ -73,7 +73,7 @@ def test_one_camera_without_points_keeps_the_unit_of_the_input():
     np.testing.assert_array_equal(frame.similarity.offset, CENTERS[0])
 
 
-def test_pose_keeps_its_rotation_and_moves_its_centre():
+def test_a_pose_keeps_its_rotation_and_its_centre_is_transformed():
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
     pose[:3, 3] = [1, 2, 3]
@@ -87,7 +87,7 @@ def test_pose_keeps_its_rotation_and_moves_its_centre():
 
 
 @pytest.mark.parametrize("strays", [1, 2])
-def test_cameras_far_from_all_others_do_not_set_the_unit(strays):
+def test_cameras_far_from_all_other_cameras_do_not_determine_the_unit(strays):
     far = CENTERS[:strays] + np.array([1e6, 0, 0])
     frame = make_frame(np.vstack([CENTERS, far]), POINTS)
     alone = make_frame(CENTERS, POINTS)
@@ -99,19 +99,19 @@ def test_cameras_far_from_all_others_do_not_set_the_unit(strays):
 @pytest.mark.parametrize(
     ("near", "far", "distance"), [(16, 1, 8), (97, 3, 8), (10, 10, 1000), (3, 1, 1e6), (18, 4, 90)]
 )
-def test_far_groups_and_few_cameras_are_not_stray(near, far, distance):
+def test_distant_groups_and_few_cameras_are_not_outliers(near, far, distance):
     rng = np.random.default_rng(0)
     centers = np.vstack([rng.normal(size=(near, 3)), rng.normal(size=(far, 3)) + distance])
     assert not make_frame(centers, rng.normal(size=(500, 3))).stray.any()
 
 
-def test_a_camera_that_sees_a_large_scene_from_afar_is_not_stray():
+def test_a_camera_that_sees_a_large_scene_from_afar_is_not_an_outlier():
     street = RNG.normal(size=(30, 3)) * 0.5
     drone = np.array([[0.0, 0, 100]])
     town = RNG.uniform(-80, 80, (2000, 3))
     assert not make_frame(np.vstack([street, drone]), town).stray.any()
 
 
-def test_single_far_points_do_not_hide_a_stray_camera():
+def test_single_far_points_do_not_hide_an_outlier_camera():
     points = np.vstack([POINTS, [[1e9, 0, 0]]])
     assert make_frame(np.vstack([CENTERS, [[1e6, 0, 0]]]), points).stray.sum() == 1

@@ -21,7 +21,7 @@ def save(path, **options):
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "bmp"])
-def test_header_of_a_whole_photo(suffix, tmp_path):
+def test_the_header_of_a_complete_photo_is_read(suffix, tmp_path):
     header = read_header(save(tmp_path / f"a.{suffix}"))
     assert header == PhotoHeader(60, 40, False, False, reducible=suffix == "jpg")
 
@@ -32,7 +32,7 @@ def test_a_progressive_jpeg_cannot_be_decoded_at_a_reduced_size(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
 @pytest.mark.parametrize("share", [0.5, 0.97])
-def test_a_photo_cut_short_is_refused(suffix, share, tmp_path):
+def test_a_truncated_photo_is_refused(suffix, share, tmp_path):
     path = save(tmp_path / f"a.{suffix}")
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
@@ -40,7 +40,7 @@ def test_a_photo_cut_short_is_refused(suffix, share, tmp_path):
         read_header(path)
 
 
-def test_a_thumbnail_does_not_hide_that_the_photo_is_cut_short(tmp_path):
+def test_a_thumbnail_does_not_hide_a_truncated_photo(tmp_path):
     # A whole JPEG with its own end marker, as the EXIF header of a camera carries it.
     thumbnail = io.BytesIO()
     Image.fromarray(PIXELS[:8, :8]).save(thumbnail, "jpeg")
@@ -56,13 +56,13 @@ def test_a_thumbnail_does_not_hide_that_the_photo_is_cut_short(tmp_path):
 
 
 @pytest.mark.parametrize("trailer", [b"\0" * 500, b"SEFH trailer of a phone" * 9])
-def test_data_behind_a_jpeg_is_allowed(trailer, tmp_path):
+def test_extra_data_after_a_jpeg_is_allowed(trailer, tmp_path):
     path = save(tmp_path / "a.jpg")
     path.write_bytes(path.read_bytes() + trailer)
     assert read_header(path).height == 40
 
 
-def test_a_jpeg_filled_up_with_zeros_is_cut_short(tmp_path):
+def test_a_jpeg_padded_with_zeros_counts_as_truncated(tmp_path):
     path = save(tmp_path / "a.jpg")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2] + b"\0" * (len(data) // 2))
@@ -71,14 +71,14 @@ def test_a_jpeg_filled_up_with_zeros_is_cut_short(tmp_path):
 
 
 @pytest.mark.parametrize(("content", "found"), [(b"", "an empty file"), (b"hello", "no format")])
-def test_what_is_no_photo_is_refused(content, found, tmp_path):
+def test_a_file_that_is_not_a_photo_is_refused(content, found, tmp_path):
     path = tmp_path / "a.jpg"
     path.write_bytes(content)
     with pytest.raises(UserError, match=rf"not a photo(?s:.*)a\.jpg(?s:.*){found}"):
         read_header(path)
 
 
-def test_a_photo_that_may_not_be_read_is_named(tmp_path):
+def test_a_photo_without_read_permission_is_named(tmp_path):
     (tmp_path / "a.jpg").mkdir()
     with pytest.raises(UserError, match=r"cannot be read(?s:.*)a\.jpg"):
         read_header(tmp_path / "a.jpg")
@@ -88,14 +88,14 @@ def test_a_photo_that_may_not_be_read_is_named(tmp_path):
     ("mode", "alpha", "grey"),
     [("L", False, True), ("LA", True, True), ("RGBA", True, False), ("I;16", False, True)],
 )
-def test_transparency_and_grey_are_seen(mode, alpha, grey, tmp_path):
+def test_transparency_and_grey_are_detected(mode, alpha, grey, tmp_path):
     Image.new(mode, (60, 40)).save(tmp_path / "a.png")
     header = PhotoHeader(60, 40, alpha, grey, deep=mode == "I;16")
     assert read_header(tmp_path / "a.png") == header
 
 
 @pytest.mark.parametrize(("orientation", "turn"), [(1, None), (3, None), (6, 6), (8, 8), (0, None)])
-def test_quarter_turns_are_found(orientation, turn, tmp_path):
+def test_quarter_turns_are_detected(orientation, turn, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = orientation
     assert read_quarter_turn(save(tmp_path / "a.jpg", exif=exif)) == turn
@@ -118,7 +118,7 @@ def test_a_header_that_claims_more_pixels_than_the_file_can_hold_is_refused(suff
         read_header(path)
 
 
-def test_the_largest_sizes_that_files_hold_pass(tmp_path):
+def test_the_largest_possible_photo_sizes_are_accepted(tmp_path):
     # One colour compresses as far as the formats allow.
     Image.new("1", (6000, 4000)).save(tmp_path / "a.png", compress_level=9)
     assert read_header(tmp_path / "a.png").width == 6000
@@ -131,7 +131,7 @@ def test_the_largest_sizes_that_files_hold_pass(tmp_path):
 @pytest.mark.parametrize(
     "error", [KeyError("x"), struct.error("x"), IndexError(), NotImplementedError("x")]
 )
-def test_whatever_a_decoder_raises_is_one_error(error, tmp_path, monkeypatch):
+def test_any_exception_of_a_decoder_becomes_one_error(error, tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise error
 
@@ -142,7 +142,7 @@ def test_whatever_a_decoder_raises_is_one_error(error, tmp_path, monkeypatch):
             read(path)
 
 
-def test_memory_is_not_set_aside_for_what_a_chunk_claims(tmp_path):
+def test_memory_is_not_allocated_for_a_claimed_chunk_size(tmp_path):
     path = save(tmp_path / "a.png")
     data = path.read_bytes()
     at = data.index(b"IDAT") - 4
@@ -156,14 +156,14 @@ def test_memory_is_not_set_aside_for_what_a_chunk_claims(tmp_path):
         tracemalloc.stop()
 
 
-def test_only_formats_of_photos_are_opened(tmp_path):
+def test_only_photo_formats_are_opened(tmp_path):
     # Pillow would hand a PostScript file to Ghostscript.
     (tmp_path / "a.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EOF\n")
     with pytest.raises(UserError, match="not a photo"):
         read_header(tmp_path / "a.jpg")
 
 
-def test_pillow_keeps_its_own_bound(tmp_path):
+def test_the_size_limit_of_pillow_is_not_changed(tmp_path):
     bound = Image.MAX_IMAGE_PIXELS
     read_header(save(tmp_path / "a.png"))
     assert bound == Image.MAX_IMAGE_PIXELS == 89_478_485

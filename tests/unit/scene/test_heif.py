@@ -24,7 +24,7 @@ def missing(monkeypatch):
     pillow._registered.cache_clear()
 
 
-def test_the_error_names_the_package(tmp_path, missing):
+def test_the_error_names_the_missing_package(tmp_path, missing):
     path = tmp_path / "IMG_1.HEIC"
     path.write_bytes(HEAD + bytes(100))
     with pytest.raises(UserError, match=r"IMG_1\.HEIC(?s:.*)pillow-heif") as caught:
@@ -32,12 +32,12 @@ def test_the_error_names_the_package(tmp_path, missing):
     assert "crossgrad[heic]" in caught.value.todo and "JPEG" in caught.value.todo
 
 
-def test_other_photos_do_not_need_it(tmp_path, missing):
+def test_other_photos_do_not_need_pillow_heif(tmp_path, missing):
     Image.new("RGB", (8, 6)).save(tmp_path / "a.heic", format="PNG")
     assert read_header(tmp_path / "a.heic").width == 8
 
 
-def test_photos_are_found_by_the_suffix(tmp_path):
+def test_heic_photos_are_found_by_their_suffix(tmp_path):
     (tmp_path / "IMG_1.HEIC").write_bytes(HEAD)
     folder = PhotoFolder(tmp_path)
     assert folder.names == ("IMG_1.HEIC",)
@@ -61,7 +61,7 @@ def test_photos_of_phones_are_read(photo):
     assert alpha is None and np.abs(rgb.astype(int) - ramp).max() <= 2
 
 
-def test_a_photo_that_is_cut_short_is_an_error(photo):
+def test_a_truncated_heic_photo_is_an_error(photo):
     path, _ = photo
     content = path.read_bytes()
     for length in (13, len(content) // 3, len(content) // 2, len(content) - 20):

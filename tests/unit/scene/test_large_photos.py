@@ -51,7 +51,7 @@ def small_limit(monkeypatch):
         ((65_000, 65_000), 20_000, 8),
     ],
 )
-def test_a_large_jpeg_is_reduced_as_far_as_the_wanted_size_allows(size, max_size, reduction):
+def test_a_large_jpeg_is_reduced_as_far_as_the_requested_size_allows(size, max_size, reduction):
     header = PhotoHeader(*size, False, False, reducible=True)
     assert choose_reduction("a.jpg", header, max_size) == reduction
     small = header.reduced(reduction)
@@ -62,7 +62,7 @@ def test_a_large_jpeg_is_reduced_as_far_as_the_wanted_size_allows(size, max_size
     ("reducible", "max_size", "way"),
     [(True, None, "--max-size 4000"), (False, None, "_2, _4 or _8"), (False, 4000, "--max-size N")],
 )
-def test_the_error_names_the_way_out(reducible, max_size, way):
+def test_the_error_about_a_large_photo_names_a_remedy(reducible, max_size, way):
     header = PhotoHeader(16_384, 12_288, False, False, reducible)
     with pytest.raises(UserError, match="too large") as caught:
         choose_reduction("a.jpg", header, max_size)
@@ -72,7 +72,7 @@ def test_the_error_names_the_way_out(reducible, max_size, way):
     assert way in caught.value.todo
 
 
-def test_a_scene_of_too_large_photos_asks_for_a_size(jpegs, small_limit):
+def test_a_scene_with_too_large_photos_requires_max_size(jpegs, small_limit):
     with pytest.raises(UserError, match=r"too large(?s:.*)\.jpg(?s:.*)--max-size"):
         read(jpegs)
 
@@ -90,7 +90,7 @@ def test_large_photos_are_trained_at_a_reduced_size(jpegs, small_limit, monkeypa
         assert np.abs(image - theirs.photo.image().numpy()).mean() < 4
 
 
-def test_a_smaller_copy_beside_the_photos_is_another_way_out(tmp_path, small_limit):
+def test_a_folder_of_smaller_copies_also_solves_too_large_photos(tmp_path, small_limit):
     scene = write_tiny_scene(tmp_path, views=4, width=192, height=128, suffix=".png")
     with pytest.raises(UserError, match="_2, _4 or _8"):
         read(scene, max_size=96)
@@ -110,7 +110,7 @@ def test_a_mask_may_be_smaller_than_its_photo(jpegs, tmp_path, small_limit):
         read(scene, max_size=90)
 
 
-def test_a_photo_that_grew_since_it_was_chosen_is_refused(jpegs, small_limit):
+def test_a_photo_that_grew_since_the_scan_is_refused(jpegs, small_limit):
     with pytest.raises(UserError, match=r"too large(?s:.*)changed"):
         decode_photo(jpegs / "images/0000.jpg")
 
@@ -132,7 +132,7 @@ def test_a_photo_of_200_megapixels_is_decoded_in_little_memory(tmp_path):
     assert peak_mebibytes() - before < 100
 
 
-def test_a_bomb_is_refused_before_memory_is_set_aside(tmp_path):
+def test_a_decompression_bomb_is_refused_before_memory_is_allocated(tmp_path):
     """400 megapixels of black in 49 kB."""
     width = height = 20_000
     header = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\1\0\0\0\0"
@@ -157,7 +157,7 @@ def test_a_bomb_is_refused_before_memory_is_set_aside(tmp_path):
 
 @pytest.mark.parametrize("height", [1, 6, 7, 8, 50])
 @pytest.mark.parametrize("mode", ["RGB", "L", "P", "CMYK"])
-def test_pixels_are_taken_over_band_by_band(height, mode, tmp_path, monkeypatch):
+def test_pixels_are_copied_in_bands(height, mode, tmp_path, monkeypatch):
     monkeypatch.setattr(decode, "_BAND", 7 * 3 * 23 + 5)  # Seven rows and a bit.
     noise = np.random.default_rng(height).integers(0, 256, (height, 23, 3), np.uint8)
     path = tmp_path / f"photo.{'tiff' if mode == 'CMYK' else 'png'}"

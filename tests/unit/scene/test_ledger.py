@@ -51,7 +51,7 @@ def test_a_plain_scene_has_no_unused_files(scene):
         ("input", "outside the photo folder images/"),
     ],
 )
-def test_folders_of_images_are_listed_with_the_reason(folder, reason, scene):
+def test_folders_of_images_are_listed_as_unused_with_the_reason(folder, reason, scene):
     copy(scene, folder)
     (note,) = unused(scene)
     assert note.startswith(f"unused: 3 files in {folder}/ (0000.png, 0001.png, 0002.png), ")
@@ -69,14 +69,14 @@ def test_folders_of_images_are_listed_with_the_reason(folder, reason, scene):
         ("maps/0001.exr", "depth and normal maps"),
     ],
 )
-def test_other_files_are_listed_with_the_reason(name, reason, scene):
+def test_other_files_are_listed_as_unused_with_the_reason(name, reason, scene):
     (scene / name).parent.mkdir(exist_ok=True)
     (scene / name).touch()
     (note,) = unused(scene)
     assert name.rpartition("/")[2] in note and reason in note
 
 
-def test_masks_of_no_photo_and_photos_without_a_mask_are_named(scene):
+def test_masks_without_a_photo_and_photos_without_a_mask_are_named(scene):
     copy(scene, "masks")
     (scene / "masks" / "0001.png").rename(scene / "masks" / "other.png")
     notes = read(scene).notes
@@ -84,7 +84,7 @@ def test_masks_of_no_photo_and_photos_without_a_mask_are_named(scene):
     assert "unused: 1 file in masks/ (other.png), masks of no photo that is used" in notes
 
 
-def test_what_is_used_is_not_listed(scene):
+def test_used_files_are_not_listed_as_unused(scene):
     copy(scene, "seg")
     assert unused(scene, masks=scene / "seg") == []
     (scene / "images").rename(scene / "photos")
@@ -95,7 +95,7 @@ def test_what_is_used_is_not_listed(scene):
     assert unused(scene, masks=scene / "seg", init=str(scene / "start.ply")) == []
 
 
-def test_full_size_photos_are_used_where_smaller_copies_are_read(master, tmp_path):
+def test_full_size_photos_are_not_listed_as_unused_if_smaller_copies_are_read(master, tmp_path):
     path = write_tiny_scene(tmp_path / "scene", views=3, width=96, height=64, points=20)
     shutil.copytree(master / "images", path / "images_4")
     scene = read(path, max_size=24)
@@ -103,14 +103,14 @@ def test_full_size_photos_are_used_where_smaller_copies_are_read(master, tmp_pat
     assert not [note for note in scene.notes if note.startswith("unused")]
 
 
-def test_folders_of_runs_are_passed_over(scene):
+def test_run_folders_are_not_listed_as_unused(scene):
     copy(scene, "run/panels")
     assert len(unused(scene)) == 1
     (scene / "run" / "config.yaml").touch()
     assert unused(scene) == []
 
 
-def test_many_folders_take_few_lines(scene):
+def test_many_unused_folders_give_few_lines(scene):
     for number in range(20):
         copy(scene, f"extra{number:02d}")
     notes = unused(scene)

@@ -93,7 +93,7 @@ def test_ordinary_lenses_lose_no_pixel_and_keep_the_frame_of_pycolmap(
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_each_counted_pixel_of_any_lens_is_the_first_to_show_its_place(seed: int) -> None:
+def test_counted_pixels_increase_monotonically_from_the_centre_for_any_lens(seed: int) -> None:
     rng = np.random.default_rng(seed)
     extra = (rng.uniform(-0.6, 0.3), rng.uniform(-0.2, 0.2), *rng.uniform(-0.04, 0.04, 2))
     calibration = lens(("OPENCV", "OPENCV_FISHEYE")[seed % 2], (100, 105), extra)
@@ -119,7 +119,7 @@ def test_tangential_terms_alone_can_fold() -> None:
     assert right.sum() <= 60 / (6 * 0.15)
 
 
-def test_a_fisheye_of_190_degrees_says_what_undistortion_loses() -> None:
+def test_the_loss_of_undistortion_is_reported_for_a_fisheye_of_190_degrees() -> None:
     calibration = lens("OPENCV_FISHEYE", (48, 48), (0.0, 0.0, 0.0, 0.0))
     cost = calibration.cost
     assert cost is not None
@@ -150,7 +150,7 @@ def test_lenses_of_180_degrees_and_more_do_not_shrink_to_a_few_pixels(
     assert (frame.width, frame.height) == (WIDTH, HEIGHT)
 
 
-def test_a_decoded_photo_masks_what_lies_beyond_the_fold_and_a_note_counts_it(
+def test_a_decoded_photo_is_masked_beyond_the_fold_and_a_note_counts_the_pixels(
     tmp_path: Path,
 ) -> None:
     calibration = lens("SIMPLE_RADIAL", (110,), (-0.35,))

@@ -24,16 +24,16 @@ def found(folder, masks, *photos):
         *("p0_seg.tif", "alpha p0.png"),
     ],
 )
-def test_a_mask_may_differ_in_suffix_case_folder_and_a_word_for_masks(mask, tmp_path):
+def test_a_mask_name_may_differ_in_suffix_case_folder_and_mask_word(mask, tmp_path):
     assert found(tmp_path, [mask], "p0.png", "p1.png") == {"p0.png": mask}
 
 
 @pytest.mark.parametrize("mask", ["segmentation_of_p0.png", "p00.png", "mask.png", "p0.5.png"])
-def test_other_names_are_masks_of_no_photo(mask, tmp_path):
+def test_other_names_do_not_match_a_photo(mask, tmp_path):
     assert not found(tmp_path, [mask], "p0.png")
 
 
-def test_the_mask_of_another_photo_is_not_taken(tmp_path):
+def test_the_mask_of_another_photo_is_not_used(tmp_path):
     masks = ["p0_mask.png", "p0.png"]
     assert found(tmp_path, masks, "p0.png", "p0_mask.jpg") == {
         "p0.png": "p0.png",
@@ -42,11 +42,11 @@ def test_the_mask_of_another_photo_is_not_taken(tmp_path):
 
 
 @pytest.mark.parametrize("masks", [["mask_p0.png", "p0_seg.png"], ["p0.jpg", "p0.bmp"]])
-def test_of_two_masks_that_could_be_meant_none_is(masks, tmp_path):
+def test_two_possible_masks_give_no_mask(masks, tmp_path):
     assert not found(tmp_path, masks, "p0.png")
 
 
-def test_one_mask_does_not_stand_for_photos_of_two_folders(tmp_path):
+def test_one_mask_is_not_used_for_photos_of_two_folders(tmp_path):
     assert not found(tmp_path, ["p0.png"], "cam0/p0.png", "cam1/p0.png")
     assert found(tmp_path, ["p1.png"], "cam0/p2.png", "cam1/p1.png") == {"cam1/p1.png": "p1.png"}
 
@@ -57,7 +57,7 @@ def test_the_default_folder_may_be_written_in_capitals(tmp_path):
     assert find_mask_folder(None, tmp_path) == tmp_path / "Masks"
 
 
-def test_masks_of_no_photo_are_refused_and_an_empty_default_folder_is_not(tmp_path):
+def test_a_mask_folder_without_matches_is_refused_unless_it_is_the_empty_default(tmp_path):
     check_masks(tmp_path, None, 0, ["p0.png"])
     with pytest.raises(UserError, match="no photo has a mask"):
         check_masks(tmp_path, Path("masks"), 0, ["p0.png"])

@@ -45,7 +45,7 @@ def write_colors(path, values):
 
 
 @pytest.mark.parametrize("white", [255, 1023, 4095, 16383])
-def test_fewer_bits_are_found_by_the_brightest_photo_of_all(white, tmp_path):
+def test_the_brightest_photo_determines_the_number_of_bits(white, tmp_path):
     photos = [write(tmp_path / f"{i}.tif", white, scale) for i, scale in enumerate((0.1, 1, 0.5))]
     found, (note,) = white_of(photos)
     assert found == white
@@ -55,13 +55,13 @@ def test_fewer_bits_are_found_by_the_brightest_photo_of_all(white, tmp_path):
     assert rgb.shape == (40, 60, 3) and alpha is None
 
 
-def test_photos_of_16_bits_are_left_alone(tmp_path):
+def test_photos_with_16_bits_are_not_rescaled(tmp_path):
     assert white_of([write(tmp_path / "a.png", 65535, 0.5)]) == (65535, [])
     assert white_of([]) == (65535, [])
 
 
 @pytest.mark.parametrize("top", [0.0005, 0.03, 0.1, 0.15])
-def test_dark_photos_of_16_bits_stay_dark_and_a_note_says_so(top, tmp_path):
+def test_dark_16_bit_photos_are_kept_dark_with_a_note(top, tmp_path):
     white, (note,) = white_of([write(tmp_path / "a.png", 65535, top)])
     assert white == 65535
     (share,) = re.findall(r"use ([\d.]+) % of their range", note)
@@ -69,7 +69,7 @@ def test_dark_photos_of_16_bits_stay_dark_and_a_note_says_so(top, tmp_path):
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_colours_keep_all_their_bits(channels, tmp_path):
+def test_colour_photos_keep_all_their_bits(channels, tmp_path):
     values = np.random.default_rng(0).integers(0, 4096, (5, 7, channels)).astype(np.uint16)
     values[..., 3:] = 65535
     path = write_colors(tmp_path / "a.png", values)
@@ -79,7 +79,7 @@ def test_colours_keep_all_their_bits(channels, tmp_path):
     assert (alpha is None) == (channels == 3)
 
 
-def test_a_scene_is_trained_in_the_brightness_of_its_bits(tmp_path):
+def test_a_scene_of_12_bit_photos_is_read_at_the_right_brightness(tmp_path):
     path = write_tiny_scene(tmp_path, views=3, width=24, height=16, points=20, suffix=".tif")
     before = [float(view.photo.image().float().mean()) for view in read(path).views]
     for photo in (path / "images").iterdir():

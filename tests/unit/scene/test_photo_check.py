@@ -34,7 +34,7 @@ def read(folder):
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_whole_photos_pass(folder, keep):
+def test_complete_photos_pass_the_check(folder, keep):
     scene = read(folder)
     check_photos(scene.test_views, keep=keep)
     assert (scene.views[0].photo.cache.used > 0) is keep
@@ -52,7 +52,7 @@ def test_every_held_out_photo_that_cannot_be_decoded_is_named(folder, keep):
         check_photos(scene.test_views, keep=keep)
 
 
-def test_masks_are_decoded_too(folder):
+def test_masks_are_decoded_by_the_check(folder):
     (folder / "masks").mkdir()
     mask = folder / "masks" / "0000.png"
     mask.write_bytes((folder / "images" / "0000.png").read_bytes())
@@ -62,7 +62,7 @@ def test_masks_are_decoded_too(folder):
         check_photos(scene.test_views, keep=False)
 
 
-def test_room_is_that_of_all_decoded_photos():
+def test_the_required_memory_is_that_of_all_decoded_photos():
     scene = sample_scene()
     large = [replace(v, camera=v.camera.resized(1024, 1024)) for v in scene.views]
     scene = replace(scene, views=tuple(large))
@@ -71,7 +71,7 @@ def test_room_is_that_of_all_decoded_photos():
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_a_training_photo_is_reported_from_the_background(folder, keep):
+def test_a_broken_training_photo_is_reported_by_the_background_check(folder, keep):
     scene, found, told = read(folder), [], Event()
     rotten(folder / "images" / "0005.png")
 
@@ -99,7 +99,7 @@ class Slow:
         return None
 
 
-def test_the_background_ends_with_the_block():
+def test_the_background_check_ends_with_its_block():
     gate = Event()
     views = [replace(view, photo=Slow(gate)) for view in sample_scene().train_views]
     with PhotosAhead().at_work(views, pytest.fail, keep=False):
@@ -110,7 +110,7 @@ def test_the_background_ends_with_the_block():
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ValueError("odd")])
-def test_want_of_memory_beside_training_is_left_to_training(error):
+def test_a_memory_error_of_the_background_check_is_ignored(error):
     class Broken:
         def image(self):
             asked.set()

@@ -73,14 +73,14 @@ def test_a_photo_is_decoded_once_for_all_runs(folder, masked):
     assert entry.stat().st_size == (MASKED_BYTES if masked else BYTES)
 
 
-def test_photos_that_decode_quickly_are_not_kept(store, folder):
+def test_photos_that_decode_quickly_are_not_stored(store, folder):
     source = large(1, origin=None)
     assert store.holds(source) is None
     store.decoded(source)
     assert not folder.exists()
 
 
-def test_another_origin_is_another_photo(store, folder):
+def test_a_changed_origin_counts_as_another_photo(store, folder):
     for number in range(4):
         source = large(1, origin=f"size {number}")
         assert store.holds(source) is False
@@ -89,7 +89,7 @@ def test_another_origin_is_another_photo(store, folder):
     assert len(files(folder)) == 4
 
 
-def test_no_damaged_entry_is_trusted(store, folder):
+def test_a_damaged_entry_is_not_used(store, folder):
     """Any byte changed, any length but the right one: decoded and kept again."""
     source, rng = large(3), np.random.default_rng(0)
     whole = store.decoded(source)
@@ -113,7 +113,9 @@ def test_no_damaged_entry_is_trusted(store, folder):
         assert entry.read_bytes() == good
 
 
-def test_an_entry_is_summed_again_only_where_others_used_it(store, folder, monkeypatch):
+def test_the_checksum_of_an_entry_is_verified_again_only_after_other_use(
+    store, folder, monkeypatch
+):
     source, sums = large(3), []
     whole = store.decoded(source)
     monkeypatch.setattr(photo_store, "crc32", lambda data: sums.append(0) or zlib.crc32(data))
@@ -125,14 +127,14 @@ def test_an_entry_is_summed_again_only_where_others_used_it(store, folder, monke
     assert len(sums) == 2
 
 
-def test_an_entry_of_another_size_does_not_count(store, folder):
+def test_an_entry_of_another_size_is_not_used(store, folder):
     store.decoded(large(1))
     other = large(1, target=(HEIGHT - 1, WIDTH))
     store.decoded(other)
     assert len(other.decoded) == 1
 
 
-def test_unused_entries_are_evicted_first_and_used_entries_stay(folder):
+def test_unused_entries_are_evicted_first_and_used_entries_are_kept(folder):
     store = PhotoStore(folder, 1)
     store._limit = 4 * MASKED_BYTES
     for number in range(4):
@@ -154,7 +156,7 @@ def test_unused_entries_are_evicted_first_and_used_entries_stay(folder):
     assert same(later.decoded(again), large(0).decode()) and not again.decoded
 
 
-def test_leftovers_of_killed_processes_are_cleared(store, folder):
+def test_temporary_files_of_killed_processes_are_deleted(store, folder):
     folder.mkdir(parents=True)
     old, new = folder / "a.1.0.tmp", folder / "b.1.0.tmp"
     for path in (old, new):
@@ -174,7 +176,7 @@ def no_rights(*_args, **_kwargs):
 
 @pytest.mark.parametrize("error", [full, no_rights])
 @pytest.mark.parametrize("where", ["mkdir", "open", "replace"])
-def test_a_disk_that_takes_nothing_costs_nothing(store, folder, monkeypatch, error, where):
+def test_a_disk_without_write_access_causes_no_error(store, folder, monkeypatch, error, where):
     source = large(1)
     with monkeypatch.context() as patch:
         if where == "open":
@@ -187,7 +189,7 @@ def test_a_disk_that_takes_nothing_costs_nothing(store, folder, monkeypatch, err
     assert not folder.exists() or not files(folder)
 
 
-def test_the_last_bytes_of_a_disk_are_left(store, folder, monkeypatch):
+def test_a_reserve_of_free_disk_space_is_kept(store, folder, monkeypatch):
     usage = shutil.disk_usage(folder.anchor)
     monkeypatch.setattr(
         photo_store.shutil, "disk_usage", lambda _: usage._replace(free=photo_store.RESERVE + 10)
@@ -196,7 +198,7 @@ def test_the_last_bytes_of_a_disk_are_left(store, folder, monkeypatch):
     assert files(folder) == []
 
 
-def test_threads_and_runs_share_a_folder(folder):
+def test_threads_and_runs_can_share_a_folder(folder):
     stores = [PhotoStore(folder, 16) for _ in range(3)]
     sources = [large(number) for number in range(12)]
     wanted = [source.decode() for source in sources]
@@ -218,7 +220,7 @@ def test_threads_and_runs_share_a_folder(folder):
     assert len(files(folder)) == 12 and all(path.suffix == ".photo" for path in files(folder))
 
 
-def test_memory_comes_before_the_disk_and_the_disk_before_the_file(store):
+def test_memory_is_used_before_the_disk_and_the_disk_before_the_file(store):
     source, cache = large(1), PhotoCache(16, store)
     assert cache.prepare(source) and cache.prepare(source)
     assert cache.used == 0 and len(source.decoded) == 1
@@ -235,7 +237,7 @@ def test_memory_comes_before_the_disk_and_the_disk_before_the_file(store):
         ({"XDG_CACHE_HOME": "/b"}, "/b/crossgrad/photos"),
     ],
 )
-def test_the_folder_is_the_user_s(monkeypatch, variables, place):
+def test_the_cache_folder_belongs_to_the_user(monkeypatch, variables, place):
     monkeypatch.delenv("CROSSGRAD_CACHE", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)

@@ -45,7 +45,7 @@ def test_a_plain_photo_has_no_mask(source):
     assert photo.image() is photo.image()
 
 
-def test_a_mask_of_half_the_size_is_spread_over_the_photo(source, tmp_path):
+def test_a_mask_of_half_the_size_is_enlarged_to_the_photo(source, tmp_path):
     mask = np.zeros((20, 30), dtype=np.uint8)
     mask[:, :10] = 255
     _, keep = replace(source, mask=save_mask(tmp_path, mask)).decode()
@@ -54,7 +54,7 @@ def test_a_mask_of_half_the_size_is_spread_over_the_photo(source, tmp_path):
     assert not keep[:, 20:].any()
 
 
-def test_a_white_mask_is_none(source, tmp_path):
+def test_a_white_mask_counts_as_no_mask(source, tmp_path):
     mask = save_mask(tmp_path, np.full((40, 60), 255, dtype=np.uint8))
     assert replace(source, mask=mask).decode()[1] is None
 
@@ -68,7 +68,7 @@ def test_mask_and_photo_are_resized_together(source, tmp_path):
     assert keep[10:].all()
 
 
-def test_alpha_masks_or_is_blended(source):
+def test_alpha_is_a_mask_or_is_blended(source):
     alpha = np.full((40, 60), 255, dtype=np.uint8)
     alpha[:, :30] = 127
     Image.fromarray(np.dstack([RGB, alpha])).save(source.path)
@@ -98,7 +98,7 @@ def test_a_photo_and_its_mask_are_turned_upright(source, tmp_path):
     assert keep.nonzero().tolist() == [[7, 34]]
 
 
-def test_a_mask_of_the_stored_photo_is_turned_in_any_size(source, tmp_path):
+def test_a_mask_of_the_stored_photo_is_turned_at_any_size(source, tmp_path):
     mask = np.zeros((20, 30), dtype=np.uint8)
     mask[:, :15] = 255  # The left half, which comes to lie above.
     turned = replace(
@@ -120,7 +120,7 @@ def test_a_mask_of_the_stored_photo_is_turned_in_any_size(source, tmp_path):
         ((50, 50), None),
     ],
 )
-def test_masks_in_the_proportion_of_the_photo_or_of_the_turned_one(mask, turned):
+def test_a_mask_is_turned_if_its_shape_matches_the_turned_photo(mask, turned):
     assert is_turned(mask, (60, 40)) is turned
     assert is_turned((50, 50), (50, 50)) is False
     # Exact sizes tell first.
@@ -143,7 +143,7 @@ def test_masks_are_undistorted_with_the_photo(source, tmp_path):
     assert torch.equal(keep, image[..., 0] >= 128)
 
 
-def test_pixels_that_the_photo_does_not_reach_do_not_count(source):
+def test_pixels_outside_the_undistorted_photo_do_not_count(source):
     Image.new("RGB", (60, 40), "white").save(source.path)
     off_centre = Calibration("SIMPLE_RADIAL", 60, 40, (60.0, 0.0, 20.0, -0.1))
     frame = off_centre.pinhole
@@ -154,13 +154,13 @@ def test_pixels_that_the_photo_does_not_reach_do_not_count(source):
     assert image[keep].min() == 255
 
 
-def test_a_photo_that_changed_its_size_is_refused(source):
+def test_a_photo_with_a_changed_size_is_refused(source):
     Image.fromarray(RGB[:20]).save(source.path)
     with pytest.raises(UserError, match=r"has changed(?s:.*)60 x 40(?s:.*)60 x 20"):
         source.decode()
 
 
-def test_large_photos_that_are_changed_say_what_they_come_from(source, tmp_path):
+def test_the_origin_of_a_large_processed_photo_identifies_its_file(source, tmp_path):
     large = replace(source, width=2000, height=1500, target=(200, 150))
     assert source.origin is None
     assert replace(large, target=(2000, 1500)).origin is None
@@ -205,13 +205,13 @@ def small_cache():
     return cache
 
 
-def test_the_cache_keeps_to_its_limit(small_cache):
+def test_the_cache_stays_within_its_limit(small_cache):
     for size in [1000] * 70 + [30_000, 60_000, 10]:
         small_cache.get(Counting(size))
         assert small_cache.used <= max(50_000, size)
 
 
-def test_a_walk_over_twice_the_memory_finds_a_good_part(small_cache):
+def test_a_walk_over_twice_the_memory_reaches_a_good_hit_rate(small_cache):
     sources = [Counting() for _ in range(100)]
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -221,7 +221,7 @@ def test_a_walk_over_twice_the_memory_finds_a_good_part(small_cache):
     assert 100 <= decoded <= 700
 
 
-def test_the_photos_of_one_step_are_decoded_once(small_cache):
+def test_photos_of_one_step_are_decoded_once(small_cache):
     for _ in range(60):
         small_cache.get(Counting())
     step = [Counting() for _ in range(8)]
@@ -230,7 +230,7 @@ def test_the_photos_of_one_step_are_decoded_once(small_cache):
     assert [source.decoded for source in step] == [1] * 8
 
 
-def test_threads_share_the_cache(small_cache):
+def test_threads_can_share_the_cache(small_cache):
     sources = [Counting() for _ in range(30)]
     errors = []
 

@@ -82,7 +82,7 @@ def test_decoding_ahead_ends_once_all_photos_are_in_memory(log):
     assert sorted(log) == list(range(5))
 
 
-def test_without_the_memory_photos_are_tried_and_the_expected_ones_decoded(log):
+def test_expected_photos_are_decoded_even_if_memory_cannot_hold_all_photos(log):
     sources = [Source(number, log) for number in range(3)]
     views, ahead = views_of(sources), PhotosAhead()
     with ahead.at_work(views, pytest.fail, keep=False):
@@ -95,7 +95,7 @@ def test_without_the_memory_photos_are_tried_and_the_expected_ones_decoded(log):
     assert not ahead.useful
 
 
-def test_no_more_is_expected_than_the_memory_holds_twice(log):
+def test_at_most_twice_the_memory_is_expected_ahead(log):
     sources = [Source(number, log) for number in range(8)]
     views, ahead = views_of(sources, limit=6500), PhotosAhead()
     with ahead.at_work([], pytest.fail, keep=False):
@@ -105,7 +105,7 @@ def test_no_more_is_expected_than_the_memory_holds_twice(log):
     assert sorted(log) == [0, 1, 2]
 
 
-def test_an_expected_photo_that_cannot_be_decoded_is_left_to_who_asks(log):
+def test_an_error_in_decoding_ahead_is_raised_at_the_request(log):
     source = Source(1, log, error=OSError("broken"))
     (view,), ahead = views_of([source]), PhotosAhead()
     with ahead.at_work([], pytest.fail, keep=False):
@@ -115,7 +115,7 @@ def test_an_expected_photo_that_cannot_be_decoded_is_left_to_who_asks(log):
         view.photo.image()
 
 
-def test_a_photo_under_way_is_waited_for_not_decoded_twice(log):
+def test_a_photo_being_decoded_is_awaited_and_not_decoded_twice(log):
     gate = Event()
     source = Source(7, log, gate)
     (view,), ahead = views_of([source]), PhotosAhead()
@@ -128,7 +128,7 @@ def test_a_photo_under_way_is_waited_for_not_decoded_twice(log):
     assert log == [7]
 
 
-def test_a_thread_that_gets_nowhere_is_not_waited_for(log, monkeypatch):
+def test_a_blocked_decoding_thread_is_not_awaited(log, monkeypatch):
     monkeypatch.setattr(photos, "_PATIENCE", 0.05)
     gate = Event()
     source = Source(7, log, gate)
@@ -157,7 +157,7 @@ def test_expected_photos_are_dropped_last(log):
     assert cache.holds(sources[0]) and cache.holds(sources[1]) and not cache.holds(sources[2])
 
 
-def test_decoding_takes_processor_time_that_is_not_training_s(log):
+def test_cpu_time_of_decoding_ahead_is_reported_separately(log):
     class Busy(Source):
         def decode(self):
             while self.spent() < 0.05:

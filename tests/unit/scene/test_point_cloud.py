@@ -63,7 +63,7 @@ def write_ply(path, xyz=XYZ, rgb=RGB, *, kind="double", color="uchar", form="asc
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", ["float", "double"])
 @pytest.mark.parametrize("color", ["uchar", "ushort", "float"])
-def test_plys_of_all_kinds_have_the_same_points(form, kind, color, tmp_path):
+def test_plys_of_all_formats_give_the_same_points(form, kind, color, tmp_path):
     cloud = read_cloud(
         write_ply(tmp_path / "a.ply", kind=kind, color=color, form=form, faces=True), "a.ply"
     )
@@ -71,7 +71,7 @@ def test_plys_of_all_kinds_have_the_same_points(form, kind, color, tmp_path):
     np.testing.assert_array_equal(cloud.colors, RGB)
 
 
-def test_whole_numbers_as_positions_and_points_without_colors_are_read(tmp_path):
+def test_integer_positions_and_points_without_colors_are_read(tmp_path):
     path = write_ply(tmp_path / "a.ply", 8 * XYZ, kind="int", color=None)
     cloud = read_cloud(path, "a.ply")
     np.testing.assert_array_equal(cloud.positions, 8 * XYZ)
@@ -79,7 +79,7 @@ def test_whole_numbers_as_positions_and_points_without_colors_are_read(tmp_path)
 
 
 @pytest.mark.parametrize("place", ["absolute", "within the scene"])
-def test_the_points_option_takes_the_place_of_the_readers_points(place, scene):
+def test_the_points_option_replaces_the_points_of_the_reader(place, scene):
     write_ply(scene / "scan" / "cloud.ply")
     option = scene / "scan" / "cloud.ply" if place == "absolute" else Path("scan/cloud.ply")
     found = read(scene, points=option)
@@ -106,7 +106,7 @@ def test_coordinates_far_from_zero_keep_their_digits(scene):
 
 @pytest.mark.parametrize("place", ["sparse/0/points3D.ply", "sparse/sparse_pc.ply", "points.ply"])
 @pytest.mark.parametrize("lacks", ["the file", "any point"])
-def test_a_ply_beside_a_colmap_model_without_points_is_read(place, lacks, scene):
+def test_a_ply_next_to_a_colmap_model_without_points_is_read(place, lacks, scene):
     file = scene / "sparse" / "0" / "points3D.bin"
     if lacks == "the file":
         file.unlink()
@@ -118,7 +118,7 @@ def test_a_ply_beside_a_colmap_model_without_points_is_read(place, lacks, scene)
     assert any(f"4 points from {place}" in note for note in found.notes)
 
 
-def test_points_of_the_model_come_before_a_ply_beside_it(scene):
+def test_points_of_the_model_have_priority_over_a_ply_in_its_folder(scene):
     before = read(scene)
     write_ply(scene / "sparse" / "0" / "points3D.ply")
     np.testing.assert_array_equal(read(scene).points, before.points)
@@ -139,7 +139,7 @@ def test_a_missing_file_is_named(scene):
         read(scene, points=Path("gone.ply"))
 
 
-def test_gaussians_as_points_and_points_as_gaussians_name_the_other_option(scene):
+def test_swapped_options_for_points_and_gaussians_are_refused_with_the_right_option(scene):
     cloud = write_ply(scene / "cloud.ply")
     with pytest.raises(UserError, match=r"--points \S+cloud\.ply"):
         Ply().sh_degree_of(cloud)
@@ -173,7 +173,7 @@ def test_a_dense_cloud_is_thinned_evenly_with_a_note(scene):
 
 
 @pytest.mark.parametrize("odd", ["one place", "a stray point", "a line"])
-def test_thinning_copes_with_odd_clouds(odd):
+def test_thinning_handles_degenerate_clouds(odd):
     xyz = np.random.default_rng(1).normal(size=(5000, 3))
     if odd == "one place":
         xyz[:] = 7.0
@@ -203,7 +203,7 @@ def test_las_and_laz_are_read_with_scale_offset_and_16_bit_colors(suffix, tmp_pa
     np.testing.assert_array_equal(cloud.colors, RGB)
 
 
-def test_a_las_file_without_colors_is_grey_and_a_damaged_one_is_an_error(tmp_path):
+def test_a_las_file_without_colors_is_grey_and_a_damaged_file_is_an_error(tmp_path):
     laspy = pytest.importorskip("laspy")
     path = write_las(laspy, tmp_path / "scan.las", XYZ, None)
     assert (read_cloud(path, "scan.las").colors == 127).all()
@@ -214,7 +214,7 @@ def test_a_las_file_without_colors_is_grey_and_a_damaged_one_is_an_error(tmp_pat
             read_las(path)
 
 
-def test_of_a_huge_las_file_every_nth_point_is_read(tmp_path, monkeypatch):
+def test_every_nth_point_of_a_huge_las_file_is_read(tmp_path, monkeypatch):
     laspy = pytest.importorskip("laspy")
     xyz = np.arange(300.0).reshape(100, 3)
     path = write_las(laspy, tmp_path / "scan.las", xyz, None)
@@ -224,7 +224,7 @@ def test_of_a_huge_las_file_every_nth_point_is_read(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("package", ["laspy", "lazrs"])
-def test_without_laspy_the_error_names_the_extra(package, tmp_path, monkeypatch):
+def test_the_error_without_laspy_names_the_extra(package, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     if package == "lazrs":
         pytest.importorskip("laspy")

@@ -35,7 +35,7 @@ def points():
     return PointCloud(positions, np.zeros((200, 3), np.uint8), "points.ply")
 
 
-def test_points_that_photos_show_are_taken(points):
+def test_points_visible_in_photos_are_accepted(points):
     check_seen(points, views(lambda pose: pose), "poses.json")
 
 
@@ -48,13 +48,13 @@ def test_points_that_photos_show_are_taken(points):
         (lambda pose: FLIP @ np.linalg.inv(pose), "inverse"),
     ],
 )
-def test_a_mistake_in_the_poses_is_named(points, change, cause):
+def test_a_known_mistake_in_the_poses_is_named(points, change, cause):
     with pytest.raises(UserError, match="the points lie in no photo") as caught:
         check_seen(points, views(change), "poses.json")
     assert cause in caught.value.what and "correct the poses" in caught.value.todo
 
 
-def test_points_in_another_frame_are_told_from_mistakes_in_the_poses(points):
+def test_points_in_another_frame_are_distinguished_from_mistakes_in_the_poses(points):
     far = PointCloud(points.positions + 1000.0, points.colors, points.source)
     with pytest.raises(UserError, match="another frame than the cameras"):
         check_seen(far, views(lambda pose: pose), "poses.json")

@@ -16,7 +16,7 @@ print("saved")
 """
 
 
-def test_signals_and_png_files_work_as_before(tmp_path):
+def test_importing_pycolmap_changes_neither_signals_nor_png_files(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(tmp_path / "a.png")],
         capture_output=True,

@@ -34,23 +34,23 @@ def refused(check, *words):
     "name", ["", ".", "..", "/a.jpg", "../a.jpg", "x/../a.jpg", "\udcff.jpg", "a\n.jpg",
              "\x1b[2J.jpg", "a" * 256, "ä" * 128, "a\0.jpg", "a/" * 600 + "b.jpg", "C:/a.jpg"],
 )  # fmt: skip
-def test_names_that_are_no_paths_below_the_photos_are_refused(name):
+def test_image_names_outside_the_photo_folder_are_refused(name):
     refused(lambda: check_views(raw(("b.jpg", name))), "an image name")
 
 
 @pytest.mark.parametrize(
     "name", ["größe.jpg", "写真\u3000一.jpg", "a b.jpg", "x/y/z.jpg", "..a.jpg"]
 )
-def test_names_of_any_language_pass(name):
+def test_names_in_any_language_are_accepted(name):
     check_views(raw(("b.jpg", name)))
 
 
-def test_two_spellings_of_one_path_are_one_name():
+def test_two_spellings_of_one_path_count_as_one_name():
     refused(lambda: check_views(raw(("x/a.jpg", "x//a.jpg"))), "several poses", "x/a.jpg")
 
 
 @pytest.mark.parametrize("shift", [np.nan, np.inf, 1e31, -1e300])
-def test_positions_that_cannot_be_squared_are_refused(shift):
+def test_positions_whose_square_overflows_are_refused(shift):
     refused(lambda: check_views(raw(shifts=((0, 0, 0), (0, shift, 0)))), "not finite")
 
 
@@ -69,7 +69,7 @@ def test_cameras_beyond_single_precision_are_refused(size, params, words):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-def test_points_that_are_not_finite_are_left_out(value):
+def test_non_finite_points_are_left_out(value):
     points = POINTS.copy()
     points[1, 2] = value
     checked, notes = check_points(raw(points=points))
@@ -96,6 +96,6 @@ def test_a_camera_too_far_for_single_precision_is_refused():
     refused(lambda: check_distances(scene, checked, frame), "too far", "b.jpg")
 
 
-def test_cameras_whose_distance_has_no_inverse_stand_in_one_place():
+def test_cameras_at_nearly_equal_positions_keep_a_finite_scale():
     frame = make_frame(np.array([[0.0, 0, 0], [1e-310, 0, 0]]), np.zeros((0, 3)))
     assert frame.similarity.scale == 1.0

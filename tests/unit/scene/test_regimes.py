@@ -33,17 +33,17 @@ def plane(count=50):
         (["all/x/a.jpg", "all/y/a.jpg", "all/c.jpg"], ("x", "y", "images")),
     ],
 )
-def test_label_by_folder(names, labels):
+def test_labels_are_taken_from_folder_names(names, labels):
     assert label_by_folder(names) == labels
 
 
-def test_near_is_at_most_the_median_footprint_of_the_training_views():
+def test_views_up_to_the_median_footprint_of_the_training_views_are_near():
     cameras = [camera(h) for h in (1.0, 2.0, 3.0, 9.0)]
     seen = [np.arange(50)] * 4
     assert label_by_footprint(cameras, seen, plane(), [0, 1, 3]) == ("near", "near", "far", "far")
 
 
-def test_a_long_lens_far_away_is_near():
+def test_a_distant_view_with_a_long_lens_is_near():
     cameras = [camera(2.0, 100.0), camera(8.0, 800.0)]
     assert label_by_footprint(cameras, [np.arange(50)] * 2, plane(), [0, 1]) == ("far", "near")
 
@@ -56,7 +56,7 @@ def test_a_view_without_observations_uses_the_points_in_its_frustum():
     assert label_by_footprint(cameras, seen, points, [0, 1]) == ("near", "far", "near", "far")
 
 
-def test_a_view_that_sees_nothing_takes_the_label_of_the_nearest_camera():
+def test_a_view_without_visible_points_gets_the_label_of_the_nearest_camera():
     away = camera(8.5)
     away.world_to_camera[1:3] *= -1
     cameras = [camera(1.0), camera(9.0), away]
@@ -64,6 +64,6 @@ def test_a_view_that_sees_nothing_takes_the_label_of_the_nearest_camera():
     assert label_by_footprint(cameras, seen, plane(), [0, 1]) == ("near", "far", "far")
 
 
-def test_without_points_there_is_one_regime():
+def test_a_scene_without_points_has_one_regime():
     cameras = [camera(1.0), camera(9.0)]
     assert label_by_footprint(cameras, [NONE] * 2, np.zeros((0, 3)), [0, 1]) == ("all", "all")

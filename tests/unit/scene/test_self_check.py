@@ -73,20 +73,22 @@ def causes(verdict):
 
 
 @pytest.mark.parametrize("tracks", [True, False])
-def test_a_right_scene_agrees(model, tracks):
+def test_a_correct_scene_agrees(model, tracks):
     verdict = found(model if tracks else without_tracks(model))
     assert not causes(verdict)
     assert verdict.correlation > 0.8
     assert verdict.compared == 16
 
 
-def test_the_search_has_these_kinds(contradictions):
+def test_the_search_covers_all_kinds_of_contradictions(contradictions):
     assert tuple(contradictions.KINDS) == KINDS
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 2, 4])
-def test_each_kind_is_reported_with_its_cause_or_its_photos(contradictions, model, kind, seed):
+def test_each_kind_of_contradiction_is_reported_with_cause_or_photos(
+    contradictions, model, kind, seed
+):
     wrong = contradictions.KINDS[kind](model, np.random.default_rng(seed))
     verdict = found(wrong.model)
     if wrong.views:
@@ -105,7 +107,7 @@ def test_the_cause_is_found_without_tracks(contradictions, model, kind):
 
 
 @pytest.mark.parametrize("axis", [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-def test_a_turned_camera_without_tracks_is_named(model, axis):
+def test_a_rotated_camera_without_tracks_is_named(model, axis):
     rotations = model.rotations.copy()
     rotations[5] = (
         Rotation.from_rotvec(np.radians(170.0) * np.array(axis)).as_matrix() @ rotations[5]
@@ -125,12 +127,14 @@ def test_the_cause_is_found_if_the_colours_of_the_points_are_noisy(contradiction
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_light_noise_jpeg_and_another_frame_are_no_contradiction(contradictions, model, seed):
+def test_illumination_noise_jpeg_and_another_frame_are_no_contradiction(
+    contradictions, model, seed
+):
     rng = np.random.default_rng(seed)
     assert not causes(found(contradictions.harmless(contradictions.varied(model, rng), rng)))
 
 
-def test_points_of_one_colour_are_compared_by_the_other_photos_of_their_tracks(model):
+def test_points_of_one_colour_are_compared_between_the_photos_of_their_tracks(model):
     grey = replace(model, colors=np.full_like(model.colors, 128))
     verdict = found(grey)
     assert verdict.compared == 16
@@ -139,13 +143,13 @@ def test_points_of_one_colour_are_compared_by_the_other_photos_of_their_tracks(m
 
 
 @pytest.mark.parametrize("tracks", [True, False])
-def test_nothing_is_said_about_points_of_random_colours(model, tracks):
+def test_points_of_random_colours_give_no_warning(model, tracks):
     colors = np.random.default_rng(1).integers(0, 256, model.colors.shape).astype(np.uint8)
     random = replace(model, colors=colors)
     assert not causes(found(random if tracks else without_tracks(random)))
 
 
-def test_nothing_is_said_without_points(model):
+def test_a_scene_without_points_gives_no_warning(model):
     none = replace(model, points=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.uint8))
     verdict = found(without_tracks(none))
     assert verdict.compared == 0
@@ -181,7 +185,7 @@ def exchange(folder, first, second):
     a.write_bytes(other)
 
 
-def test_photos_that_disagree_are_named_in_a_note_and_in_the_figures(tmp_path, caplog):
+def test_photos_that_disagree_are_named_in_a_note_and_in_the_results(tmp_path, caplog):
     folder = write_tiny_scene(tmp_path / "s", views=12, width=96, height=64, points=600)
     exchange(folder, "0003.png", "0007.png")
     config = configured({"scene": str(folder), "threads": 1})
@@ -208,7 +212,7 @@ def test_photos_that_cannot_be_decoded_are_named_and_left_out(tmp_path, damaged)
     assert names[0] in warning and "decoded" in warning
 
 
-def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(contradictions, model):
+def test_a_contradictory_scene_is_refused_unless_the_user_accepts_it(contradictions, model):
     wrong = contradictions.KINDS["OpenGL axes"](model, np.random.default_rng(0)).model.scene()
     with pytest.raises(UserError, match="the scene contradicts itself") as error:
         checked(wrong, Path("scene"), cache_mib=1280)
@@ -219,7 +223,7 @@ def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(cont
     assert accepted.check["verdict"] == "the scene disagrees"
 
 
-def test_of_a_scene_larger_than_the_memory_evenly_spread_photos_are_looked_at(model):
+def test_evenly_spread_photos_of_a_very_large_scene_are_checked(model):
     scene = model.scene()
     large = [
         replace(view, camera=replace(view.camera, width=4000, height=3000)) for view in scene.views

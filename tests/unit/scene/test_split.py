@@ -11,14 +11,14 @@ def split(names, root, given=None, **options):
     return split_views(names, SceneOptions(**options), root, given)
 
 
-def test_every_eighth_by_name_is_held_out(tmp_path):
+def test_every_eighth_photo_by_name_is_held_out(tmp_path):
     result = split(NAMES[::-1], tmp_path)
     assert result.test == ("00.jpg", "08.jpg", "16.jpg", "24.jpg")
     assert len(result.train) == 24
     assert "24 train, 4 test" in result.notes[0]
 
 
-def test_folders_are_split_each_on_its_own(tmp_path):
+def test_folders_are_split_separately(tmp_path):
     names = [f"street/{k}.jpg" for k in range(5)] + [f"aerial/{k}.jpg" for k in range(3)]
     assert split(names, tmp_path).test == ("aerial/0.jpg", "street/0.jpg")
     assert split(names, tmp_path, test_every=2).test == (
@@ -40,7 +40,7 @@ def test_folders_are_split_each_on_its_own(tmp_path):
         (["1/a", "2/a", "3/a", "4/a", "5/a", "6/a", "7/a", "8/a", "9/a"], ("1/a", "9/a")),
     ],
 )
-def test_few_views_always_leave_one_to_train_on(names, test, tmp_path):
+def test_few_views_always_leave_one_training_view(names, test, tmp_path):
     result = split(names, tmp_path)
     assert result.test == test
     assert result.train
@@ -52,7 +52,7 @@ def by_parity(_train):
     return {name: ("even", "odd")[k % 2] for k, name in enumerate(NAMES)}
 
 
-def test_stratified_takes_every_eighth_of_each_regime(tmp_path):
+def test_the_stratified_split_holds_out_every_eighth_photo_of_each_regime(tmp_path):
     result = split_views(NAMES, SceneOptions(split="stratified"), tmp_path, label=by_parity)
     assert result.test == ("00.jpg", "01.jpg", "16.jpg", "17.jpg")
     assert len(result.train) == 24 and result.regimes == by_parity(())
@@ -72,7 +72,7 @@ def test_the_default_split_is_stratified_only_if_a_regime_needs_it(tmp_path):
     )
 
 
-def test_regimes_that_keep_two_by_themselves_leave_the_split_as_it_is(tmp_path):
+def test_regimes_with_two_held_out_views_keep_the_plain_split(tmp_path):
     def halves(_train):
         return {name: "first" if name < "14.jpg" else "last" for name in NAMES}
 
@@ -80,7 +80,7 @@ def test_regimes_that_keep_two_by_themselves_leave_the_split_as_it_is(tmp_path):
     assert (result.test, result.regimes) == (("00.jpg", "08.jpg", "16.jpg", "24.jpg"), None)
 
 
-def test_regimes_too_small_for_two_leave_the_split_as_it_is(tmp_path):
+def test_regimes_too_small_for_two_held_out_views_keep_the_plain_split(tmp_path):
     def few(_train):
         return {name: "few" if k in range(20, 28) else "many" for k, name in enumerate(NAMES)}
 
@@ -90,7 +90,7 @@ def test_regimes_too_small_for_two_leave_the_split_as_it_is(tmp_path):
     assert split_views(NAMES, half, tmp_path, label=by_parity).regimes is None
 
 
-def test_the_regimes_of_each_eighth_are_those_of_its_training_views(tmp_path):
+def test_the_regimes_of_each_candidate_split_use_its_training_views(tmp_path):
     asked = []
 
     def label(train):
@@ -101,7 +101,7 @@ def test_the_regimes_of_each_eighth_are_those_of_its_training_views(tmp_path):
     assert sorted(set(asked)) == [24, 28]
 
 
-def test_lists_and_other_ways_ask_for_no_regime(tmp_path):
+def test_lists_and_other_split_methods_need_no_regimes(tmp_path):
     def label(_train):
         raise AssertionError
 
@@ -111,11 +111,11 @@ def test_lists_and_other_ways_ask_for_no_regime(tmp_path):
     assert split_views(NAMES, SceneOptions(), tmp_path, label=label).test == ("05.jpg",)
 
 
-def test_none_trains_on_all(tmp_path):
+def test_split_none_trains_on_all_views(tmp_path):
     assert split(NAMES, tmp_path, split="none").train == tuple(NAMES)
 
 
-def test_lists_win_unless_told_otherwise(tmp_path):
+def test_view_lists_define_the_split_unless_a_method_is_given(tmp_path):
     (tmp_path / "train_list.txt").write_text("# mine\n./03.jpg\r\n04.jpg\n\n99.jpg\n")
     (tmp_path / "test_list.txt").write_text("05.jpg\n")
     result = split(NAMES, tmp_path)
@@ -126,7 +126,7 @@ def test_lists_win_unless_told_otherwise(tmp_path):
     assert len(split(NAMES, tmp_path, split="every").test) == 4
 
 
-def test_one_list_leaves_the_rest_to_the_other(tmp_path):
+def test_with_a_single_list_all_other_views_form_the_other_set(tmp_path):
     (tmp_path / "test_list.txt").write_text("05.jpg\n")
     assert len(split(NAMES, tmp_path).train) == 27
     (tmp_path / "test_list.txt").rename(tmp_path / "train_list.txt")
@@ -135,7 +135,7 @@ def test_one_list_leaves_the_rest_to_the_other(tmp_path):
     assert len(result.test) == 27
 
 
-def test_a_split_of_the_input_itself_is_kept(tmp_path):
+def test_a_split_given_by_the_input_is_kept(tmp_path):
     given = (frozenset({"00.jpg"}), frozenset({"01.jpg"}))
     assert split(NAMES, tmp_path, given=given).test == ("01.jpg",)
     # Lists of the user come first.

@@ -9,7 +9,7 @@ def load(path):
     return pycolmap.Reconstruction(path / "sparse" / "0")
 
 
-def test_two_writings_are_equal_byte_for_byte(tmp_path):
+def test_writing_a_scene_twice_gives_equal_bytes(tmp_path):
     first, second = (
         write_tiny_scene(tmp_path / name, views=3, width=24, height=16) for name in "ab"
     )
@@ -23,7 +23,7 @@ def test_two_writings_are_equal_byte_for_byte(tmp_path):
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV_FISHEYE"])
-def test_tracks_are_exact(model, tmp_path):
+def test_tracks_of_a_written_scene_are_exact(model, tmp_path):
     scene = load(write_tiny_scene(tmp_path, model=model, text=True, scale=10, offset=(1e3, 0, 0)))
     scene.update_point_3d_errors()
     assert scene.num_points3D() == 200
@@ -31,7 +31,7 @@ def test_tracks_are_exact(model, tmp_path):
     assert scene.compute_mean_track_length() > 3
 
 
-def test_folders_are_rings_at_three_times_the_distance(tmp_path):
+def test_folders_become_rings_at_three_times_the_distance(tmp_path):
     scene = load(write_tiny_scene(tmp_path, views=4, folders=("near", "mid", "far"), mixed=True))
     distance = {}
     for image in scene.images.values():

@@ -25,18 +25,18 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_a_regime_that_nothing_is_measured_of_is_named_with_the_option(scene):
+def test_a_regime_without_held_out_photos_is_named_with_the_option(scene):
     (note,) = notes_of(scene)
     assert "no photo of aerial is held out" in note
     assert "--split stratified" in note
 
 
 @pytest.mark.parametrize("split", ["stratified", "every", "none"])
-def test_other_splits_hold_out_photos_of_both_regimes_or_none_at_all(scene, split):
+def test_other_splits_give_no_note_about_regimes(scene, split):
     assert notes_of(scene, split=split) == []
 
 
-def test_the_plan_names_it_too(scene, capsys, monkeypatch):
+def test_plan_also_names_a_regime_without_held_out_photos(scene, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert ended("plan", scene) == 0
     (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("held out")]

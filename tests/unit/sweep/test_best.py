@@ -71,13 +71,13 @@ def test_the_best_grid_contains_each_arm_as_given_and_at_its_best_value(swept, t
     ]
 
 
-def test_a_grid_without_a_name_makes_one_without_a_name(swept, tmp_path):
+def test_a_grid_without_a_name_gives_a_best_grid_without_a_name(swept, tmp_path):
     grid, cells, standings = swept
     nameless = grid.model_copy(update={"name": None})
     assert "name" not in best_grid(nameless, cells, standings, tmp_path)[0]
 
 
-def test_less_may_be_better(swept, tmp_path):
+def test_a_metric_to_minimize_selects_the_smallest_value(swept, tmp_path):
     grid, cells, standings = swept
     metric = grid.metric.model_copy(update={"goal": "minimize"})
     content, _ = best_grid(grid.model_copy(update={"metric": metric}), cells, standings, tmp_path)
@@ -113,7 +113,7 @@ def test_values_are_compared_on_the_same_seeds(swept, tmp_path):
         assert notes[0].endswith("with seed 2")
 
 
-def test_where_all_values_failed_there_is_none_to_choose(swept, tmp_path):
+def test_choosing_the_best_value_fails_if_all_runs_failed(swept, tmp_path):
     labels = [f"two, rate_factor={factor}" for factor in (0.5, 1, 2)]
     gone = with_ends(swept, {(label, "beach", 4): "failed" for label in labels})
     with pytest.raises(UserError, match="no parameters can be chosen") as error:
@@ -121,7 +121,7 @@ def test_where_all_values_failed_there_is_none_to_choose(swept, tmp_path):
     assert error.value.where == "beach, arm two"
 
 
-def test_a_file_that_is_there_is_kept(tmp_path):
+def test_an_existing_best_grid_file_is_not_overwritten(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene", views=9)
     path, best = tmp_path / "grid.yaml", tmp_path / "best.yaml"
     path.write_text(f"scenes: [{scene}]\nbase: {{steps: 9}}\n")
@@ -179,7 +179,7 @@ PLAIN = (
 @pytest.mark.parametrize("arms", CHOICES.split("---"))
 @pytest.mark.parametrize("base", ["{backbone: mip}", "{operator: {name: cagrad, c: 0.7}}"])
 @pytest.mark.parametrize("fixed", PLAIN)
-def test_the_best_arm_is_the_configuration_that_was_best(tmp_path, fixed, base, arms):
+def test_the_best_arm_has_the_configuration_of_the_best_run(tmp_path, fixed, base, arms):
     path, again = tmp_path / "grid.yaml", tmp_path / "best.yaml"
     plain = f"- {{name: plain, settings: {fixed}}}"
     path.write_text(f"base: {base}\nscenes: [town]\narms:\n{arms.strip()}\n{plain}\n")
@@ -199,7 +199,7 @@ def test_the_best_arm_is_the_configuration_that_was_best(tmp_path, fixed, base, 
         assert found[name].settings(new.base, scene) == choice.settings(grid.base, scene), name
 
 
-def test_a_grid_in_which_nothing_varies_has_no_best(tmp_path):
+def test_a_grid_without_varied_parameters_has_no_best_grid(tmp_path):
     path = tmp_path / "grid.yaml"
     path.write_text("scenes: [town]\narms: [{name: a}, {name: b}]\n")
     grid = read_grid(path)
@@ -209,7 +209,7 @@ def test_a_grid_in_which_nothing_varies_has_no_best(tmp_path):
         best_grid(grid, jobs, standings, tmp_path)
 
 
-def test_an_arm_in_which_nothing_varies_has_to_be_finished_too(swept, tmp_path):
+def test_an_arm_without_varied_parameters_must_also_be_finished(swept, tmp_path):
     path = tmp_path / "grid.yaml"
     path.write_text(GRID + "  - {name: plain, parameters: {rate_factor: {value: 1}}}\n")
     grid, cells, standings = read_grid(path), *swept[1:]

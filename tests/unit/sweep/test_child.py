@@ -19,7 +19,7 @@ print(child._SESSION_NICENESS.read_text())
 
 
 @pytest.mark.skipif(not child._SESSION_NICENESS.exists(), reason="no automatic groups of sessions")
-def test_its_session_is_as_nice_as_the_sweep():
+def test_the_session_of_a_run_has_the_niceness_of_the_sweep():
     done = subprocess.run(
         [sys.executable, "-c", NICE],
         start_new_session=True,
@@ -41,7 +41,7 @@ def test_the_session_niceness_is_written_only_if_nonzero(monkeypatch, tmp_path, 
     assert [each.read_text() for each in tmp_path.iterdir()] == said
 
 
-def test_a_system_without_such_groups_is_left_alone(monkeypatch, tmp_path):
+def test_a_system_without_session_niceness_is_supported(monkeypatch, tmp_path):
     monkeypatch.setattr(child, "_SESSION_NICENESS", tmp_path / "missing" / "autogroup")
     monkeypatch.setattr(child.os, "nice", lambda _: 7)
     child._be_as_nice_as_asked()

@@ -7,7 +7,7 @@ from crossgrad_plugins.sweep.engines import ENGINES, check_options
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_an_option_that_an_engine_does_not_have_is_named(name):
+def test_an_unknown_option_of_an_engine_is_refused(name):
     check_options(name, ())
     with pytest.raises(UserError, match=f"the engine {name} has no") as caught:
         check_options(name, ["adress"])
@@ -16,6 +16,6 @@ def test_an_option_that_an_engine_does_not_have_is_named(name):
     assert ("address" in caught.value.expected) == (name == "ray")
 
 
-def test_options_that_it_has_are_taken():
+def test_known_options_of_an_engine_are_accepted():
     check_options("ray", ["address"])
     check_options("slurm", ["time", "cluster"])

@@ -17,7 +17,7 @@ def labels(grid):
     return [each.label for each in choices(grid)]
 
 
-def test_parameters_are_multiplied_and_the_last_varies_fastest(tmp_path):
+def test_parameters_are_combined_and_the_last_one_varies_fastest(tmp_path):
     grid = read_grid(written(tmp_path, """
         parameters:
           sampler: {values: [epoch, random]}
@@ -31,7 +31,7 @@ def test_parameters_are_multiplied_and_the_last_varies_fastest(tmp_path):
     ]
 
 
-def test_parameters_inside_a_component_are_its_options(tmp_path):
+def test_parameters_inside_a_component_become_its_options(tmp_path):
     text = "parameters: {operator: {parameters: {name: {value: cagrad}, c: {values: [0, 1]}}}}"
     found = choices(read_grid(written(tmp_path, text)))
     assert [each.parameters for each in found] == [
@@ -39,7 +39,7 @@ def test_parameters_inside_a_component_are_its_options(tmp_path):
     ]
 
 
-def test_an_arm_may_have_parameters_of_its_own(tmp_path):
+def test_an_arm_may_have_its_own_parameters(tmp_path):
     grid = read_grid(written(tmp_path, """
         arms:
           - {name: one, settings: {views: 1}}
@@ -56,7 +56,7 @@ def test_an_arm_may_have_parameters_of_its_own(tmp_path):
     ]
 
 
-def test_scenes_and_seeds_may_stand_among_the_parameters(tmp_path):
+def test_scenes_and_seeds_may_be_given_as_parameters(tmp_path):
     text = "parameters: {scene: {values: [a, b]}, seed: {values: [3, 4]}}"
     grid = read_grid(written(tmp_path, text))
     assert grid.seeds == (3, 4)
@@ -64,7 +64,7 @@ def test_scenes_and_seeds_may_stand_among_the_parameters(tmp_path):
     assert labels(grid) == ["run"]
 
 
-def test_scenes_are_relative_to_the_grid(tmp_path, monkeypatch):
+def test_scene_paths_are_relative_to_the_grid_file(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     path = written(tmp_path, "scenes: [scene, ../other, /abs]")
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -75,7 +75,7 @@ def test_scenes_are_relative_to_the_grid(tmp_path, monkeypatch):
     )
 
 
-def test_other_scenes_keep_the_settings_of_those_with_their_name(tmp_path):
+def test_replaced_scenes_keep_the_settings_for_scenes_with_their_name(tmp_path):
     text = "scenes: [a, b]\narms: [{name: x, by_scene: {a: {steps: 3}, b: {steps: 4}}}]"
     grid = with_scenes(read_grid(written(tmp_path, text)), [tmp_path / "b", tmp_path / "c"])
     assert grid.arms[0].by_scene == {"b": {"steps": 4}}
@@ -112,14 +112,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_errors_of_a_grid_name_the_file_and_the_place(tmp_path, text):
+def test_errors_of_a_grid_name_the_file_and_the_position(tmp_path, text):
     with pytest.raises(UserError) as caught:
         read_grid(written(tmp_path, text))
     assert WRONG[text] in str(caught.value)
     assert str(tmp_path / "grid.yaml") in str(caught.value)
 
 
-def test_a_list_that_is_empty_without_its_wrong_parts_is_wrong_once(tmp_path):
+def test_a_list_with_only_invalid_entries_gives_one_error(tmp_path):
     with pytest.raises(UserError) as caught:
         read_grid(written(tmp_path, "seeds: [-1]"))
     assert "not be empty" not in str(caught.value) and "2 things" not in str(caught.value)
@@ -140,7 +140,7 @@ def test_all_errors_of_a_grid_are_reported_at_once(tmp_path):
         ("{name: lpips, goal: maximize}", "maximize"),
     ],
 )
-def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
+def test_lpips_is_minimized_by_default(tmp_path, metric, goal):
     assert read_grid(written(tmp_path, f"metric: {metric}")).metric.goal == goal
 
 
@@ -165,12 +165,12 @@ def test_sweep_options_without_effect_are_refused(tmp_path, capsys, options, wor
     assert words in capsys.readouterr().err
 
 
-def test_an_empty_grid_is_one_run_of_the_bundled_scene(tmp_path):
+def test_an_empty_grid_defines_one_run_of_the_bundled_scene(tmp_path):
     grid = read_grid(written(tmp_path, ""))
     assert (grid.scenes, grid.seeds, labels(grid)) == ((None,), (0,), ["run"])
 
 
-def test_a_few_lines_that_stand_for_too_many_runs_are_refused(tmp_path):
+def test_a_small_grid_file_with_too_many_runs_is_refused(tmp_path):
     ten = "{values: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]}"
     grid = lambda number: "parameters:\n" + "".join(  # noqa: E731
         f"  p{i}: {ten}\n" for i in range(number)
@@ -189,7 +189,7 @@ def test_a_few_lines_that_stand_for_too_many_runs_are_refused(tmp_path):
         "arms: [{name: 'a, views=2'}, {name: a, parameters: {views: {values: [2, 3]}}}]",
     ],
 )
-def test_two_configurations_of_one_name_are_refused(tmp_path, text):
+def test_two_configurations_with_the_same_name_are_refused(tmp_path, text):
     path = tmp_path / "grid.yaml"
     path.write_text(text)
     with pytest.raises(UserError, match="two configurations are called"):

@@ -36,7 +36,7 @@ def contents(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def test_tables_come_back_and_models_do_not(script, sweep, tmp_path):
+def test_packing_keeps_tables_and_removes_models(script, sweep, tmp_path):
     archive = tmp_path / "results" / "grid.tar.xz"
     assert script.pack(sweep, archive) == 3
     assert script.unpack(archive, tmp_path / "back") == 3
@@ -51,7 +51,7 @@ def test_tables_come_back_and_models_do_not(script, sweep, tmp_path):
     assert again.read_bytes() == archive.read_bytes()
 
 
-def test_runs_that_did_not_finish_are_left_out(script, sweep, tmp_path):
+def test_unfinished_runs_are_not_packed(script, sweep, tmp_path):
     path = sweep / "runs" / "r1" / "summary.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "status": "interrupted"}))
     (sweep / "runs" / "r2" / "summary.json").unlink()
@@ -61,7 +61,7 @@ def test_runs_that_did_not_finish_are_left_out(script, sweep, tmp_path):
         script.pack(sweep, tmp_path / "grid.tar.xz")
 
 
-def test_runs_that_belong_to_no_sweep_are_refused_and_nothing_is_left(script, sweep, tmp_path):
+def test_runs_without_a_sweep_are_refused_and_no_archive_is_written(script, sweep, tmp_path):
     (sweep / "runs.csv").unlink()
     with pytest.raises(UserError, match="nothing to keep"):
         script.pack(sweep, tmp_path / "results" / "grid.tar.xz")
@@ -86,7 +86,7 @@ def labels(sweep):
     }
 
 
-def test_runs_that_are_added_keep_their_labels(script, sweep, tmp_path):
+def test_added_runs_keep_their_labels(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     other = tmp_path / "other"
     RunFolder(seed=7).write(other / "runs" / "r7")
@@ -103,7 +103,7 @@ def test_runs_that_are_added_keep_their_labels(script, sweep, tmp_path):
     assert labels(tmp_path / "back") == labels(other)
 
 
-def test_lost_labels_come_back(script, sweep, tmp_path):
+def test_lost_labels_are_restored_from_the_archive(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     (sweep / "runs.csv").write_text("run,configuration\nr0,a\n")
     with pytest.raises(UserError, match="not in the table") as error:
@@ -115,7 +115,7 @@ def test_lost_labels_come_back(script, sweep, tmp_path):
     assert (tmp_path / "again.tar.xz").read_bytes() == (tmp_path / "grid.tar.xz").read_bytes()
 
 
-def test_tables_of_another_form_are_refused_before_anything_is_written(script, sweep, tmp_path):
+def test_tables_of_another_format_are_refused_before_anything_is_written(script, sweep, tmp_path):
     script.pack(sweep, tmp_path / "grid.tar.xz")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "runs.csv").write_text("run,name\n")

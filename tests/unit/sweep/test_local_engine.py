@@ -46,7 +46,7 @@ def starts(work, name):
     return [line.split() for line in lines]
 
 
-def test_all_are_finished_once_with_their_cores_threads_and_folder(work):
+def test_all_runs_finish_once_with_their_cores_threads_and_folder(work):
     given = work(*["finish"] * 5)
     found = carried_out(given)
     assert [each.state for each in found.values()] == ["finished"] * 5
@@ -56,7 +56,7 @@ def test_all_are_finished_once_with_their_cores_threads_and_folder(work):
         assert (cores, threads, folder) == (core, "1", str(given.folder))
 
 
-def test_a_failure_stops_nothing_and_has_its_reason(work):
+def test_a_failed_run_stops_no_other_run_and_has_a_reason(work):
     given = work("fail", "refuse", "finish")
     found = carried_out(given)
     assert [each.state for each in found.values()] == ["failed", "failed", "finished"]
@@ -72,7 +72,7 @@ def test_a_refused_run_has_the_reason_of_its_last_attempt(work):
     assert carried_out(given)["refuse-0"].error.startswith("error: there is no such thing")
 
 
-def test_a_process_that_dies_is_tried_again(work):
+def test_a_run_whose_process_dies_is_tried_again(work):
     given = work("die_once", workers=1)
     assert carried_out(given)["die_once-0"].state == "finished"
     assert len(starts(given, "die_once-0")) == 2
@@ -92,13 +92,13 @@ def test_a_run_that_makes_progress_between_deaths_continues(work):
     assert len(starts(given, "go_on-0")) == 5
 
 
-def test_one_that_takes_too_much_memory_is_stopped(work):
+def test_a_run_that_uses_too_much_memory_is_stopped(work):
     found = carried_out(work("eat", "finish", memory=GIB // 8))
     assert [each.state for each in found.values()] == ["failed", "finished"]
     assert "GiB" in found["eat-0"].error
 
 
-def test_asked_to_stop_it_stops_what_is_under_way_and_begins_nothing(work):
+def test_a_stop_request_stops_running_runs_and_starts_no_other_run(work):
     given = work("hang", "hang", "finish")
     for _ in engine("local")(given):
         if all((given.out / "runs" / f"hang-{n}" / "ready").exists() for n in (0, 1)):
@@ -108,7 +108,7 @@ def test_asked_to_stop_it_stops_what_is_under_way_and_begins_nothing(work):
     assert [each.status for each in ends] == ["stopped", "stopped"]
 
 
-def test_a_run_that_somebody_writes_to_waits(work):
+def test_a_run_whose_folder_is_locked_waits(work):
     import fcntl
 
     given = work("finish", "finish", workers=1)
@@ -125,7 +125,7 @@ def test_a_run_that_somebody_writes_to_waits(work):
     assert [each.state for each in state(given)] == ["finished", "finished"]
 
 
-def test_work_has_a_stop_of_its_own():
+def test_every_work_object_has_a_separate_stop():
     one, other = (Work([], Path(), Path(), 1) for _ in range(2))
     one.stop.count += 1
     assert other.stop == Stop()

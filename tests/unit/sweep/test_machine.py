@@ -21,7 +21,7 @@ def has(monkeypatch):
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("workers", [None, 1, 2])
-def test_no_core_is_given_twice_and_none_that_is_not_ours(has, threads, workers):
+def test_each_available_core_is_assigned_at_most_once(has, threads, workers):
     ours = (3, 4, 5, 8, 9, 11)
     has(ours, 64)
     found = divided(workers, threads, None)
@@ -52,7 +52,7 @@ def test_without_a_known_memory_size_there_is_no_memory_limit(has):
     [((5, 1, None), "--workers"), ((None, 5, None), "--threads"), ((2, 1, 5.0), "--workers"),
      ((None, 1, 20.0), "--memory")],
 )  # fmt: skip
-def test_more_than_there_is_is_refused(has, arguments, named):
+def test_more_workers_or_threads_than_available_are_refused(has, arguments, named):
     has(range(4), 8)
     with pytest.raises(UserError) as caught:
         divided(*arguments)
@@ -77,7 +77,7 @@ def counts(**busy):
         ({}, (0, 1, 2, 3)),
     ],
 )
-def test_idle_cores_come_first(monkeypatch, tmp_path, busy, expected):
+def test_idle_cores_are_used_first(monkeypatch, tmp_path, busy, expected):
     looks = counts(**busy)
     file = tmp_path / "stat"
     monkeypatch.setattr(machine, "_COUNTS", file)
@@ -86,12 +86,12 @@ def test_idle_cores_come_first(monkeypatch, tmp_path, busy, expected):
     assert machine.idle_first((0, 1, 2, 3)) == expected
 
 
-def test_without_counts_cores_keep_their_order(monkeypatch, tmp_path):
+def test_cores_keep_their_order_without_load_counts(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "_COUNTS", tmp_path / "no-such-file")
     assert machine.idle_first((4, 2)) == (4, 2)
 
 
-def test_cores_are_only_chosen_where_some_are_left(has, monkeypatch):
+def test_idle_cores_are_selected_only_if_cores_are_left_over(has, monkeypatch):
     has(range(4), 64)
     monkeypatch.setattr(machine, "idle_first", lambda cores: cores[::-1])
     assert divided(2, 1, None).cores == ((3,), (2,))

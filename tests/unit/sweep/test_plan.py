@@ -25,7 +25,7 @@ def plan(folder, assignments=(), **grid):
     return planned(read_grid(path), path, assignments)
 
 
-def test_what_a_run_notes_about_its_length_is_not_in_its_id():
+def test_the_id_of_a_run_does_not_depend_on_notes_about_its_length():
     plain = {"seed": 1, "steps": 9}
     noted = {**plain, "revisions": [[1, 9]], "planned_seconds": 5.0, "planned_views": 9}
     assert run_id(noted, "scene") == run_id(plain, "scene")
@@ -45,7 +45,7 @@ def test_seeds_vary_slowest(scene, tmp_path):
     assert len({job.id for job in found.jobs}) == 4
 
 
-def test_an_id_depends_on_what_is_trained_and_on_nothing_else(scene, tmp_path):
+def test_the_id_of_a_run_depends_only_on_its_training(scene, tmp_path):
     (one,) = ids(tmp_path, scene, steps=30)
     elsewhere = tmp_path / "moved" / "under-another-name"
     shutil.copytree(scene, elsewhere)
@@ -70,14 +70,14 @@ def test_an_id_depends_on_what_is_trained_and_on_nothing_else(scene, tmp_path):
     assert len({one, *(each for (each,) in others)}) == len(others) + 1
 
 
-def test_a_run_that_two_configurations_come_to_is_one_run(scene, tmp_path):
+def test_two_configurations_with_equal_settings_share_one_run(scene, tmp_path):
     arms = [{"name": "a"}, {"name": "b", "settings": {"operator": "sum"}}]
     found = plan(tmp_path, scenes=[str(scene)], arms=arms)
     assert [cell.label for cell in found.cells] == ["a", "b"]
     assert len(found.jobs) == 1
 
 
-def test_an_arm_that_chooses_another_component_drops_the_options_of_the_base(scene, tmp_path):
+def test_an_arm_with_another_component_drops_the_options_of_the_base(scene, tmp_path):
     base = {"operator": {"name": "cagrad", "c": 0.3}, "data": {"max_size": 40}, "steps": 9}
     arms = [
         {"name": "a", "settings": {"operator.c": 0.1, "data": {"test_every": 4}}},
@@ -91,14 +91,14 @@ def test_an_arm_that_chooses_another_component_drops_the_options_of_the_base(sce
     assert "steps" not in other.settings
 
 
-def test_settings_by_scene_and_of_the_command_line_win(scene, tmp_path):
+def test_settings_of_scenes_and_of_the_command_line_override_the_base(scene, tmp_path):
     arms = [{"name": "a", "by_scene": {"tiny": {"views": 3, "steps": 4}}}]
     grid = {"scenes": [str(scene)], "arms": arms, "base": {"views": 1}}
     (job,) = plan(tmp_path, ["steps=6"], **grid).jobs
     assert (job.settings["views_per_step"], job.settings["steps"]) == (3, 6)
 
 
-def test_everything_that_is_wrong_is_said_at_once(scene, tmp_path):
+def test_all_errors_are_reported_at_once(scene, tmp_path):
     arms = [
         {"name": "unknown", "settings": {"opertor": "sum"}},
         {"name": "name", "settings": {"sampler": "epoc"}},
@@ -119,7 +119,7 @@ def test_everything_that_is_wrong_is_said_at_once(scene, tmp_path):
     assert "8 things are wrong" in text and "99 different views" in text
 
 
-def test_a_fault_of_all_configurations_is_said_once(scene, tmp_path):
+def test_an_error_of_all_configurations_is_reported_once(scene, tmp_path):
     with pytest.raises(UserError, match="something is wrong") as caught:
         plan(
             tmp_path,

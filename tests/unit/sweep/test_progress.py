@@ -48,7 +48,7 @@ def test_a_line_reports_each_finished_or_failed_run(sweep, capsys):
     assert not capsys.readouterr().err
 
 
-def test_a_terminal_shows_one_table_that_is_drawn_over(sweep, capsys, monkeypatch):
+def test_a_terminal_shows_one_table_that_is_redrawn(sweep, capsys, monkeypatch):
     monkeypatch.setattr(screens, "is_live", lambda stream: stream is sys.stderr)
     shown = Screen(sweep.watch, 2)
     ended(sweep, "id1", "failed", error="lost")
@@ -67,7 +67,7 @@ def test_a_terminal_shows_one_table_that_is_drawn_over(sweep, capsys, monkeypatc
     assert not capsys.readouterr().err
 
 
-def test_times_are_those_of_like_runs(sweep):
+def test_run_times_are_estimated_from_similar_runs(sweep):
     jobs = [
         Job("a", "arm", "city", 1, {}),
         Job("b", "arm", "city", 2, {}),
@@ -87,7 +87,7 @@ def test_times_are_those_of_like_runs(sweep):
     assert total.text(2) == "about 81 s and 1 run of which nothing is known yet"
 
 
-def test_no_sweep_is_shorter_than_its_longest_run(sweep):
+def test_the_estimate_of_a_sweep_is_at_least_its_longest_run(sweep):
     jobs = [Job(name, "arm", "city", n, {}, seconds=600.0) for n, name in enumerate("abc")]
     found = estimated(jobs, {job.id: job for job in jobs}, [])
     assert [found.text(workers) for workers in (1, 2, 16)] == [
@@ -102,7 +102,7 @@ def test_durations_are_rounded_for_people():
     assert list(map(duration, given)) == ["3 s", "119 s", "2 min", "120 min", "2.5 h"]
 
 
-def test_the_table_has_means_over_seeds_and_marks_the_best():
+def test_the_table_shows_means_over_seeds_and_marks_the_best_arm():
     values = {"id0": 10.0, "id1": 12.0, "id2": 13.0, "id3": None}
     jobs = [Job(f"id{n}", "ab"[n // 2], "city", n % 2, {}) for n in range(4)]
     found = [
@@ -116,7 +116,7 @@ def test_the_table_has_means_over_seeds_and_marks_the_best():
     assert list(table(jobs, found, Metric(goal="minimize")))[1].endswith("*")
 
 
-def test_a_metric_that_no_run_has_is_reported_with_those_they_have():
+def test_a_metric_that_no_run_has_is_reported_with_the_available_metrics():
     jobs, overall = JOBS[:2], {"psnr": 20.0, "lpips": None, "ssim": 0.5}
     found = [Standing(job, "finished", summary={"overall": overall}) for job in jobs]
     told = list(table(jobs, found, Metric(name="psnr_street")))[-1]
@@ -138,7 +138,7 @@ def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
     ]
 
 
-def test_another_table_in_its_place_is_kept(tmp_path):
+def test_a_foreign_table_with_the_name_of_the_plan_is_not_overwritten(tmp_path):
     layout = Layout(tmp_path)
     layout.plan.write_text("arm,scene\nmine,city\n")
     with pytest.raises(UserError, match="none that a sweep wrote"):
@@ -146,7 +146,7 @@ def test_another_table_in_its_place_is_kept(tmp_path):
     assert layout.plan.read_text() == "arm,scene\nmine,city\n"
 
 
-def test_rows_of_earlier_grids_are_told_from_those_of_the_newest(tmp_path):
+def test_rows_of_earlier_grids_are_distinguished_from_rows_of_the_newest_grid(tmp_path):
     layout = Layout(tmp_path)
     assert earlier_rows(layout) == frozenset()
     layout.make()
@@ -165,7 +165,7 @@ def test_rows_of_earlier_grids_are_told_from_those_of_the_newest(tmp_path):
     assert ",c," not in layout.plan.read_text()
 
 
-def test_a_record_of_a_clock_that_is_behind_is_seen(sweep, monkeypatch):
+def test_a_record_from_a_machine_with_a_slow_clock_is_read(sweep, monkeypatch):
     ended(sweep, "id1", "finished")
     assert len(sweep.watch.look()) == 1
     (line,) = [each for each in read_records(sweep.layout.records) if each.event == "ended"]

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 TWO_NODES = Path(fake_run.__file__).with_name("two_nodes.py")
 
 
-def test_a_node_that_is_killed_costs_only_time(tmp_path):
+def test_a_killed_node_loses_no_run(tmp_path):
     command = [sys.executable, str(TWO_NODES), str(tmp_path / "grid"), str(tmp_path / "out")]
     command += ["kill", sys.executable, fake_run.__file__]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -27,6 +27,6 @@ def test_a_node_that_is_killed_costs_only_time(tmp_path):
     assert 6 <= said["begins"] <= 8
 
 
-def test_a_cluster_that_is_not_there_is_refused(tmp_path):
+def test_a_missing_ray_cluster_is_refused(tmp_path):
     with pytest.raises(UserError, match="answer"):
         next(engine("ray")(Work([], tmp_path, tmp_path, 1, options={"address": "127.0.0.1:1"})))

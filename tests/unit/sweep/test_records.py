@@ -14,7 +14,7 @@ def add(folder, worker="1", **more):
     append(folder, {"event": "begun", "run": "a", "worker": worker, **more})
 
 
-def test_lines_of_all_workers_come_in_the_order_of_time(tmp_path):
+def test_lines_of_all_workers_are_read_in_the_order_of_time(tmp_path):
     for worker, run in (("1", "a"), ("2", "b"), ("1", "c")):
         add(tmp_path, worker, run=run)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.jsonl", "2.jsonl"]
@@ -29,7 +29,7 @@ FOREIGN = b'{"event": "ended", "run": "a", "worker": 3, "time": 5, "host": "x"}\
 @pytest.mark.parametrize(
     "torn", [b'{"event": "beg', b"{}\n", b"[1]\n", b'\xff\xfe\n{"a": 1}', FOREIGN]
 )
-def test_a_torn_or_foreign_line_costs_no_other(tmp_path, torn):
+def test_a_damaged_line_loses_no_other_line(tmp_path, torn):
     add(tmp_path)
     with (tmp_path / "1.jsonl").open("ab") as file:
         file.write(torn)
@@ -43,7 +43,7 @@ def test_a_line_is_json_with_time_and_machine(tmp_path):
     assert line.keys() == {"event", "run", "worker", "time", "host", "status", "seconds"}
 
 
-def test_a_full_disk_is_said_as_such(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -27,7 +27,7 @@ def states(work):
     return [each.state for each in found]
 
 
-def test_the_local_executor_carries_out_runs_and_stops_for_none(tmp_path):
+def test_the_local_executor_executes_all_runs_and_a_dead_run_again(tmp_path):
     work = made(tmp_path, ["finish", "fail", "die_once"], {"cluster": "local"}, workers=3)
     for _ in engine("slurm")(work):
         pass
@@ -37,7 +37,7 @@ def test_the_local_executor_carries_out_runs_and_stops_for_none(tmp_path):
     assert len(workers) == 4  # A job for each attempt.
 
 
-def test_asked_to_stop_its_jobs_stop(tmp_path):
+def test_a_stop_request_stops_the_slurm_jobs(tmp_path):
     work = made(tmp_path, ["hang", "finish"], {"cluster": "local"})
     for _ in engine("slurm")(work):
         if (work.out / "runs" / "hang-0" / "ready").exists():
@@ -45,7 +45,7 @@ def test_asked_to_stop_its_jobs_stop(tmp_path):
     assert states(work) == ["interrupted", "waiting"]
 
 
-def test_the_script_says_what_is_asked_of_slurm(tmp_path):
+def test_the_script_contains_the_requested_slurm_options(tmp_path):
     from crossgrad_plugins.sweep.engines.slurm import script
 
     options = {"partition": "gpu", "time": "90"}

@@ -58,7 +58,7 @@ def failures(slot, name, distribution="made-up-check"):
     return {each.check: each.failure for each in check_entry(entry) if each.failure is not None}
 
 
-def test_a_name_that_another_package_has_is_not_free(installed):
+def test_a_component_name_of_another_package_fails_the_check(installed):
     installed(SAMPLER, samplers={"epoch": "made_up_check:Fixed", "made-up": "made_up_check:Fixed"})
     found = failures("samplers", "epoch")
     assert "2 installed packages offer a sampler named 'epoch'" in found["its name is free"]
@@ -67,7 +67,7 @@ def test_a_name_that_another_package_has_is_not_free(installed):
     assert rest == failures("samplers", "made-up").keys()
 
 
-def test_the_name_of_a_command_of_the_core_is_not_free(installed):
+def test_a_command_name_of_the_core_fails_the_check(installed):
     source = 'def run():\n    """Runs."""\n'
     installed(source, commands={"run": "made_up_check:run"})
     assert failures("commands", "run") == {
@@ -75,27 +75,27 @@ def test_the_name_of_a_command_of_the_core_is_not_free(installed):
     }
 
 
-def test_a_plugin_that_ends_the_program_fails_its_checks(installed):
+def test_a_plugin_that_calls_exit_fails_its_checks(installed):
     installed(SAMPLER, samplers={"ends": "made_up_check:Ends"})
     found = failures("samplers", "ends")
     assert found["every view comes"] == "SystemExit: 0"
     assert "options are frozen" not in found
 
 
-def test_a_plugin_that_ends_the_program_cannot_be_made(installed):
+def test_a_plugin_that_calls_exit_on_creation_fails_the_first_check(installed):
     installed(SAMPLER, samplers={"ends": "made_up_check:EndsWhenMade"})
     found = failures("samplers", "ends")
     assert found == {"it can be made with default options": "SystemExit: 0"}
 
 
 @pytest.mark.parametrize("kind", ["Misspelt", "Ends"])
-def test_a_broken_backbone_of_another_package_fails_no_densifier(installed, kind):
+def test_a_broken_backbone_of_another_package_does_not_fail_a_densifier(installed, kind):
     installed(BACKBONE, backbones={"aaa": f"made_up_check:{kind}"})
     for check in DENSIFIER_CHECKS:
         check(load("densifiers", "adc"))
 
 
-def test_a_densifier_is_tried_on_a_backbone_of_crossgrad(installed):
+def test_a_densifier_is_checked_with_a_bundled_backbone(installed):
     installed(BACKBONE, backbones={"aaa": "made_up_check:Sound", "zzz": "made_up_check:Sound"})
     for name in ("adc", "pixel", "none"):
         backbone = DensifierRun.of(load("densifiers", name)()).backbone

@@ -1033,13 +1033,13 @@ def name_of(value):
 
 
 @pytest.mark.parametrize(("check", "make"), DEFECTS, ids=name_of)
-def test_a_defect_is_caught(check, make):
+def test_each_defect_fails_its_check(check, make):
     with pytest.raises(ContractError, match=r"\w+ \w+"):
         check(make)
 
 
 @pytest.mark.parametrize(("check", "make", "error"), RAISING, ids=name_of)
-def test_an_error_of_the_component_comes_through(check, make, error):
+def test_an_error_of_the_component_is_passed_on(check, make, error):
     with pytest.raises(error):
         check(make)
 
@@ -1060,7 +1060,7 @@ def test_correct_components_pass_all_checks(checks, make):
         check(make)
 
 
-def test_every_check_has_a_defect_that_it_catches():
+def test_every_check_has_a_defect_that_it_detects():
     modules = (operators, samplers, groupings, rasterizers, backbones, densifiers, readers)
     checks = {
         check
@@ -1088,7 +1088,7 @@ def test_every_check_has_a_defect_that_it_catches():
     ],
     ids=name_of,
 )
-def test_a_failed_check_reports_what_it_found(check, make, words):
+def test_a_failed_check_reports_its_observation(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 

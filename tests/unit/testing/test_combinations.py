@@ -24,7 +24,7 @@ def test_lines_of_refusals_are_read_back_exactly(refusals):
     assert lines == sorted(set(lines))
 
 
-def test_a_reason_of_two_components_is_one_line_for_all_others():
+def test_a_reason_of_two_components_is_one_line_for_all_other_components():
     concerned = [row for row in ROWS if row[0] == "b" and row[3] == "i"]
     found = as_lines(dict.fromkeys(concerned, ("does not fit",)), ROWS)
     assert found == ["sampler=b densifier=i: does not fit"]
@@ -32,12 +32,12 @@ def test_a_reason_of_two_components_is_one_line_for_all_others():
     assert as_lines(dict.fromkeys(concerned, ("is off",)), ROWS) == ["operator=d: is off"]
 
 
-def test_a_reason_against_everything_names_nothing():
+def test_a_reason_for_all_combinations_names_no_component():
     assert as_lines(dict.fromkeys(ROWS, ("is off",)), ROWS) == [": is off"]
     assert set(from_lines([": is off"], ROWS)) == set(ROWS)
 
 
-def test_refusals_name_their_reasons_one_by_one():
+def test_all_reasons_of_a_refusal_are_listed_separately():
     row = ("three-way", "anchors", "vanilla", "anchor", "numba")
     assert row in every_combination()
     (reasons,) = refused([row]).values()

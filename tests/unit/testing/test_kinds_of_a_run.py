@@ -85,7 +85,7 @@ PLAIN = {"RegularizeContext.gaussians", "ViewRecord.gaussians"}
 
 
 @pytest.mark.parametrize("kind", [Kinds, KindsOfGradients, KindsOfTheModel])
-def test_checks_give_the_kinds_of_a_run(kind):
+def test_checks_pass_the_same_types_to_hooks_as_a_run(kind):
     SEEN.clear()
     for check in set(observers.OBSERVER_CHECKS) - set(observers.COMPONENT_CHECKS):
         check(kind)

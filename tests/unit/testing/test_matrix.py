@@ -40,7 +40,7 @@ def test_combinations_train_or_are_refused_with_the_reason(mine):
     assert text.endswith("0 combinations failed")
 
 
-def test_a_failure_has_its_reason_and_the_command_that_repeats_it(mine, monkeypatch):
+def test_a_failure_is_reported_with_its_reason_and_a_command_that_repeats_it(mine, monkeypatch):
     def broken(self, context, state):
         raise ZeroDivisionError("no steps yet")
 
@@ -55,7 +55,7 @@ def test_a_failure_has_its_reason_and_the_command_that_repeats_it(mine, monkeypa
         report.train_one("mine", row)
 
 
-def test_a_component_that_everything_refuses_fails(monkeypatch):
+def test_a_component_refused_in_all_combinations_fails(monkeypatch):
     refused = Members("mine 1.0", {**NAMES, "densifier": ("anchor",)}, MINE.own, ())
     monkeypatch.setattr(report, "members_of", lambda package: refused)
     text, passed = report.train_matrix("mine", full=True)
@@ -68,12 +68,12 @@ def test_an_unknown_combination_is_refused(mine):
         report.train_one("mine", "sampler=epoch operator=no-such-operator")
 
 
-def test_a_package_that_is_not_installed_names_those_that_are():
+def test_the_error_for_an_unknown_package_names_the_installed_packages():
     with pytest.raises(UserError, match="crossgrad"):
         members_of("no-such-package")
 
 
-def test_a_usual_row_has_the_densifier_of_its_backbone():
+def test_a_default_row_has_the_densifier_of_its_backbone():
     slots = tuple(NAMES)
     assert (
         default_row({"backbone": "scaffold"}, slots)[3]
@@ -87,7 +87,7 @@ def run_pytest(folder, *arguments):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_the_option_of_pytest_adds_the_combinations_to_the_tests(tmp_path):
+def test_the_pytest_option_adds_the_combinations_to_the_tests(tmp_path):
     (tmp_path / "conftest.py").write_text(CONFTEST)
     ended = run_pytest(tmp_path, "--crossgrad-matrix", "mine")
     assert ended.returncode == 0, ended.stdout
@@ -95,13 +95,13 @@ def test_the_option_of_pytest_adds_the_combinations_to_the_tests(tmp_path):
     assert "refused before training: densifier anchor" in ended.stdout
 
 
-def test_the_option_of_pytest_names_a_package_that_is_not_there(tmp_path):
+def test_the_pytest_option_reports_an_unknown_package(tmp_path):
     ended = run_pytest(tmp_path, "--crossgrad-matrix", "no-such-package")
     assert ended.returncode == pytest.ExitCode.USAGE_ERROR
     assert "no installed package 'no-such-package'" in ended.stderr + ended.stdout
 
 
-def test_pytest_without_the_option_imports_nothing_of_ours():
+def test_pytest_without_the_option_does_not_import_crossgrad():
     program = "import sys, crossgrad_plugins.authoring.pytest_plugin; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, check=True, text=True

@@ -16,7 +16,7 @@ def pairs(rows):
 
 @settings(suppress_health_check=[HealthCheck.too_slow])  # A busy machine is slow enough.
 @given(st.sets(st.tuples(*[st.sampled_from("abcd")] * 4), min_size=1))
-def test_every_pair_that_can_occur_occurs(admitted):
+def test_a_design_contains_every_possible_pair_and_no_redundant_row(admitted):
     chosen = pairwise(sorted(admitted))
     assert set(chosen) <= admitted
     assert pairs(chosen) == pairs(list(admitted))
@@ -37,7 +37,7 @@ def test_designs_are_far_smaller_than_the_product(sizes, most):
     assert chosen == pairwise(rows)
 
 
-def test_pairs_know_their_factors():
+def test_pairs_contain_the_index_of_their_factors():
     assert pairs_of(("x", "x", "y")) == [(0, 1, "x", "x"), (0, 2, "x", "y"), (1, 2, "x", "y")]
 
 
@@ -53,14 +53,14 @@ def completed(given):
     return tuple(given.get(i, value) for i, value in enumerate(USUAL))
 
 
-def test_a_value_meets_all_others_in_as_few_rows_as_there_are_values():
+def test_a_value_meets_all_other_values_in_the_fewest_rows():
     rows = list(meetings(0, "b", VALUES, completed, lambda _: True))
     assert len(rows) == 4
     assert all(row[0] == "b" for row in rows)
     assert {value for row in rows for value in enumerate(row)} >= {(1, "l"), (2, "w"), (2, "z")}
 
 
-def test_a_pair_that_is_refused_in_turn_is_tried_with_usual_values_and_one_change():
+def test_a_refused_pair_is_tried_with_default_values_and_one_change():
     def admits(row):
         return not (row[2] == "w" and row[1] != "k")
 
@@ -69,7 +69,7 @@ def test_a_pair_that_is_refused_in_turn_is_tried_with_usual_values_and_one_chang
     assert all(map(admits, rows))
 
 
-def test_a_pair_that_nothing_admits_is_left_out():
+def test_a_pair_that_is_always_refused_is_left_out():
     rows = list(meetings(0, "b", VALUES, completed, lambda row: row[2] != "z"))
     assert not [row for row in rows if row[2] == "z"]
     assert {row[2] for row in rows} == {"x", "y", "w"}

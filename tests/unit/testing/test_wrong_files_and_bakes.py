@@ -77,13 +77,13 @@ class OneBand(Fainter):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_a_wrong_component_is_refused_for_its_reason(check, make, words):
+def test_a_wrong_component_is_refused_with_the_right_reason(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 
 
 @pytest.mark.parametrize("check", exporters.EXPORTER_CHECKS, ids=lambda check: check.__name__)
-def test_the_right_one_passes(check):
+def test_a_correct_component_passes(check):
     try:
         check(Centres)
     except SkipTest:

@@ -113,10 +113,10 @@ class Sleeps(api.Observer):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_a_wrong_observer_is_refused_for_its_reason(check, make, words, short_windows):
+def test_a_wrong_observer_is_refused_with_the_right_reason(check, make, words, short_windows):
     with pytest.raises(ContractError, match=words):
         check(make)
 
 
-def test_a_buffer_of_one_size_is_allowed():
+def test_a_buffer_of_constant_size_is_allowed():
     observers.nothing_piles_up(KeepsOnce)

@@ -107,12 +107,12 @@ def fixing(**options):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_a_wrong_rasterizer_is_refused_for_its_reason(check, make, words):
+def test_a_wrong_rasterizer_is_refused_with_the_right_reason(check, make, words):
     with pytest.raises(ContractError, match=words):
         check(make)
 
 
-def test_a_rasterizer_with_the_published_footprint_is_right():
+def test_a_rasterizer_with_the_published_footprint_passes():
     def make():
         return Torch(footprint="3-sigma", max_alpha=0.999)
 

@@ -100,26 +100,26 @@ class RepeatsOne(NoDensification):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
-def test_a_wrong_state_or_edit_is_refused_for_its_reason(check, make, words, short_windows):
+def test_a_wrong_state_or_edit_is_refused_with_the_right_reason(check, make, words, short_windows):
     with pytest.raises(ContractError, match=words):
         check(make)
 
 
-def test_weights_that_are_drawn_are_not_compared():
+def test_randomly_drawn_weights_are_not_compared():
     with pytest.raises(SkipTest, match="random numbers"):
         operators.views_that_are_alike_count_alike(AtRandom)
 
 
-def test_a_window_of_the_last_steps_is_bounded():
+def test_a_window_over_the_last_steps_is_bounded():
     growth.require_bounded((min(step, 900) for step in range(10_000)), "sample")
 
 
-def test_a_state_that_grows_for_3000_steps_is_not_bounded():
+def test_a_state_that_grows_for_3000_steps_is_refused():
     with pytest.raises(ContractError, match="1,007 numbers after 1,016 steps and 3,007 after"):
         growth.require_bounded((max(step, 8) - 8 for step in range(10_000)), "sample")
 
 
-def test_numbers_letters_and_columns_count():
+def test_numbers_letters_and_columns_count_as_size():
     state = api.PluginState(
         {"name": "abc", "list": [1, 2]}, {"t": torch.zeros(5)}, {"r": torch.zeros(9, 2)}
     )

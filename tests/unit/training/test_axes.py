@@ -72,14 +72,14 @@ def test_steps_are_stretched_along_the_axes(count, kind):
     assert (np.abs(found.double().numpy() - want) <= bound).all()
 
 
-def test_gaussians_of_one_size_take_the_steps_of_adam():
+def test_gaussians_of_one_size_take_the_plain_steps_of_adam():
     positions, steps, _, quats = gaussians(100, 3)
     found = positions.clone()
     step_along_axes(found, steps, torch.full((100, 3), -4.0), quats)
     assert torch.allclose(found, positions + steps, rtol=1e-6, atol=1e-7)
 
 
-def test_one_axis_takes_no_more_than_its_limit():
+def test_the_stretch_of_one_axis_is_limited():
     scales = torch.tensor([[-50.0, 0.0, 50.0]] + [[0.0, 0.0, 0.0]] * 4)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(5, 1)
     found = torch.zeros(5, 3)
@@ -88,11 +88,11 @@ def test_one_axis_takes_no_more_than_its_limit():
     assert torch.equal(found[1:], torch.ones(4, 3))
 
 
-def test_zero_gaussians_need_no_step():
+def test_steps_of_an_empty_model_work():
     step_along_axes(*(torch.zeros(0, columns) for columns in (3, 3, 3, 4)))
 
 
-def test_a_turned_scene_takes_turned_steps():
+def test_a_rotated_scene_takes_rotated_steps():
     _, steps, scales, quats = gaussians(50, 5)
     quats = torch.nn.functional.normalize(quats)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
@@ -106,7 +106,7 @@ def test_a_turned_scene_takes_turned_steps():
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS == 1, reason="there is one thread")
-def test_threads_change_no_bit(keeps_threads):
+def test_the_number_of_threads_changes_no_bit(keeps_threads):
     found = []
     for threads in (1, 2):
         configure_threads(threads)
@@ -116,7 +116,7 @@ def test_threads_change_no_bit(keeps_threads):
     assert torch.equal(*found)
 
 
-def test_a_gaussian_that_is_not_finite_spoils_no_other():
+def test_a_non_finite_gaussian_does_not_affect_other_gaussians():
     positions, steps, scales, quats = gaussians(9, 2)
     want = positions.clone()
     step_along_axes(want, steps, scales, quats)
@@ -143,7 +143,7 @@ def test_the_typical_size_uses_the_finite_middle_axes(seed, kind):
     assert found == pytest.approx(want, rel=1e-6, nan_ok=True)
 
 
-def test_a_vanishing_quaternion_means_no_rotation():
+def test_a_zero_quaternion_means_no_rotation():
     steps = torch.tensor([[1.0, 2.0, 3.0]]).repeat(3, 1)
     quats = torch.tensor([[1e-20, 2e-20, 0.0, 1e-20], [1e-23, 0.0, 1e-23, 0.0], [0.0] * 4])
     found = torch.zeros(3, 3)
@@ -178,7 +178,7 @@ def with_backbone(backbone):
     return replace(setup, selection=replace(setup.selection, backbone=backbone))
 
 
-def test_a_class_that_inherits_has_no_axes_unless_it_says_so():
+def test_a_derived_backbone_has_no_axes_unless_it_declares_them():
     assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
     assert axes_of(with_backbone(Round())) is None
     first_state(with_backbone(Round()))
@@ -208,7 +208,7 @@ def setup_of(backbone="vanilla", **settings):
         ({"schedule": "absolute", "schedule_length": 10}, True),
     ],
 )
-def test_short_runs_step_by_size(settings, by_size):
+def test_short_runs_use_steps_along_the_axes(settings, by_size):
     assert (axes_of(setup_of(**settings)) is not None) == by_size
 
 
@@ -239,14 +239,14 @@ def test_a_step_moves_positions_along_the_axes(backbone):
 
 
 @pytest.mark.parametrize("backbone", sorted(ANCHORS))
-def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
+def test_per_axis_steps_are_refused_for_a_backbone_without_axes(backbone):
     setup = setup_of(backbone)
     config = setup.config.model_copy(update={"position_lr": "per-axis"})
     with pytest.raises(UserError, match="no Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)
 
 
-def test_a_setting_that_a_checkpoint_does_not_know_counts_as_unchanged():
+def test_a_setting_missing_in_a_checkpoint_counts_as_unchanged():
     config = setup_of().config
     stored = settings_of(config)
     del stored["position_lr"]

@@ -81,7 +81,7 @@ def assembled(monkeypatch):
     return make
 
 
-def test_frozen_blocks_follow_edits_and_checkpoints_and_nothing_else(assembled):
+def test_frozen_blocks_follow_edits_and_checkpoints_and_are_not_trained(assembled):
     setup = assembled(backbone="numbered", densifier="reversing", operator="pcgrad")
     state = first_state(setup)
     count = len(state.parameters["means"])
@@ -107,7 +107,7 @@ def test_a_learning_rate_of_zero_freezes_a_block_of_vanilla():
     assert not torch.equal(state.parameters["means"], before["means"])
 
 
-def test_the_densifier_decides_when_it_acts_and_how_it_starts(assembled):
+def test_the_densifier_determines_its_steps_and_initial_values(assembled):
     setup = assembled(densifier="reversing")
     assert setup.schedule.edits() == 1
     start = first_state(setup).parameters["opacities"]
@@ -117,13 +117,13 @@ def test_the_densifier_decides_when_it_acts_and_how_it_starts(assembled):
 
 
 @pytest.mark.usefixtures("assembled")
-def test_what_the_user_sets_wins_over_the_densifier():
+def test_settings_of_the_user_override_the_densifier():
     config = RunConfig(steps=10, densify_every=3, densifier=ComponentChoice(name="reversing"))
     schedule = assembling.assemble(config, sample_scene(), "none").schedule
     assert (schedule.densify_from, schedule.densify_every) == (1, 3)
 
 
-def test_a_rasterizer_that_lacks_the_response_is_refused(assembled):
+def test_a_rasterizer_without_the_pixel_response_is_refused(assembled):
     assembled(backbone="an", rasterizer="torch")
     with pytest.raises(IncompatibleSelectionError) as caught:
         assembled(backbone="an", rasterizer="plain")

@@ -113,7 +113,7 @@ def reached(step, present=1000):
         (18_000.0, 9000),  # twice as much at the most
     ],
 )
-def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
+def test_the_cost_of_growth_counts_only_while_primitives_grow(affordable, steps):
     assert _fitting(partial(cost_of_run, setup(), CROWD), affordable) == steps
 
 
@@ -121,14 +121,14 @@ def test_growth_is_paid_for_only_where_it_happens(affordable, steps):
     ("affordable", "steps"),
     [(400.0, 400), (599.0, 599), (1200.0, 799), (18_000.0, 9000)],
 )
-def test_edits_that_a_run_never_reaches_cost_nothing(affordable, steps):
+def test_edits_after_the_end_of_a_run_cost_nothing(affordable, steps):
     run = setup(mode="absolute")
     assert _fitting(partial(cost_of_run, run, CROWD), affordable) == steps
     assert bool(growth_note(setup(steps=steps, mode="absolute"))) == (steps < 600)
 
 
 @pytest.mark.parametrize("mode", ["scaled", "absolute"])
-def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
+def test_probe_steps_use_all_bands_and_levels_and_no_edits(mode):
     schedule = _without_edits(Schedule.for_run(12_000, mode))
     steps = [*range(1, 12_001), budget._FULL_SIZE + 1, budget._FULL_SIZE + budget.PROBE_STEPS]
     assert all(schedule.collects(step) for step in steps)
@@ -139,7 +139,7 @@ def test_probed_steps_have_statistics_all_bands_and_levels_and_no_edits(mode):
 
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "strided"])
-def test_probed_steps_gather_statistics_and_have_all_bands(monkeypatch, name, views):
+def test_probe_steps_collect_statistics_and_use_all_bands(monkeypatch, name, views):
     settings = {"seconds": 10.0, "resolution": {"name": "full"}, "views_per_step": views}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     resolution = GROWING.get(name, run.selection.resolution)
@@ -166,7 +166,7 @@ def along_the_curve(steps, start):
     return run, PrimitiveCounts(start, start)
 
 
-def test_growth_along_the_curve_costs_what_the_curve_adds():
+def test_growth_along_the_budget_curve_costs_the_primitives_that_it_adds():
     run, crowd = along_the_curve(1000, 30_000)
     camera = run.train_views[0].camera
     empty = camera.width * camera.height / 8.0
@@ -185,17 +185,17 @@ def test_growth_along_the_curve_costs_what_the_curve_adds():
     assert behind == pytest.approx(mean / (empty + 31_000))
 
 
-def test_budgeted_growth_is_never_estimated_above_unbounded_growth():
+def test_growth_to_a_budget_costs_at_most_the_cost_of_unbounded_growth():
     run, _ = along_the_curve(2000, 1)
     assert growth_ahead(run, PrimitiveCounts(1, 1), run.schedule, 0) == 2.0
 
 
-def test_once_density_control_is_over_every_step_costs_the_same():
+def test_every_step_costs_the_same_after_density_control_has_ended():
     run, _ = along_the_curve(2000, 30_000)
     assert growth_ahead(run, PrimitiveCounts(30_000, 60_000), run.schedule, 1000) == 1.0
 
 
-def test_without_density_control_every_step_costs_the_same():
+def test_every_step_costs_the_same_without_density_control():
     assert _fitting(partial(cost_of_run, setup("none"), CROWD), 18_000.0) == 18_000
 
 
@@ -228,7 +228,7 @@ def grown(step, schedule):
         (3000, lambda step, schedule: 0.06 if step < 1000 else 0.02),
     ],
 )
-def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
+def test_a_time_budget_is_met_even_if_the_probe_was_wrong(planned, cost):
     run, seconds = timed(140.0, planned, cost)
     assert seconds == pytest.approx(140.0, rel=0.01)
     assert run.schedule.total == run.schedule.lr_until
@@ -239,7 +239,7 @@ def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
 
 
 @pytest.mark.parametrize(("each", "steps"), [(0.01, 3000), (0.04, 2334), (0.08, 1168)])
-def test_a_budget_with_a_bound_on_its_steps_ends_with_the_first_of_both(each, steps):
+def test_a_time_budget_with_a_step_limit_ends_with_the_first_of_both(each, steps):
     run, state, length = setup(steps=3000), reached(0), Timed(93.33, most=3000)
     while state.step < run.schedule.total:
         state.step += 1
@@ -251,12 +251,12 @@ def test_a_budget_with_a_bound_on_its_steps_ends_with_the_first_of_both(each, st
     assert all(total <= 3000 for _, total in run.config.revisions)
 
 
-def test_a_budget_that_is_used_up_ends_the_run():
+def test_a_used_up_time_budget_ends_the_run():
     _, seconds = timed(10.0, 1000, lambda step, schedule: 1.0)
     assert seconds == 13.0  # the first look is after twelve steps
 
 
-def test_the_written_lengths_repeat_the_schedule_of_every_step():
+def test_the_recorded_lengths_repeat_the_schedule_of_every_step():
     run, _ = timed(140.0, 3000, grown)
     revisions = run.config.revisions
     assert list(revisions) == run.hook.lengths
@@ -267,7 +267,7 @@ def test_the_written_lengths_repeat_the_schedule_of_every_step():
     assert replay_length(start, step).schedule.total == revisions[3][1]
 
 
-def test_a_length_that_fits_stays():
+def test_a_length_that_fits_the_budget_is_kept():
     run, _ = timed(140.0, 1000, lambda step, schedule: 0.14)
     assert run.config.revisions == ()
     assert run.schedule == Schedule.for_run(1000)
@@ -297,7 +297,7 @@ def test_notes_that_a_new_length_makes_wrong_are_withdrawn():
 
 
 @pytest.mark.parametrize("length", [Timed(140.0), Planned(((20, 3000),))], ids=["timed", "planned"])
-def test_a_note_reports_once_that_density_control_takes_place_after_all(length):
+def test_a_note_reports_once_that_density_control_becomes_active(length):
     run, state = noted(setup(steps=935)), reached(0)
     while state.step < run.schedule.total:
         state.step += 1
@@ -309,7 +309,7 @@ def test_a_note_reports_once_that_density_control_takes_place_after_all(length):
     assert text.startswith("density control after all: in ") and "from step 500 to step" in text
 
 
-def test_a_note_reports_that_a_shorter_length_leaves_density_control_out():
+def test_a_note_reports_that_a_shorter_length_disables_density_control():
     run = noted(setup(steps=3000))
     Planned(((20, 900),)).revised(run, reached(20))
     assert run.hook.texts == list(growth_note(setup(steps=900)))
@@ -341,7 +341,7 @@ def with_pixels(resolution, base=0.01, each=0.03):
 
 
 @pytest.mark.parametrize("name", GROWING)
-def test_the_length_of_a_run_whose_photos_grow_is_planned_with_that(name):
+def test_the_planned_length_includes_the_growing_photo_size(name):
     run, seconds, cost = setup("none"), 60.0, with_pixels(GROWING[name])
     run.selection.resolution = GROWING[name]
     run = replace(run, pixel_share=0.75)
@@ -360,7 +360,7 @@ def test_the_length_of_a_run_whose_photos_grow_is_planned_with_that(name):
     assert len(run.config.revisions) <= 2
 
 
-def test_a_step_ahead_costs_more_where_photos_grow():
+def test_future_steps_cost_more_if_photos_become_larger():
     run = replace(setup("none"), pixel_share=1.0, schedule=Schedule.for_run(100))
     run.selection.resolution = GROWING["octaves"]
     # 20 steps of 1/16, 20 of 1/4, 60 of all pixels.
@@ -394,13 +394,13 @@ def test_the_probe_separates_the_cost_per_pixel(monkeypatch, name, views):
         assert total > 10.0 / 0.04
 
 
-def test_photos_that_were_reduced_stay_when_the_length_changes():
+def test_reduced_photos_are_kept_when_the_length_changes():
     run = assemble(RunConfig(steps=400), sample_scene(), "none")
     run = replace(run, config=run.config.model_copy(update={"revisions": ((3, 500),)}))
     assert replay_length(run, 4).scaled_photos is run.scaled_photos
 
 
-def test_the_note_on_scales_is_that_of_the_length_that_holds():
+def test_the_note_on_scales_follows_the_current_length():
     settings = {"steps": 1000, "resolution": {"name": "octaves"}, "densifier": {"name": "none"}}
     run = assemble(RunConfig.model_validate(settings), sample_scene(), "none")
     told = [note for note in run.notes if note.startswith("resolution")]

@@ -121,7 +121,7 @@ def test_checkpoints_and_results_are_finite(kept, settings, step):
     assert len(sink.rewound) == 1 and sink.rewound[0] < step
 
 
-def test_a_pause_right_after_a_bad_step_rewinds_to_before_it():
+def test_a_pause_right_after_a_bad_step_rewinds_to_the_state_before():
     step = CHECK_EVERY + 3
     sink = Watching()
     setup = watched(Poison(step), sink)
@@ -131,7 +131,7 @@ def test_a_pause_right_after_a_bad_step_rewinds_to_before_it():
     assert sink.shown == [("paused", 5, True), ("paused", step, True)]
 
 
-def test_a_signal_after_a_check_leaves_a_good_state():
+def test_a_signal_after_a_check_leaves_a_valid_state():
     sink = Watching(stops_after=7)
     setup = watched(Poison(7), sink)
     state = first_state(setup)
@@ -140,7 +140,7 @@ def test_a_signal_after_a_check_leaves_a_good_state():
     assert state.step == 0 and is_finite(state)
 
 
-def test_too_many_dropped_gradients_leave_a_good_state():
+def test_too_many_dropped_gradients_leave_a_valid_state():
     sink = Watching()
     setup = watched(Poison(7), sink, max_nonfinite_blocks=1)
     state = first_state(setup)
@@ -168,7 +168,7 @@ class Dropping:
 
 
 @pytest.mark.parametrize("part", ["parameters", "exp_avg", "exp_avg_sq"])
-def test_a_bad_state_is_not_gone_on_from(part):
+def test_a_bad_state_is_not_continued(part):
     sink = Watching()
     setup = watched(Poison(None), sink)
     state = first_state(setup)
@@ -183,7 +183,7 @@ def test_a_bad_state_is_not_gone_on_from(part):
     assert resumed.step == 4 and sink.rewound == []
 
 
-def test_a_bad_first_state_is_named_at_once():
+def test_a_bad_initial_state_is_named_at_once():
     sink = Watching()
     setup = watched(Poison(None), sink)
     state = first_state(setup)

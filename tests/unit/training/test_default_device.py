@@ -50,17 +50,17 @@ def without_a_gpu(monkeypatch):
 
 
 @pytest.mark.usefixtures("without_a_gpu")
-def test_without_a_gpu_the_cpu_is_taken_and_nothing_is_said():
+def test_a_machine_without_a_gpu_uses_the_cpu_without_a_note():
     assert device_of() == ("cpu", ())
 
 
 @pytest.mark.usefixtures("without_a_gpu")
-def test_the_device_that_was_taken_is_in_the_configuration():
+def test_the_selected_device_is_recorded_in_the_configuration():
     assert parsed({}).device == "auto"
     assert assemble(parsed({"steps": 9}), sample_scene(), "none").config.device == "cpu"
 
 
-def test_a_gpu_is_taken_if_a_rasterizer_works_which_is_tried_once(on_a_gpu, caplog):
+def test_a_gpu_is_selected_if_a_rasterizer_works_and_the_trial_runs_once(on_a_gpu, caplog):
     tried = on_a_gpu(*WORKS)
     with caplog.at_level(logging.INFO, "crossgrad_core"):
         device, notes = device_of()
@@ -70,7 +70,7 @@ def test_a_gpu_is_taken_if_a_rasterizer_works_which_is_tried_once(on_a_gpu, capl
     assert "trying rasterizer gswarp on the GPU" in caplog.text
 
 
-def test_without_a_rasterizer_one_line_says_what_to_install(on_a_gpu):
+def test_a_gpu_without_a_rasterizer_gives_one_line_with_the_package_to_install(on_a_gpu):
     on_a_gpu()
     device, (note,) = device_of()
     assert device == "cpu"
@@ -88,7 +88,7 @@ def test_without_a_rasterizer_one_line_says_what_to_install(on_a_gpu):
     ],
     ids=["wrong", "broken"],
 )
-def test_a_rasterizer_that_does_not_work_leaves_the_cpu(on_a_gpu, error, why):
+def test_the_cpu_is_used_if_the_gpu_rasterizer_does_not_work(on_a_gpu, error, why):
     on_a_gpu(*WORKS).error = error
     device, (note,) = device_of()
     assert device == "cpu"
@@ -106,7 +106,7 @@ def test_a_rasterizer_that_does_not_work_leaves_the_cpu(on_a_gpu, error, why):
     ],
     ids=str,
 )
-def test_runs_that_a_gpu_does_not_support_stay_on_the_cpu(on_a_gpu, settings, why):
+def test_runs_that_the_gpu_rasterizers_do_not_support_use_the_cpu(on_a_gpu, settings, why):
     tried = on_a_gpu(*WORKS)
     device, (note,) = device_of(**settings)
     assert device == "cpu"
@@ -114,21 +114,21 @@ def test_runs_that_a_gpu_does_not_support_stay_on_the_cpu(on_a_gpu, settings, wh
     assert not tried.devices
 
 
-def test_the_reference_takes_a_gpu_only_if_it_is_named(on_a_gpu):
+def test_the_reference_rasterizer_uses_a_gpu_only_if_named(on_a_gpu):
     on_a_gpu()
     assert device_of()[0] == "cpu"
     assert device_of(rasterizer={"name": "torch"})[0] == "cuda"
 
 
 @pytest.mark.parametrize("name", ["cpu", "cuda:1"])
-def test_a_device_that_is_named_is_taken_without_a_trial(on_a_gpu, name):
+def test_a_named_device_is_used_without_a_trial(on_a_gpu, name):
     tried = on_a_gpu(*WORKS)
     assert device_of(device=name) == (name, ())
     assert not tried.devices
 
 
 @pytest.mark.usefixtures("without_a_gpu")
-def test_a_run_goes_on_where_auto_leads(tmp_path):
+def test_a_run_can_be_resumed_on_the_automatically_selected_device(tmp_path):
     (tmp_path / "config.yaml").write_text(
         "scene: s\nseed: 0\nsteps: 3\nrasterizer: {name: gsplat}\n"
     )

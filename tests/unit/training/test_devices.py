@@ -40,13 +40,13 @@ def test_a_missing_device_is_reported_with_a_remedy(build, cuda, devices, name, 
 
 
 @pytest.mark.parametrize("name", ["cuda", "cuda:0", "cuda:1"])
-def test_devices_that_are_there_are_taken(build, name):
+def test_available_devices_are_accepted(build, name):
     build("12.4", 2)
     assert choose_device(name) == torch.device(name)
 
 
 @pytest.mark.parametrize("name", ["gpu", "mps", "cuda:x", "cpu:x"])
-def test_names_that_mean_nothing_here_are_refused_with_a_way_out(name):
+def test_unknown_device_names_are_refused_with_a_remedy(name):
     with pytest.raises(UserError) as raised:
         choose_device(name)
     assert "--device" in raised.value.where and raised.value.todo

@@ -9,7 +9,7 @@ from crossgrad_core.training.loop import evaluates_after
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_usual_evaluations_are_far_from_resets_of_the_opacities(views):
+def test_default_evaluations_are_far_from_opacity_resets(views):
     config = RunConfig(steps=20_000, views=views, recipe={"name": "published"})
     setup = assemble(config, sample_scene(), "none")
     resets = [step for step in range(1, 20_000) if setup.schedule.resets(step)]
@@ -38,5 +38,5 @@ def test_default_evaluations_without_resets_are_at_multiples_of_a_tenth(steps, g
     ],
     ids=str,
 )
-def test_opacities_are_reset_where_growth_is_free_or_of_the_published_length(settings, every):
+def test_opacities_are_reset_if_growth_is_unbounded_or_the_length_is_published(settings, every):
     assert assemble(RunConfig(**settings), sample_scene(), "none").schedule.reset_every == every

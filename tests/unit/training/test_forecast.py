@@ -73,7 +73,7 @@ def texts(each, steps, densifier="adc", first=0, wait=0.0, revisions=()):
     return said
 
 
-def test_the_default_length_is_reported_in_hours_once_with_a_way_out():
+def test_the_expected_duration_of_a_default_run_is_reported_once_with_a_remedy():
     ((step, text),) = texts(0.1, 30_000, wait=60.0)  # a slow first step is not taken for the rest
     hours = (30_000 - step) * 0.1 * (1.0 + COST_PER_EDIT * COUNTED_EDITS) / 3600
     assert 1.6 < hours < 1.7
@@ -81,7 +81,7 @@ def test_the_default_length_is_reported_in_hours_once_with_a_way_out():
     assert "one takes 100 ms now, growth included" in text and "--seconds S" in text
 
 
-def test_without_density_control_nothing_is_added():
+def test_the_expected_duration_without_density_control_includes_no_growth():
     ((step, text),) = texts(1.0, 30_000, "none")
     assert step == 1 + LOOK_STEPS
     assert "29,996 more steps take about 8 h 20 min (one takes 1000 ms now)" in text
@@ -92,7 +92,7 @@ def test_a_resumed_run_reports_the_remaining_time():
     assert "996 more steps take about 17 min" in text
 
 
-def test_a_short_run_says_nothing():
+def test_a_short_run_reports_no_expected_duration():
     assert texts(0.01, 900) == []
     assert texts(0.01, 900, revisions=((20, 800),)) == []
 
@@ -101,5 +101,5 @@ def test_a_short_run_says_nothing():
     ("seconds", "text"),
     [(61, "1 min"), (7100, "118 min"), (7200, "2 h 00 min"), (360_000, "100 h 00 min")],
 )
-def test_estimates_are_rough(seconds, text):
+def test_estimated_durations_are_rounded(seconds, text):
     assert roughly(seconds) == f"about {text}"

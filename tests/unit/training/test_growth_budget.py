@@ -71,7 +71,7 @@ numbers = st.integers(0, 10**7)
 
 
 @given(start=numbers, budget=numbers, events=st.integers(1, 500), share=st.floats(0, 1))
-def test_the_curve_is_the_published_one(start, budget, events, share):
+def test_the_growth_curve_is_the_published_curve(start, budget, events, share):
     event = round(share * events)
     a = Fraction(budget - start - 2 * events, events**2)
     assert curve(event, events, start, budget) == floor(a * event**2 + 2 * event + start)
@@ -80,7 +80,7 @@ def test_the_curve_is_the_published_one(start, budget, events, share):
 
 
 @pytest.mark.parametrize("name", GREEDY)
-def test_every_method_that_grows_follows_the_curve(name):
+def test_every_growing_densifier_follows_the_budget_curve(name):
     free = counts_of(setup_of(name))
     start = free[0]
     budget = start + (free[2] - start) // 2  # Less than the first edit alone would add.
@@ -94,7 +94,7 @@ def test_every_method_that_grows_follows_the_curve(name):
     assert at_once[2] == budget
 
 
-def test_the_strongest_come_first():
+def test_the_strongest_candidates_grow_first():
     """What the curve leaves out is what the method itself would have taken last."""
     found = {}
     for growth in ("unbounded", "budget"):
@@ -174,7 +174,7 @@ def test_growth_and_budget_follow_the_settings(settings, growth, bound):
 
 @pytest.mark.parametrize("growth", ["unbounded", "budget"])
 @pytest.mark.parametrize("name", GREEDY)
-def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
+def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name, growth):
     whole = first_state(setup_of(name)).primitives(setup_of(name))
     bound = whole - 10
     setup = setup_of(name, max_gaussians=bound, growth=growth)
@@ -190,7 +190,7 @@ def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
         assert state.primitives(setup) == whole and start_notes(setup, state) == ()
 
 
-def test_a_start_that_is_taken_as_it_is_is_reported_where_it_is_above_the_bound():
+def test_a_ply_start_above_max_gaussians_is_reported():
     state = first_state(setup_of("adc"))
     (told,) = start_notes(setup_of("adc", max_gaussians=30), state)
     assert "more than --max-gaussians 30: a PLY is taken as it is" in told
@@ -199,13 +199,13 @@ def test_a_start_that_is_taken_as_it_is_is_reported_where_it_is_above_the_bound(
 @pytest.mark.parametrize(
     "settings", [{"steps": 4}, {"steps": 2_000, "densifier": {"name": "none"}}]
 )
-def test_without_density_control_all_of_the_bound_is_there_at_once(settings):
+def test_a_run_without_density_control_starts_with_max_gaussians(settings):
     config = RunConfig(initializer={"name": "points"}, max_gaussians=9, **settings)
     setup = assemble(config, sample_scene(), "none")
     assert first_state(setup).primitives(setup) == 9
 
 
-def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
+def test_random_points_are_bounded_and_determined_by_the_seed():
     def means(seed):
         config = RunConfig(seed=seed, steps=4, max_gaussians=300, data={"init": "random"})
         return first_state(assemble(config, sample_scene(), "none")).parameters["means"]
@@ -214,7 +214,7 @@ def test_random_points_are_bounded_too_and_a_seed_draws_the_same():
     assert not torch.equal(means(0), means(1))
 
 
-def test_random_points_know_nothing_of_the_rows_of_sfm_points():
+def test_random_points_ignore_the_indices_of_sfm_points():
     """A scene with more SfM points than random ones: views know them by large rows."""
     scene = sample_scene()
     rows = np.arange(30_000) % len(scene.points)
@@ -227,7 +227,7 @@ def test_random_points_know_nothing_of_the_rows_of_sfm_points():
     assert first_state(setup).primitives(setup) == 300
 
 
-def test_a_bound_is_kept_where_many_points_make_one_anchor():
+def test_max_gaussians_is_respected_if_many_points_form_one_anchor():
     scene = sample_scene()
     spread = np.random.default_rng(0).uniform(-1, 1, (4_000, 3))
     colors = np.zeros((4_000, 3), dtype=np.uint8)
@@ -244,7 +244,7 @@ def test_a_bound_is_kept_where_many_points_make_one_anchor():
     assert 0 < first_state(setup).primitives(setup) <= whole // 2
 
 
-def test_points_that_a_start_added_are_kept_where_they_fit():
+def test_points_added_by_an_initializer_are_kept_if_they_fit_the_bound():
     scene = sample_scene()
     count = len(scene.points)
     sizes = np.full(count, np.nan)
@@ -263,14 +263,14 @@ def test_points_that_a_start_added_are_kept_where_they_fit():
 
 
 @pytest.mark.parametrize("growth", ["unbounded", "budget"])
-def test_a_budget_by_itself_suits_the_length(growth, monkeypatch):
+def test_the_automatic_budget_suits_the_length(growth, monkeypatch):
     monkeypatch.setattr(budgets, "SHORT_BUDGET", 50)
     found = counts_of(setup_of("adc", max_gaussians="auto", growth=growth))
     assert found[-1] == 50 == max(found)
     assert (found[2] == 50) == (growth == "unbounded")
 
 
-def test_budgets_by_length():
+def test_the_default_budget_grows_with_the_length():
     assert [default_budget(20_000, length) for length in (1, 300, 1_000)] == [
         30_001,
         30_303,
@@ -325,7 +325,7 @@ def test_runs_with_few_passes_over_large_photos_have_a_larger_budget(settings, m
 
 
 @pytest.mark.parametrize("longer", [700, 3_000, 5_000])
-def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
+def test_a_changed_length_still_reaches_the_budget(longer):
     """The edits that are left share what is left, however many they have become."""
     counting = Counting("views", ViewsPerStepSpec((1,)), 50, min_refinements=6)
     first = Schedule.for_run(2_000, counting=counting)
@@ -348,7 +348,7 @@ def test_a_length_that_follows_the_clock_still_leads_to_the_budget(longer):
     assert reached[0] < 3_000
 
 
-def test_a_resumed_run_knows_where_it_started(tmp_path):
+def test_a_resumed_run_knows_its_initial_number_of_primitives(tmp_path):
     setup = setup_of("adc", max_gaussians=75, growth="budget")
     whole = counts_of(setup)
     state = first_state(setup)
@@ -359,7 +359,7 @@ def test_a_resumed_run_knows_where_it_started(tmp_path):
     assert [timed_step(setup, state).primitives for _ in range(6)] == whole[4:]
 
 
-def test_a_run_without_a_budget_keeps_nothing_of_it():
+def test_a_run_without_a_budget_stores_no_budget_state():
     state = first_state(setup := setup_of("adc", max_gaussians=60))
     for _ in range(3):
         timed_step(setup, state)
@@ -369,7 +369,7 @@ def test_a_run_without_a_budget_keeps_nothing_of_it():
 @pytest.mark.parametrize(
     ("text", "value"), [("auto", "auto"), ("5000", 5000), ("0", 0), (None, None)]
 )
-def test_budgets_as_written(text, value):
+def test_budgets_are_read_as_written(text, value):
     assert RunConfig(max_gaussians=text).max_gaussians == value
 
 

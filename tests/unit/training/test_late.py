@@ -130,7 +130,7 @@ def long_wait():
 
 @pytest.mark.parametrize("shape", [(3000, 15, 3), (3000, 1, 3)])
 @pytest.mark.parametrize("share", [0.25, 0.9, 1.0])
-def test_with_many_rows_a_step_is_taken_with_all(monkeypatch, shape, share):
+def test_a_step_with_many_rows_updates_all_rows(monkeypatch, shape, share):
     monkeypatch.setattr(late, "MOST_ROWS", 0.2)
     rng = np.random.default_rng(3)
     both = Both(torch.from_numpy(rng.normal(size=shape).astype(np.float32)))
@@ -148,7 +148,7 @@ def test_ten_thousand_deferred_steps_have_the_bits_of_immediate_steps(long_wait)
     assert long_wait[0].same()
 
 
-def test_ten_thousand_late_steps_are_right_to_the_rounding_of_those_that_still_move(long_wait):
+def test_ten_thousand_deferred_steps_are_accurate_to_rounding(long_wait):
     both, start, oracle = long_wait
     way, error = np.abs(oracle - start).max(), np.abs(both.rows.double().numpy() - oracle)
     # Each step rounds the parameter once; some 200 of them are larger than its last place.
@@ -319,7 +319,7 @@ THIRD = {"rules": {"sparse-sh": {"every": 3}}}
     ],
     ids=str,
 )
-def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, plugins):
+def test_runs_with_deferred_steps_have_the_bits_of_runs_without(monkeypatch, settings, plugins):
     lazy, waited = trained(setup_of(**settings), [plugin() for plugin in plugins])
     monkeypatch.setattr(late, "MOST_ROWS", 0.2)
     mixed, _ = trained(setup_of(**settings), [plugin() for plugin in plugins])
@@ -344,9 +344,7 @@ def test_runs_have_the_bits_of_runs_that_put_nothing_off(monkeypatch, settings, 
     ],
     ids=str,
 )
-def test_a_run_that_is_resumed_while_rows_are_behind_has_the_same_bits(
-    tmp_path, monkeypatch, stop, settings
-):
+def test_a_run_resumed_with_deferred_rows_has_the_same_bits(tmp_path, monkeypatch, stop, settings):
     with monkeypatch.context() as patched:
         patched.setattr(NumbaRasterizer, "sparse_rows", False)
         whole, none = trained(setup_of(**settings))
@@ -417,7 +415,7 @@ def test_wrappers_of_the_aggregation_get_dense_gradients():
     assert late == 0
 
 
-def test_other_sparse_gradients_are_brought_into_order():
+def test_unordered_sparse_gradients_are_sorted_and_merged():
     """Rows in any order or twice, as autograd and a wrapper's sums leave them."""
     rows, values = torch.tensor([4, 1, 4]), torch.tensor([[1.0], [2.0], [4.0]])
     found = coalesced(sparse_rows(rows, values, (6, 1)))
@@ -461,7 +459,7 @@ def test_reading_a_tensor_applies_its_deferred_steps(read):
     [Snapshot.hand_over, lambda snapshot, state: snapshot.restore(state, seed=1)],
     ids=["hand over", "rewind"],
 )
-def test_going_back_forgets_what_was_late(go_back):
+def test_a_rewind_discards_deferred_steps(go_back):
     state = behind()
     state.rngs = make_streams(0)
     snapshot = Snapshot.of(state)
@@ -487,7 +485,7 @@ class Failing:
         self.tensor[0] = 5.0
 
 
-def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
+def test_a_failed_update_of_deferred_steps_is_rolled_back():
     state = behind()
     state.rngs = make_streams(0)
     guard, kept = RollbackGuard(state), state.parameters["x"].clone()
@@ -502,7 +500,7 @@ def test_a_step_that_was_under_way_and_fails_is_gone_back_from():
     assert torch.equal(state.parameters["x"], kept)
 
 
-def test_density_control_takes_what_is_seen_from_what_was_drawn():
+def test_density_control_gets_visible_primitives_of_the_rendered_views():
     looks = Seen()
     trained(setup_of(), (looks,))
     assert looks.looks > 10

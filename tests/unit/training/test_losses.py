@@ -19,7 +19,7 @@ WEIGHTS = torch.from_numpy(RNG.random((20, 16), dtype=np.float32))
 
 @pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_weights_are_a_weighted_mean_over_the_kept_pixels(mask, share):
+def test_weights_give_a_weighted_mean_over_the_unmasked_pixels(mask, share):
     found = build("losses", "l1-ssim", {"ssim_weight": share}).loss(IMAGE, PHOTO, mask, WEIGHTS)
     kept = torch.ones(20, 16) if mask is None else mask.float()
     x, y = IMAGE * kept[..., None], PHOTO / 255 * kept[..., None]
@@ -28,7 +28,7 @@ def test_weights_are_a_weighted_mean_over_the_kept_pixels(mask, share):
     assert float(found) == pytest.approx(expected, rel=1e-5)
 
 
-def test_without_weights_the_reference_is_what_it_was():
+def test_the_reference_without_weights_equals_equal_weights():
     plain = l1_ssim_loss(IMAGE, PHOTO, MASK)
     weighted = l1_ssim_loss(IMAGE, PHOTO, MASK, 0.2, torch.full((20, 16), 3.0))
     assert float(plain) == pytest.approx(float(weighted), rel=1e-6)
@@ -48,7 +48,7 @@ def test_an_unknown_loss_is_refused_by_name(tmp_path):
     assert "l1-ssim" in caught.value.todo
 
 
-def test_the_fused_loss_is_what_a_default_run_brings_down(tmp_path):
+def test_a_default_run_minimizes_the_fused_loss(tmp_path):
     from crossgrad_core.run.load_run import set_up
 
     write_tiny_scene(tmp_path / "scene", views=4)

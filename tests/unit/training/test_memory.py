@@ -37,11 +37,11 @@ GIB = 2**30
         ({"views": 4, "joint": True}, 6 + 2 + 4 * 3),  # four graphs instead of an edit
     ],
 )
-def test_copies_of_the_parameters_at_the_worst_moment(kind, copies):
+def test_the_peak_memory_counts_copies_of_the_parameters(kind, copies):
     assert Demand(parameters=236, kept=0, **kind).bytes == copies * 236
 
 
-def test_what_is_decoded_counts_where_it_is_more_than_the_parameters():
+def test_decoded_tensors_count_if_they_exceed_the_parameters():
     assert Demand(parameters=100, kept=800, views=4).bytes == 8 * 100 + 800 + 3 * 200
 
 
@@ -98,22 +98,22 @@ OTHERS = 3
 
 
 @pytest.mark.parametrize("views", [2, 5])
-def test_all_gradients_that_are_kept_are_counted(monkeypatch, views):
+def test_all_stored_gradients_are_counted(monkeypatch, views):
     look = looked(monkeypatch, views=views, operator={"name": "pcgrad"})
     assert look.demand.gradients == views <= look.alive - OTHERS <= views + 1
 
 
-def test_a_sum_keeps_no_gradient_of_a_single_view(monkeypatch):
+def test_a_sum_stores_no_gradient_of_a_single_view(monkeypatch):
     look = looked(monkeypatch, views=5)
     assert look.alive - OTHERS <= look.demand.gradients == 2
 
 
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
-def test_an_edit_finds_no_gradient(monkeypatch, operator):
+def test_no_gradient_is_alive_during_an_edit(monkeypatch, operator):
     assert looked(monkeypatch, views=2, operator={"name": operator}).left == OTHERS
 
 
-def test_more_views_leave_less_room(monkeypatch):
+def test_more_views_leave_less_free_memory(monkeypatch):
     operator = {"name": "pcgrad"}
     few, many = (looked(monkeypatch, views=k, operator=operator) for k in (2, 8))
     joint = looked(monkeypatch, views=8, backward="joint")
@@ -122,21 +122,21 @@ def test_more_views_leave_less_room(monkeypatch):
     assert many.demand.kept == pytest.approx(4 * few.demand.kept, rel=0.3)
 
 
-def test_where_the_system_does_not_say_nothing_is_shown(monkeypatch):
+def test_memory_is_not_shown_on_systems_without_this_information(monkeypatch):
     monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
     assert peak_mebibytes(CPU) is None
     line = cost_line(Totals(1, 2, 3, 4.0, 5, peak_mebibytes(CPU), 0.5))
     assert "5 primitives" in line and "memory" not in line
 
 
-def test_no_module_of_ours_needs_one_that_only_some_systems_have():
+def test_no_module_requires_a_module_that_only_some_systems_have():
     absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
     ours = "import crossgrad_core.run.app, crossgrad_core.run.postprocess.evaluate\n"
     ours += "import crossgrad_plugins.diagnostics.app"
     subprocess.run([sys.executable, "-c", absent + ours], check=True, timeout=100)
 
 
-def test_what_torch_holds_on_to_of_a_gpu_is_there_for_its_next_tensors(monkeypatch):
+def test_memory_reserved_by_torch_counts_as_available(monkeypatch):
     for name, answer in {
         "mem_get_info": (3000, 8000),
         "memory_reserved": 4000,
@@ -146,6 +146,6 @@ def test_what_torch_holds_on_to_of_a_gpu_is_there_for_its_next_tensors(monkeypat
     assert available_bytes(torch.device("cuda")) == 5500
 
 
-def test_this_machine_says_how_much_memory_is_left():
+def test_the_available_memory_of_this_machine_is_found():
     available = available_bytes(CPU)
     assert available is None or available > 0

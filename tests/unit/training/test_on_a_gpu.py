@@ -36,7 +36,7 @@ needs_device = pytest.mark.skipif(FRESH not in os.environ, reason="run in a proc
 
 
 @pytest.mark.skipif(counted.REGISTER is None, reason="this torch has no backends in Python")
-def test_in_a_process_of_their_own(request):
+def test_the_device_tests_of_this_file_pass_in_a_separate_process(request):
     """Runs the tests of this file that need the device."""
     config = request.config
     command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
@@ -131,7 +131,7 @@ def steps(setup, count):
     ],
     ids=str,
 )
-def test_a_step_waits_twice_whatever_k_is(rasterizer, options):
+def test_a_step_reads_back_from_the_device_twice_for_any_k(rasterizer, options):
     """For the losses, and for the Gramians or what tells whether gradients are finite.
 
     What the first step copies there once, later ones find.
@@ -150,7 +150,7 @@ def kind(options):
 
 
 @needs_device
-def test_the_device_notes_what_is_waited_for():
+def test_the_test_device_records_each_value_that_is_read_back():
     with counted.Reads() as reads:
         one = torch.arange(3.0).to(counted.device(), non_blocking=True)
         two = torch.zeros(3, device=counted.device()).to(torch.float64)
@@ -177,7 +177,7 @@ def test_the_device_notes_what_is_waited_for():
 
 
 @needs_device
-def test_a_loss_that_is_not_finite_is_found_and_its_view_named():
+def test_a_non_finite_loss_is_found_and_its_view_is_named():
     setup = on_gpu(Dense(), views=2)
     with counted.Reads():
         state = first_state(setup)
@@ -188,7 +188,7 @@ def test_a_loss_that_is_not_finite_is_found_and_its_view_named():
 
 @needs_device
 @pytest.mark.parametrize("room", [64, 0])
-def test_photos_stay_on_the_device_as_far_as_there_is_room(room):
+def test_photos_are_kept_on_the_device_as_far_as_memory_allows(room):
     view = sample_scene().train_views[0]
     asked = []
 
@@ -224,7 +224,7 @@ class NumbaTogether(NumbaRasterizer):
     ],
     ids=str,
 )
-def test_views_that_are_drawn_together_train_like_views_one_by_one(options):
+def test_views_rendered_together_train_like_views_rendered_one_by_one(options):
     """The same losses, statistics and parameters, to the last bit, from one backward pass."""
     config = {"steps": 100, "metrics": [{"name": "psnr"}], **options}
     setup = assemble(RunConfig.model_validate(config), sample_scene(), "none")

@@ -84,20 +84,20 @@ class Labelled(GramianOperator):
 
 @pytest.mark.parametrize("views", [1, 2, 3, 5])
 @pytest.mark.parametrize("name", EXPECTED)
-def test_known_operators_have_the_sums_of_the_specification(name, views):
+def test_bundled_operators_have_the_specified_scales(name, views):
     scale = scale_of(build("operators", name, {}), views)
     assert scale.per_step == pytest.approx(dict.fromkeys(TENSORS, EXPECTED[name](views)))
     assert scale.per_view == pytest.approx(dict.fromkeys(TENSORS, EXPECTED[name](views) / views))
 
 
 @pytest.mark.parametrize("granularity", ["kind", "global", "gaussian"])
-def test_every_granularity_has_the_same_sum(granularity):
+def test_every_granularity_has_the_same_scale(granularity):
     operator = build("operators", "nash", {"granularity": granularity})
     assert scale_of(operator, 3).per_step == pytest.approx(dict.fromkeys(TENSORS, sqrt(3)))
 
 
 @pytest.mark.parametrize("name", entries("operators"))
-def test_one_view_changes_no_bit(name):
+def test_the_scale_of_an_operator_for_a_single_view_is_exactly_one(name):
     operator = build("operators", name, {})
     if 1 in admitted(operator.views):
         scale = scale_of(operator, 1)
@@ -106,12 +106,12 @@ def test_one_view_changes_no_bit(name):
         assert scale.to_sum == ones
 
 
-def test_chains_follow_their_links():
+def test_the_scale_of_a_chain_is_the_product_of_its_links():
     chain = build("operators", "chain", {"links": ["symmetric", "preconditioner", "mean"]})
     assert scale_of(chain, 4).per_step == pytest.approx(dict.fromkeys(TENSORS, 1))
 
 
-def test_each_block_follows_its_own_operator():
+def test_each_block_has_the_scale_of_its_operator():
     rules = {"geometry": "mean", "appearance": "sum", "net": "nash"}
     scale = scale_of(build("operators", "dispatch", {"rules": rules}), 2)
     expected = {"means": 1, "f_dc": 2, "net.weight": sqrt(2), "net.bias": sqrt(2)}
@@ -119,7 +119,7 @@ def test_each_block_follows_its_own_operator():
     assert scale.to_sum == pytest.approx({name: 2 / value for name, value in expected.items()})
 
 
-def test_a_third_party_operator_is_asked_once_for_each_number_of_views():
+def test_a_third_party_operator_is_evaluated_once_for_each_number_of_views():
     scale = OperatorScale(Fivefold())
     Fivefold.asked.clear()
     for views in (2, 3, 2, 3, 2):
@@ -128,7 +128,7 @@ def test_a_third_party_operator_is_asked_once_for_each_number_of_views():
     assert [len(context.losses) for context in Fivefold.asked] == [2, 3]
 
 
-def test_nothing_but_labels_tells_the_views_apart():
+def test_the_probe_of_an_operator_distinguishes_views_only_by_labels():
     Fivefold.asked.clear()
     context = aggregate_context(sample_gradients(3))
     OperatorScale(Fivefold()).of(replace(context, scales=(1.0, 0.5, 0.25)))
@@ -140,11 +140,11 @@ def test_nothing_but_labels_tells_the_views_apart():
     assert seen.labels == ("near", "far", "near")
 
 
-def test_an_operator_that_needs_labels_gets_those_of_the_step():
+def test_an_operator_that_needs_labels_gets_the_labels_of_the_step():
     assert scale_of(Labelled(), 2).per_step == dict.fromkeys(TENSORS, 1.25)
 
 
-def test_operators_with_their_own_aggregation_are_asked_for_it():
+def test_the_scale_of_an_operator_with_its_own_aggregation_uses_this_aggregation():
     scale = scale_of(Halves(), 3)
     expected = {"means": 1.5, "f_dc": 1.5, "net.weight": 0.0, "net.bias": 0.0}
     assert scale.per_step == expected
@@ -152,7 +152,7 @@ def test_operators_with_their_own_aggregation_are_asked_for_it():
     assert scale.to_sum == {"means": 2.0, "f_dc": 2.0, "net.weight": 1.0, "net.bias": 1.0}
 
 
-def test_asking_leaves_the_step_alone():
+def test_measuring_the_scale_does_not_change_the_step():
     context = aggregate_context(sample_gradients(2))
     drawn = np.random.default_rng(0).bit_generator.state
     OperatorScale(build("operators", "graddrop", {})).of(context)
@@ -161,7 +161,7 @@ def test_asking_leaves_the_step_alone():
     assert neutral(context).rng is not context.rng
 
 
-def test_weights_that_are_not_finite_are_refused_by_name():
+def test_non_finite_weights_are_refused_with_the_operator():
     with pytest.raises(UserError, match="Broken gave weights that are not finite"):
         scale_of(Broken(), 2)
 
@@ -171,13 +171,13 @@ class Overflowing(Operator):
         return AggregateResult({name: torch.tensor([torch.inf]) for name in TENSORS}), state
 
 
-def test_answers_that_are_not_finite_are_refused_by_name():
+def test_non_finite_results_are_refused_with_operator_and_tensor():
     with pytest.raises(UserError) as caught:
         scale_of(Overflowing(), 2)
     assert "Overflowing" in str(caught.value) and "means" in str(caught.value)
 
 
-def test_terms_join_as_often_as_equal_gradients():
+def test_regularizer_terms_are_added_in_proportion_to_equal_gradients():
     scale = Scale.of({"a": 3.0, "b": 1.5, "c": 0.0}, 3)
     one = torch.ones(2)
     of_views = {"a": 10 * one, "b": 10 * one, "c": 10 * one}

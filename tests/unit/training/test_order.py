@@ -45,20 +45,20 @@ def test_rows_are_in_morton_order():
 @pytest.mark.parametrize(
     ("far", "place"), [(torch.nan, 0), (-torch.inf, 0), (torch.inf, 2), (1e38, 2)]
 )
-def test_positions_without_a_cell_are_put_at_an_end(far, place):
+def test_positions_without_a_cell_are_sorted_to_the_end(far, place):
     """Where x is not a number or left of all cells it counts as the first cell, else the last."""
     positions = torch.tensor([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert along_curve(positions).tolist().index(1) == place
 
 
-def test_neighbours_come_to_lie_side_by_side():
+def test_neighbouring_primitives_become_neighbours_in_memory():
     means = random_parameters(4000)["means"]
     apart = (means[1:] - means[:-1]).norm(dim=1).median()
     means = means[along_curve(means)]
     assert (means[1:] - means[:-1]).norm(dim=1).median() < 0.2 * apart
 
 
-def test_all_rows_move_together_and_what_is_shared_stays():
+def test_all_rows_are_reordered_together_and_shared_tensors_are_unchanged():
     parameters = random_parameters(50)
     found = ordered(parameters, BLOCKS, "means")
     rows = found["codes"].long()
@@ -68,14 +68,14 @@ def test_all_rows_move_together_and_what_is_shared_stays():
 
 
 @pytest.mark.parametrize("name", ["", "places", "shared"])
-def test_without_a_tensor_of_positions_nothing_moves(name):
+def test_parameters_without_a_tensor_of_positions_are_not_reordered(name):
     parameters = random_parameters(5)
     assert in_order(parameters, BLOCKS, name) is None
     assert ordered(parameters, BLOCKS, name) is parameters
 
 
 @pytest.mark.parametrize("backbone", ["vanilla", "mip", "scaffold", "octree"])
-def test_steps_that_edit_leave_all_in_order_and_together(backbone, monkeypatch):
+def test_a_step_with_an_edit_reorders_all_rows_together(backbone, monkeypatch):
     """An edit that turns all around: moments and a plugin's rows stay with their primitives."""
     config = RunConfig.model_validate({"steps": 10, "backbone": {"name": backbone}})
     setup = assemble(config, sample_scene(), "none")

@@ -35,7 +35,7 @@ def checkpoint():
     )
 
 
-def test_frozen_whole_numbers_come_back():
+def test_frozen_integer_tensors_are_restored():
     state = from_checkpoint(SETUP, checkpoint())
     assert state.parameters["levels"].dtype == torch.int64
     assert state.parameters["means"].requires_grad
@@ -53,7 +53,7 @@ def test_frozen_whole_numbers_come_back():
         ({"scalars": {}}, "KeyError"),
     ],
 )
-def test_a_checkpoint_of_another_run_is_one_error(changes, found):
+def test_a_checkpoint_of_another_run_gives_one_error(changes, found):
     with pytest.raises(UserError, match="does not fit the run") as caught:
         from_checkpoint(SETUP, replace(checkpoint(), **changes))
     assert found in caught.value.found

@@ -40,7 +40,7 @@ def watched(asked, **changes):
     return replace(scene, views=views)
 
 
-def test_held_out_photos_come_first_and_each_is_decoded_once():
+def test_held_out_photos_are_decoded_first_and_each_photo_once():
     asked, done = [], Event()
     scene = watched(asked)
     last = scene.train_views[-1]
@@ -53,7 +53,7 @@ def test_held_out_photos_come_first_and_each_is_decoded_once():
     assert asked == names
 
 
-def test_nothing_is_decoded_behind_the_block_even_where_it_raises():
+def test_no_photo_is_decoded_after_the_block_even_after_an_exception():
     asked, go_on = [], Event()
     scene = watched(asked, **{sample_scene().test_views[0].name: {"wait": go_on}})
 
@@ -71,7 +71,7 @@ def test_nothing_is_decoded_behind_the_block_even_where_it_raises():
     assert len(asked) == count
 
 
-def test_a_photo_that_cannot_be_decoded_is_left_to_who_asks_for_it():
+def test_an_error_in_decoding_ahead_is_raised_at_the_request():
     asked, name = [], sample_scene().test_views[0].name
     scene = watched(asked, **{name: {"error": OSError("broken")}})
     with decoded_meanwhile(scene):
@@ -82,7 +82,7 @@ def test_a_photo_that_cannot_be_decoded_is_left_to_who_asks_for_it():
         scene.test_views[0].photo.image()
 
 
-def test_kernels_are_loaded_meanwhile():
+def test_photos_are_decoded_while_kernels_are_loaded():
     asked = []
     config = RunConfig(steps=4, exposure={"name": "none"}, plan="off")
     setup = assemble(config, watched(asked), "none")

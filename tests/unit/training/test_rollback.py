@@ -176,7 +176,7 @@ def assert_same(state, wanted) -> None:
 
 
 @pytest.mark.parametrize(("hook", "method", "kept"), HOOKS)
-def test_a_plugin_that_raises_leaves_a_good_state(hook, method, kept):
+def test_a_plugin_that_raises_leaves_a_valid_state(hook, method, kept):
     setup = assembled(trap(hook, method, BrokenError("sorry")))
     state = first_state(setup)
     with pytest.raises(BrokenError) as told:
@@ -187,7 +187,7 @@ def test_a_plugin_that_raises_leaves_a_good_state(hook, method, kept):
     assert_same(state, trained_until(kept))
 
 
-def test_from_there_the_run_ends_as_if_nothing_had_happened():
+def test_a_run_continued_after_an_error_ends_with_the_same_bits():
     setup = assembled(trap("densify", after, BrokenError()))
     state = first_state(setup)
     with pytest.raises(BrokenError):
@@ -208,7 +208,7 @@ def test_any_exception_in_a_hook_rewinds_to_the_last_good_state(error):
 
 
 @pytest.mark.parametrize(("when", "kept"), [("evaluate", 6), ("save", 10)])
-def test_results_that_cannot_be_written_cost_no_step(when, kept):
+def test_results_that_cannot_be_written_lose_no_step(when, kept):
     setup = assembled()
     state = first_state(setup)
     with pytest.raises(BrokenError):
@@ -216,7 +216,7 @@ def test_results_that_cannot_be_written_cost_no_step(when, kept):
     assert_same(state, trained_until(kept))
 
 
-def test_a_state_with_a_value_that_is_not_finite_is_not_kept():
+def test_a_state_with_a_non_finite_value_is_discarded():
     setup = assembled(trap("step_end", of_record, BrokenError()))
     state = first_state(setup)
     # Not looked for between the steps 12 and 15.
@@ -226,7 +226,7 @@ def test_a_state_with_a_value_that_is_not_finite_is_not_kept():
     assert_same(state, trained_until(10))
 
 
-def test_going_back_from_an_edit_that_ran_out_of_memory_asks_for_none(monkeypatch):
+def test_a_rollback_after_an_edit_without_memory_needs_no_memory(monkeypatch):
     def no_room(*_args, **_kwargs):
         raise torch.OutOfMemoryError("no room")
 
@@ -246,7 +246,7 @@ def test_going_back_from_an_edit_that_ran_out_of_memory_asks_for_none(monkeypatc
     assert_same(state, trained_until(WHILE))
 
 
-def test_a_look_that_fails_does_not_keep_the_state_from_going_back(monkeypatch):
+def test_a_failing_check_does_not_prevent_the_rollback(monkeypatch):
     def lost(_state):
         raise RuntimeError("CUDA error")
 
@@ -258,7 +258,7 @@ def test_a_look_that_fails_does_not_keep_the_state_from_going_back(monkeypatch):
     assert_same(state, trained_until(WHILE))
 
 
-def test_checkpoints_are_of_states_that_were_looked_at():
+def test_only_checked_states_are_saved_as_checkpoints():
     """A parameter that nothing draws any more is looked for before it is saved."""
     setup = assembled()
     state = first_state(setup)
@@ -270,7 +270,7 @@ def test_checkpoints_are_of_states_that_were_looked_at():
     assert results.saved == []
 
 
-def test_an_error_found_beside_training_ends_it_after_the_step():
+def test_an_error_reported_from_the_background_ends_training_after_the_step():
     stopper = Stopper()
     setup = assembled()
     state = first_state(setup)
@@ -287,7 +287,7 @@ def test_an_error_found_beside_training_ends_it_after_the_step():
     assert_same(state, trained_until(7))
 
 
-def test_the_traps_cover_every_hook_of_a_step():
+def test_the_tests_cover_every_hook_of_a_step():
     outside = {
         *("validate_selection", "run_start", "update_intervals", "eval_parameters", "final_edit"),
         *("evaluation", "length_changed", "log", "run_end"),

@@ -14,7 +14,7 @@ from crossgrad_core.testing.samplers import sampler_run
 @pytest.mark.parametrize(
     ("scale", "expected"), [(1.0, 0), (0.75, 0), (0.7, -1), (0.5, -1), (0.36, -1), (0.25, -2)]
 )
-def test_octaves_are_the_nearest_powers_of_two(scale, expected):
+def test_scale_octaves_are_the_nearest_powers_of_two(scale, expected):
     assert octave(scale) == expected
 
 
@@ -37,7 +37,7 @@ def _record(loss, scale):
     return StepRecord(1, (0,), ("a",), None, (loss,), 40, {}, 0.1, scales)
 
 
-def test_active_begins_a_view_s_loss_anew_where_the_octave_changes():
+def test_active_restarts_the_running_loss_of_a_view_when_its_scale_octave_changes():
     assert active_after((0.4, 1.0), (0.2, 1.0))["losses"]["0"] == pytest.approx(0.38)
     half = active_after((0.4, 1.0), (0.2, 0.5))
     assert half["losses"]["0"] == 0.2
@@ -74,7 +74,7 @@ def test_gradnorm_compares_with_the_loss_at_the_start_of_the_same_octave():
     assert gradnorm_rates(*full, *half, (0.2, 0.4, 1.0))[0] == pytest.approx([0.5, 1.0])
 
 
-def test_gradnorm_keeps_the_state_that_it_had_at_full_size():
+def test_gradnorm_keeps_its_state_of_full_size():
     _, losses = gradnorm_rates((0.4, 0.4, 1.0))
     assert losses["a"].keys() == {"count", "start", "average"}
     assert PluginState({"losses": losses})

@@ -52,7 +52,7 @@ def test_each_pixel_is_the_mean_of_the_area_that_it_covers(width, height, mask):
         assert (found == expected)[sure].all()
 
 
-def test_a_mask_that_leaves_nothing_out_is_none():
+def test_a_mask_without_masked_pixels_is_dropped():
     assert reduced(IMAGE, torch.ones(23, 37, dtype=torch.bool), 9, 9)[1] is None
 
 
@@ -64,7 +64,7 @@ def test_a_mask_that_leaves_nothing_out_is_none():
     kept=st.sampled_from([None, 0.0, 0.02, 0.5, 1.0]),
     seed=st.integers(0, 99),
 )
-def test_random_photos_are_averaged_as_a_brute_force_does(height, width, shares, kept, seed):
+def test_averages_of_random_photos_agree_with_brute_force(height, width, shares, kept, seed):
     rng = np.random.default_rng(seed)
     image = torch.from_numpy(rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
     mask = None if kept is None else torch.from_numpy(rng.random((height, width)) < kept)
@@ -77,7 +77,7 @@ def test_random_photos_are_averaged_as_a_brute_force_does(height, width, shares,
     assert (found == (cover >= 0.5))[sure].all()
 
 
-def test_a_photo_that_lies_otherwise_in_memory_is_the_same():
+def test_a_photo_with_another_memory_layout_gives_the_same_result():
     turned = IMAGE.transpose(0, 1).contiguous().transpose(0, 1)
     assert torch.equal(reduced(turned, MASK, 9, 8)[0], reduced(IMAGE, MASK, 9, 8)[0])
 
@@ -100,7 +100,7 @@ def resized(view, width, height):
 VIEWS = sample_scene().train_views  # 24 x 16 pixels
 
 
-def test_the_size_that_was_asked_for_last_is_made_once():
+def test_the_last_requested_size_is_computed_once():
     view, full, photos = VIEWS[0], Counted(), ScaledPhotos(1)
     first = photos.get(view, resized(view, 20, 13), full)
     assert photos.get(view, resized(view, 20, 13), full)[0] is first[0]
@@ -114,7 +114,7 @@ def test_the_size_that_was_asked_for_last_is_made_once():
     assert torch.equal(smaller[0], reduced(*half, 7, 5)[0])
 
 
-def test_full_size_is_the_photo_itself_and_nothing_is_kept_beside_it():
+def test_full_size_returns_the_photo_and_stores_no_copy():
     view, full, photos = VIEWS[0], Counted(), ScaledPhotos(1)
     photos.get(view, resized(view, 8, 6), full)
     assert photos._kept and photos._room < 2**20
@@ -122,7 +122,7 @@ def test_full_size_is_the_photo_itself_and_nothing_is_kept_beside_it():
     assert not photos._kept and photos._room == 2**20
 
 
-def test_memory_is_bounded_and_what_does_not_fit_is_made_again():
+def test_memory_is_bounded_and_evicted_photos_are_computed_again():
     full, photos = Counted(), ScaledPhotos(1)
     photos._room = room = 2 * 20 * 13 * 3
     for _ in range(2):
@@ -148,7 +148,7 @@ def test_earlier_requests_change_no_pixel(asked, room):
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])
-def test_statistics_are_those_of_the_full_photo_whatever_the_scale(scale):
+def test_statistics_refer_to_the_full_photo_at_any_scale(scale):
     view = sample_scene().train_views[0]
     size = torch.tensor([view.camera.width, view.camera.height])
     gaussians = Gaussians(torch.zeros(1, 3), torch.zeros(1, 4), torch.ones(1, 3), torch.ones(1))
@@ -166,7 +166,7 @@ def test_statistics_are_those_of_the_full_photo_whatever_the_scale(scale):
     assert torch.allclose(ndc_gradient(record), expected, rtol=1e-6)
 
 
-def test_at_full_size_the_camera_is_the_view_s_own():
+def test_the_camera_of_the_view_is_used_at_full_size():
     camera = sample_scene().train_views[0].camera
     assert camera_at(camera, 1.0) is camera
     assert (camera_at(camera, 0.01).width, camera_at(camera, 0.01).height) == (1, 1)

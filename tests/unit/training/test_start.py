@@ -34,7 +34,7 @@ def decoded(setup, state):
     return setup.backbone.decode(state.parameters, sample_camera(), phase)
 
 
-def test_it_begins_with_all_bands_of_the_file(trained):
+def test_a_run_from_a_ply_starts_with_all_bands_of_the_file(trained):
     setup, state, path = trained
     config = RunConfig.model_validate({"steps": 1000, "data": {"init": str(path)}})
     again = assemble(config, sample_scene(), "none")
@@ -46,7 +46,7 @@ def test_it_begins_with_all_bands_of_the_file(trained):
     assert with_length(again, 10, 2000).schedule.sh_from == 3
 
 
-def test_file_and_degree_are_written_down(trained, monkeypatch):
+def test_the_ply_and_its_degree_are_recorded(trained, monkeypatch):
     path = trained[2]
     monkeypatch.chdir(path.parent)
     config = RunConfig.model_validate({"steps": 1000, "data": {"init": path.name}})
@@ -55,12 +55,12 @@ def test_file_and_degree_are_written_down(trained, monkeypatch):
 
 
 @pytest.mark.parametrize(("asked", "degree"), [(None, 0), (2, 2)])
-def test_points_begin_with_the_degree_that_is_asked_for(asked, degree):
+def test_points_start_with_the_requested_sh_degree(asked, degree):
     setup = assemble(RunConfig(steps=1000, sh_from=asked), sample_scene(), "none")
     assert decoded(setup, first_state(setup)).sh_degree == degree
 
 
-def test_parameters_lie_row_by_row_as_they_come_out_of_a_checkpoint():
+def test_initial_parameters_are_contiguous_in_memory():
     scene = sample_scene()
     turned = replace(scene, points=np.asfortranarray(scene.points))
     assert not turned.points.flags.c_contiguous

@@ -33,7 +33,7 @@ CORNERS = [(2, 0, 0), (2, 1, 0), (2, 0, 1), (2, 1, 1), (3, 2, 1), (4, 3, 3), (5,
 
 @pytest.mark.parametrize("response", ["plain", "antialiased"])
 @pytest.mark.parametrize(("stride", "column", "row"), CORNERS)
-def test_the_reference_draws_the_pixels_of_its_full_render(stride, column, row, response):
+def test_the_reference_renders_exact_pixels_of_the_full_image(stride, column, row, response):
     camera = posed_camera(46, 34)
     # Nobody stands beyond the border, where positions are clamped by the size of the image.
     gaussians = random_gaussians(40, camera, sigmas=(0.05, 4.0), border=0.0, response=response)
@@ -48,7 +48,7 @@ def test_the_reference_draws_the_pixels_of_its_full_render(stride, column, row, 
 
 
 @pytest.mark.parametrize(("stride", "column", "row"), CORNERS)
-def test_kernels_draw_the_pixels_of_their_full_render(stride, column, row):
+def test_kernels_render_exact_pixels_of_the_full_image(stride, column, row):
     camera = posed_camera(64, 48, focal=60.0)
     gaussians = random_gaussians(300, camera, sigmas=(0.2, 5.0), border=0.0).mapped(
         torch.Tensor.float
@@ -62,7 +62,7 @@ def test_kernels_draw_the_pixels_of_their_full_render(stride, column, row):
     assert (drawn - whole[row::stride, column::stride]).abs().mean() < 1e-5
 
 
-def test_gradients_of_all_corners_add_up_to_those_of_the_full_render():
+def test_gradients_of_all_corners_add_up_to_the_gradient_of_the_full_image():
     camera = posed_camera(22, 16)
     start, torch_ = random_gaussians(20, camera, border=0.0), build("rasterizers", "torch", {})
     photo = torch.rand(16, 22, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -83,7 +83,7 @@ def test_gradients_of_all_corners_add_up_to_those_of_the_full_render():
 
 
 @pytest.mark.parametrize("stride", [2, 3, 4])
-def test_every_corner_has_its_turn_whatever_sampler_goes_through_the_photos(stride):
+def test_every_corner_is_used_equally_for_any_sampler_period(stride):
     for period in (1, 2, 3, 4, 7, 112):
         turns = Counter(corner_of(step, 0, stride) for step in range(1, 4000 * period, period))
         assert len(turns) == stride**2
@@ -95,16 +95,16 @@ def test_every_corner_has_its_turn_whatever_sampler_goes_through_the_photos(stri
 @pytest.mark.parametrize(
     ("scale", "stride"), [(1.0, 1), (0.5, 2), (1 / 3, 3), (0.25, 4), (0.6, 1), (0.45, 1), (0.2, 5)]
 )
-def test_strides_are_those_of_whole_numbers(scale, stride):
+def test_strides_exist_for_scales_of_whole_number_ratios_only(scale, stride):
     assert stride_of(scale, posed_camera()) == stride
 
 
-def test_no_stride_is_wider_than_the_photo():
+def test_no_stride_exceeds_the_size_of_the_photo():
     assert stride_of(1 / 8, posed_camera(8, 9)) == 8
     assert stride_of(1 / 8, posed_camera(9, 7)) == 1
 
 
-def test_masks_are_taken_at_the_same_pixels():
+def test_masks_are_sampled_at_the_same_pixels():
     image = torch.arange(5 * 7 * 3, dtype=torch.uint8).reshape(5, 7, 3)
     mask = image[..., 0] > 40
     small, kept = pixels_of((image, mask), 2, (1, 0))
@@ -146,7 +146,7 @@ def scene_of(width, height):
          "8 x 8 to step 48, of each 4 x 4 to step 96, of each 2 x 2 to step 160"),
     ],
 )  # fmt: skip
-def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
+def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, note):
     scene, schedule = scene_of(width, height), Schedule.for_run(200)
     resolution = build("resolutions", "strided", {}).fitted_to(scene)
     assert resolution.coarsest == coarsest
@@ -174,7 +174,7 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
     ("steps", "share"),
     [(100, 0.8), (3000, 0.8), (9487, 0.4), (29_999, 0.0), (30_000, 0.0), (40_000, 0.0)],
 )
-def test_longer_runs_have_all_pixels_sooner(steps, share):
+def test_longer_runs_reach_all_pixels_earlier(steps, share):
     resolution = build("resolutions", "strided", {"coarsest": 2})
     schedule = Schedule.for_run(steps)
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
@@ -184,7 +184,7 @@ def test_longer_runs_have_all_pixels_sooner(steps, share):
     assert build("resolutions", "strided", {"until": 0.5}).window(schedule) == 0.5 * steps
 
 
-def test_a_run_as_long_as_the_published_ones_has_all_pixels_from_its_first_step():
+def test_a_run_of_published_length_renders_all_pixels_from_the_first_step():
     setup = assembled(steps=30_000)
     assert timed_step(setup, first_state(setup)).scales == (1.0,)
 
@@ -219,7 +219,7 @@ def test_strided_rendering_is_the_default_in_short_runs_of_plain_gaussians(case)
 
 
 @pytest.mark.parametrize(("asked", "coarsest"), [(1, 1), (2, 2), (4, 4), (8, 4)])
-def test_an_n_that_is_named_is_that_of_photos_that_are_large_enough(asked, coarsest):
+def test_a_named_stride_is_reduced_for_small_photos(asked, coarsest):
     scene = scene_of(400, 298)
     large = replace(scene.views[0], camera=scene.views[0].camera.resized(1600, 1200))
     scene = replace(scene, views=(large, *scene.views[1:]), train=(0, 1, 2))
@@ -228,12 +228,12 @@ def test_an_n_that_is_named_is_that_of_photos_that_are_large_enough(asked, coars
     assert resolution.fitted_to(scene).coarsest == coarsest
 
 
-def test_a_run_without_a_stage_says_that_a_share_of_zero_was_asked_for():
+def test_a_run_with_a_strided_share_of_zero_reports_so():
     resolution = build("resolutions", "strided", {"coarsest": 2, "until": 0.0})
     assert "this share of the run is 0" in resolution.messages(Schedule.for_run(100))[0]
 
 
-def test_a_rasterizer_with_one_dilation_is_refused():
+def test_a_rasterizer_with_a_fixed_dilation_is_refused():
     gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
     selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
     told = gswarp.crossgrad_validate_selection(selection)
@@ -249,13 +249,13 @@ def assembled(**settings):
     return assemble(RunConfig.model_validate(given), sample_scene(), "none")
 
 
-def test_a_run_draws_some_pixels_and_then_all():
+def test_a_run_renders_some_pixels_first_and_all_pixels_at_the_end():
     setup = assembled(views=2)
     state = first_state(setup)
     assert [timed_step(setup, state).scales[0] for _ in range(20)] == [0.5] * 16 + [1.0] * 4
 
 
-def test_pixels_are_those_of_the_photo_and_another_step_has_others():
+def test_rendered_pixels_are_photo_pixels_and_change_between_steps():
     setup = assembled()
     state = first_state(setup)
     photo = setup.train_views[0].photo.image()
@@ -274,12 +274,12 @@ def test_pixels_are_those_of_the_photo_and_another_step_has_others():
     assert target_at(setup, state, 0, 1.0, slot=0).stride == 1
 
 
-def test_a_response_that_is_a_mean_over_pixels_is_refused():
+def test_a_response_that_averages_over_pixels_is_refused():
     with pytest.raises(UserError, match="is a mean over all of them"):
         assembled(backbone={"name": "analytic"})
 
 
-def test_dilations_of_backbones_are_those_of_the_full_photo():
+def test_dilations_of_backbones_refer_to_the_full_photo():
     setup = assembled(backbone={"name": "mip"})
     state = first_state(setup)
     camera = setup.train_views[0].camera

@@ -127,7 +127,7 @@ def check_two_views(backbone, densifier):
     return runs[0].edited
 
 
-def test_the_pairs_name_every_backbone_and_densifier():
+def test_the_tested_pairs_cover_every_backbone_and_densifier():
     everything = every_pair()
     assert set(PAIRS) <= set(everything)
     assert [set(names) for names in zip(*PAIRS, strict=True)] == [
@@ -162,7 +162,7 @@ def test_sum_and_mean_of_two_views_train_alike_in_every_combination():
 @pytest.mark.matrix
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize(("backbone", "densifier"), PAIRS)
-def test_three_views_differ_by_rounding_only(backbone, densifier):
+def test_sum_and_mean_of_three_views_differ_by_rounding_only(backbone, densifier):
     # In float32 a third is rounded, and Adam makes full steps of gradients that are noise.
     setups = [setup_of(backbone, densifier, name, 3, "torch") for name in ("sum", "mean")]
     runs = [trained(setup, torch.float64) for setup in setups]

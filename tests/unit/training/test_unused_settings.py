@@ -182,7 +182,7 @@ def refusal(settings):
 
 
 @pytest.mark.parametrize(("settings", "name"), IDLE, ids=lambda value: str(value)[:60])
-def test_a_setting_that_would_do_nothing_is_refused_by_name_with_the_reason(settings, name):
+def test_a_setting_without_an_effect_is_refused_with_the_reason(settings, name):
     with pytest.raises(UserError) as caught:
         refusal(settings)
     assert caught.value.where == name
@@ -200,7 +200,7 @@ def test_settings_with_an_effect_are_accepted(settings):
     assert resolved(setup).model_dump(exclude={"reader"}) == config.model_dump(exclude={"reader"})
 
 
-def test_gaussians_of_a_file_are_not_bounded(tmp_path):
+def test_max_gaussians_does_not_limit_a_ply_start(tmp_path):
     setup = assemble(RunConfig(steps=4), sample_scene(), "none")
     export_scene(setup, first_state(setup), tmp_path / "start.ply")
     settings = {"data": {"init": str(tmp_path / "start.ply")}, "max_gaussians": 10}
@@ -218,7 +218,7 @@ def test_defaults_are_never_refused_as_unused(slot):
         assert not set_for_nothing(build(slot, name, {}), selection)
 
 
-def test_listed_splits_leave_test_every_nothing_to_do(tmp_path):
+def test_split_lists_make_test_every_unused(tmp_path):
     scene = write_tiny_scene(tmp_path / "scene")
     names = sorted(path.name for path in (scene / "images").iterdir())
     (scene / "test_list.txt").write_text(names[0])
@@ -249,7 +249,7 @@ def folders(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(("settings", "reason"), LABELS, ids=lambda value: str(value)[:60])
-def test_labels_that_no_view_has_are_refused_before_anything_is_compiled(
+def test_labels_that_no_view_has_are_refused_before_compilation(
     settings, reason, folders, tmp_path
 ):
     given = {
@@ -263,14 +263,14 @@ def test_labels_that_no_view_has_are_refused_before_anything_is_compiled(
     assert reason in caught.value.found
 
 
-def test_labels_of_lists_can_be_named(folders, tmp_path):
+def test_labels_of_lists_can_be_selected(folders, tmp_path):
     operator = {"name": "anchors", "near": "street", "far": "aerial"}
     settings = {"sampler": {"name": "near-far"}, "grouping": {"name": "lists"}}
     given = {"scene": str(folders), "steps": 10, "out": str(tmp_path / "run")}
     assert run({**given, **settings, "operator": operator}, dry_run=True) == 0
 
 
-def test_a_run_that_goes_on_is_not_asked(folders):
+def test_a_resumed_run_with_unused_settings_is_accepted(folders):
     """Runs from before are continued as they were."""
     config = RunConfig.model_validate(
         {
@@ -283,6 +283,6 @@ def test_a_run_that_goes_on_is_not_asked(folders):
 
 
 @pytest.mark.parametrize("name", ["sum", "mean", "graddrop", "preconditioner"])
-def test_operators_that_look_at_no_gramians_have_no_granularity(name):
+def test_operators_without_gramians_have_no_option_granularity(name):
     with pytest.raises(UserError, match="has no option 'granularity'"):
         build("operators", name, {"granularity": "gaussian"})

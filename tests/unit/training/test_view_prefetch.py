@@ -38,7 +38,7 @@ def setup_of(sampler, **changes):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
+def test_the_sampled_views_are_predicted_from_the_first_step_on(sampler):
     setup = setup_of(sampler)
     state, prefetcher = first_state(setup), Prefetcher(setup)
     for _ in range(12):
@@ -51,7 +51,7 @@ def test_the_drawn_views_were_foreseen_from_the_first_step_on(sampler):
 
 
 @pytest.mark.parametrize("sampler", [*SAMPLERS, "active"])
-def test_looking_ahead_touches_nothing(sampler):
+def test_prediction_changes_nothing_in_the_run(sampler):
     setup = setup_of(sampler)
     state, prefetcher = first_state(setup), Prefetcher(setup)
     for _ in range(6):
@@ -63,7 +63,7 @@ def test_looking_ahead_touches_nothing(sampler):
         timed_step(setup, state)
 
 
-def test_a_step_that_drew_something_else_begins_the_guess_anew():
+def test_a_step_with_other_views_restarts_the_prediction():
     setup = setup_of("random")
     state, prefetcher = first_state(setup), Prefetcher(setup)
     prefetcher.update(state)
@@ -75,7 +75,7 @@ def test_a_step_that_drew_something_else_begins_the_guess_anew():
     assert tuple(expected[:2]) == timed_step(setup, state).names
 
 
-def test_views_in_an_array_are_foreseen():
+def test_views_given_as_an_array_are_predicted():
     setup = setup_of("random", views_per_step=2)
     sample = setup.sampler.sample
 
@@ -93,7 +93,7 @@ def test_views_in_an_array_are_foreseen():
 
 
 @pytest.mark.parametrize("views", [(99,), None])
-def test_nothing_is_foreseen_of_views_that_are_not_there(views):
+def test_views_that_do_not_exist_are_not_predicted(views):
     setup = setup_of("random")
     wrong = ViewSample(views)
     object.__setattr__(setup.sampler, "sample", lambda *_: (wrong, EMPTY_STATE))
@@ -101,7 +101,7 @@ def test_nothing_is_foreseen_of_views_that_are_not_there(views):
     assert setup.photos_ahead.names == []
 
 
-def test_nothing_is_foreseen_of_a_sampler_that_fails():
+def test_views_of_a_failing_sampler_are_not_predicted():
     setup = setup_of("random")
     state, prefetcher = first_state(setup), Prefetcher(setup)
 
@@ -115,7 +115,7 @@ def test_nothing_is_foreseen_of_a_sampler_that_fails():
 
 
 @pytest.mark.parametrize(("resolution", "width"), [("octaves", WIDTH // 2), ("strided", WIDTH)])
-def test_photos_that_are_kept_in_the_size_they_are_taken_from_are_not_decoded(resolution, width):
+def test_photos_stored_in_their_source_size_are_not_decoded(resolution, width):
     class OddOnesKept:
         def holds(self, view, camera):
             asked.append(camera.width)

@@ -71,7 +71,7 @@ def of_slot(slot, name, method, answer):
         ("resolution", "resolutions", "full", "scales"),
     ],
 )
-def test_an_answer_without_its_state_names_the_method(word, slot, name, method, answer):
+def test_a_result_without_its_state_is_reported_with_the_method(word, slot, name, method, answer):
     error = refused(setup_of({word: of_slot(slot, name, method, answer)}))
     assert f"Wrong.{method} gave a wrong answer" in error.what
     assert __name__ in error.where
@@ -86,13 +86,13 @@ def test_decode_must_return_gaussians(answer):
 
 
 @pytest.mark.parametrize("answer", [None, 3, (1, 2)])
-def test_what_a_backbone_creates_are_tensors(answer):
+def test_backbones_must_create_tensors(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
     assert "Wrong.create gave a wrong answer" in error.what
 
 
 @pytest.mark.parametrize("answer", [{}, {"moans": torch.zeros(3, 3)}, {"means": None}])
-def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
+def test_backbones_must_create_exactly_the_tensors_of_their_blocks(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
     assert "Wrong.create makes other tensors than its blocks name" in error.what
     assert error.expected == "means"
@@ -106,7 +106,7 @@ def test_prepare_must_return_all_tensors_of_the_blocks():
     assert error.expected.startswith("means, scales, quats")
 
 
-def test_what_a_backbone_prepares_it_need_not_create():
+def test_tensors_that_a_backbone_prepares_need_not_be_created():
     class Late(type(build("backbones", "vanilla", {}))):
         def create(self, scene, rng):
             made = super().create(scene, rng)
@@ -151,13 +151,13 @@ def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, 
 
 
 @pytest.mark.parametrize("scales", ["a", (None,), ()])
-def test_scales_are_numbers(scales):
+def test_scales_must_be_numbers(scales):
     wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
     assert refused(setup_of({"resolution": wrong})).what.startswith("the resolution does not give")
 
 
 @pytest.mark.parametrize("shape", [(2,), (6, 3), (5, 2), ()])
-def test_weights_of_another_shape_say_which(shape):
+def test_weights_of_a_wrong_shape_are_reported_with_both_shapes(shape):
     class Own(Weighting):
         def weights(self, gramians, context):
             return np.ones(shape)
@@ -171,7 +171,7 @@ def test_weights_of_another_shape_say_which(shape):
 
 
 @pytest.mark.parametrize("tail", [(3,), (1, 2)])
-def test_matrices_of_another_shape_say_which(tail):
+def test_matrices_of_a_wrong_shape_are_reported_with_their_shape(tail):
     class Own(GramianOperator):
         def transform(self, gramians, context, state, rng):
             return np.ones((len(gramians), 1, *tail)), state
@@ -211,14 +211,14 @@ def test_a_wrong_hook_result_names_the_plugin(plugin):
     assert "stranger" in error.where
 
 
-def test_right_answers_pass():
+def test_correct_results_are_accepted():
     plugin = Answers(DensifyResult(NO_EDIT), RegularizeResult(torch.ones(1)))
     setup = setup_of(stranger=plugin)
     assert take_step(setup, first_state(setup)).step == 1
 
 
 @pytest.mark.parametrize("name", sorted(TAKEN))
-def test_names_of_others_are_refused(name):
+def test_states_under_names_of_other_plugins_are_refused(name):
     plugin = Answers(DensifyResult(NO_EDIT, states={name: PluginState({"n": 1})}))
     error = refused(setup_of(stranger=plugin))
     assert repr(name) in error.what
@@ -226,12 +226,12 @@ def test_names_of_others_are_refused(name):
 
 
 @pytest.mark.parametrize("states", [None, [PluginState()]])
-def test_states_are_a_mapping(states):
+def test_states_must_be_a_mapping(states):
     plugin = Answers(DensifyResult(NO_EDIT, states=states))
     assert refused(setup_of(stranger=plugin)).expected.startswith("a mapping")
 
 
-def test_a_component_keeps_its_own_state_in_every_hook_that_it_has():
+def test_a_component_stores_its_state_in_every_hook_that_it_implements():
     kind = type(build("densifiers", "none", {}))
 
     class Own(kind):
@@ -245,12 +245,12 @@ def test_a_component_keeps_its_own_state_in_every_hook_that_it_has():
     assert state.states["densifier"].values == {"n": 1}
 
 
-def test_a_state_that_is_none_is_refused_at_once():
+def test_a_state_of_a_wrong_type_is_refused_at_once():
     plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": {"n": 1}}))
     assert refused(setup_of(stranger=plugin)).found == "dict"
 
 
-def test_the_names_of_the_core_are_those_that_it_uses():
+def test_the_reserved_names_are_the_state_names_of_the_core():
     slots = {each.STATE for each in (sampler, operator, densifier, resolution)}
     own = {each.STATE for each in (per_image_params, growth_budget)} | {step.GROUPING}
     assert slots | own | {start.THINNED} == TAKEN
@@ -281,7 +281,7 @@ def test_the_names_of_the_core_are_those_that_it_uses():
         ),
     ],
 )
-def test_an_edit_that_does_not_fit_says_how(edit, found):
+def test_an_edit_that_does_not_fit_is_reported_with_the_reason(edit, found):
     setup = setup_of(stranger=Answers(DensifyResult(edit)))
     state = first_state(setup)
     assert state.primitives(setup) == 40
@@ -291,7 +291,7 @@ def test_an_edit_that_does_not_fit_says_how(edit, found):
 
 
 @pytest.mark.parametrize("values", [torch.zeros(()), torch.zeros(3), torch.zeros(1, 3)])
-def test_values_that_spread_over_the_rows_fit(values):
+def test_values_that_broadcast_over_the_rows_are_accepted(values):
     setup = setup_of(stranger=Answers(DensifyResult(Edit(values={"means": Rows(values)}))))
     state = first_state(setup)
     take_step(setup, state)
@@ -329,14 +329,14 @@ def with_means(means):
         (with_means(torch.zeros(40, 3).double()), "[40, 3] of torch.float64, not [40, 3]"),
     ],
 )
-def test_aggregated_gradients_fit_the_parameters(plugin, found):
+def test_aggregated_gradients_must_fit_the_parameters(plugin, found):
     error = refused(setup_of(wrapping=plugin))
     assert error.what == "the aggregated gradients do not fit the parameters"
     assert "operator sum" in error.where
     assert found in error.found
 
 
-def test_a_tensor_may_be_skipped_and_counts_be_numbers_of_numpy():
+def test_a_tensor_may_be_skipped_and_counts_may_be_numpy_numbers():
     counts = {"dropped": np.int64(2), "odd": torch.tensor(3)}
     setup = setup_of(
         wrapping=Wraps(lambda answer: replace(answer, counts=counts)), a=with_means(None)
@@ -353,19 +353,19 @@ def labelled(labels):
 
 
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
-def test_labels_are_one_text_for_each_view(labels):
+def test_labels_must_be_one_text_for_each_view(labels):
     error = refused(setup_of({"sampler": labelled(labels)}))
     assert error.what == "the sampler does not label each view that it draws"
     assert "sampler epoch" in error.where
 
 
 @pytest.mark.parametrize("labels", [["a"], np.array(["a"])])
-def test_labels_may_be_listed(labels):
+def test_labels_may_be_a_list(labels):
     setup = setup_of({"sampler": labelled(labels)})
     assert take_step(setup, first_state(setup)).labels == ("a",)
 
 
-def test_scales_of_numpy_are_numbers_in_the_record():
+def test_scales_given_as_numpy_numbers_become_numbers_in_the_record():
     wrong = of_slot("resolutions", "full", "scales", ((np.float32(0.5),), PluginState()))
     setup = setup_of({"resolution": wrong})
     scales = take_step(setup, first_state(setup)).scales
@@ -385,13 +385,13 @@ def test_scales_of_numpy_are_numbers_in_the_record():
         (PluginState(per_primitive={"t": torch.zeros(40).cdouble()}), "per_primitive, t: "),
     ],
 )
-def test_a_state_that_no_checkpoint_can_hold_is_refused_at_once(held, found):
+def test_a_state_that_a_checkpoint_cannot_store_is_refused_at_once(held, found):
     error = refused(setup_of(stranger=Answers(DensifyResult(NO_EDIT, states={"stranger": held}))))
     assert error.what == "a checkpoint cannot hold the state of plugin stranger"
     assert found in error.where
 
 
-def test_a_state_is_looked_at_where_it_has_new_names():
+def test_a_state_with_new_names_is_checked_again():
     plugin = Answers(DensifyResult(NO_EDIT, states={"stranger": PluginState()}))
     setup = setup_of(stranger=plugin)
     state = first_state(setup)
@@ -448,7 +448,7 @@ def more_points(**changed):
         ({"opacities": np.array([0.5, 1.0])}, "an opacity that is not between 0 and 1"),
     ],
 )
-def test_what_a_start_adds_can_be_points(changed, found):
+def test_points_added_by_an_initializer_must_be_valid(changed, found):
     start = of_slot("initializers", "points", "more_points", more_points(**changed))
     error = refused(setup_of({"initializer": start}))
     assert error.what == "initializer points adds what cannot be points"
@@ -456,7 +456,7 @@ def test_what_a_start_adds_can_be_points(changed, found):
     assert found in error.found
 
 
-def test_good_points_of_a_start_are_taken_and_its_own_errors_come_through():
+def test_valid_points_of_an_initializer_are_used_and_its_errors_are_passed_on():
     setup = setup_of(
         {"initializer": of_slot("initializers", "points", "more_points", more_points())}
     )
@@ -471,7 +471,7 @@ def test_good_points_of_a_start_are_taken_and_its_own_errors_come_through():
 
 
 @pytest.mark.parametrize("form", ["d", "%.2f"])
-def test_a_form_that_formats_no_numbers_is_refused_before_the_run(monkeypatch, form):
+def test_an_invalid_number_format_of_a_metric_is_refused_before_the_run(monkeypatch, form):
     psnr = type(build("metrics", "psnr", {}))
     monkeypatch.setattr(psnr, "figure", replace(psnr.figure, form=form))
     with pytest.raises(UserError, match="metric psnr has a figure that cannot be shown") as caught:
@@ -479,14 +479,14 @@ def test_a_form_that_formats_no_numbers_is_refused_before_the_run(monkeypatch, f
     assert caught.value.found == repr(form)
 
 
-def test_groups_of_any_labels_are_counted_in_words():
+def test_any_number_of_group_labels_is_listed_in_the_objection():
     setup = setup_of({"sampler": build("samplers", "near-far", {})})
     names = {**setup.selection.names, "grouping": "odd"}
     selection = replace(setup.selection, names=names, labels=(0, 1, 2))
     assert "gives 3: 0, 1, 2" in " ".join(objections_to(selection))
 
 
-def test_groups_are_named_by_their_kind_whatever_blocks_are_called():
+def test_groups_are_named_by_kind_for_any_block_names():
     rate = LearningRate(1.0)
     blocks = (
         Block("all", ("a",), True, "geometry", rate),

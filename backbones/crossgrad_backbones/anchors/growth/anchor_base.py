@@ -29,7 +29,7 @@ GRADIENT, RENDERS = "gradient", "renders"
 
 
 def observed(context: DensifyContext, state: PluginState) -> PluginState:
-    """Add the views of this step to the sums.
+    """Add the statistics of this step's views to the running sums.
 
     Source: Scaffold-GS, section 3.3; methods of section 2.5.
     """
@@ -72,14 +72,14 @@ class GrowthRequest:
 
     Attributes:
         gradient: [P, k] mean gradient norm of each offset, NDC.
-        eligible: [P, k] bool, offsets that were seen often enough for a decision.
+        eligible: [P, k] bool, offsets that were visible often enough for a decision.
     """
 
     gradient: Tensor
     eligible: Tensor
 
     def among(self, may_grow: Tensor | None) -> "GrowthRequest":
-        """Restrict the request to the anchors that may grow [P]; None for all anchors."""
+        """Restrict the request to the anchors that may grow [P]; None means all anchors."""
         if may_grow is None:
             return self
         return replace(self, eligible=self.eligible & may_grow[:, None])
@@ -93,8 +93,8 @@ class NewAnchors:
         positions: [M, 3] local units.
         cells: [M] edge of the cell of each anchor, local units.
         features: [M, F].
-        parents: [M] int64, an anchor whose offset requested the new anchor.
-        strength: [M] the largest gradient that requested the new anchor.
+        parents: [M] int64, the anchor whose offset requested each new anchor.
+        strength: [M] the largest gradient among the requests for each new anchor.
         further: Tensor name -> [M, ...], other tensors that are not copied from the parents.
     """
 
@@ -109,7 +109,7 @@ class NewAnchors:
         return int(self.positions.shape[0])
 
     def limited(self, room: int) -> tuple["NewAnchors", int]:
-        """Return the strongest `room` anchors in their order, and the number left out."""
+        """Return the `room` strongest anchors, in unchanged order, and the number of others."""
         left_out = max(0, len(self) - room)
         if left_out == 0:
             return self, 0
@@ -117,7 +117,7 @@ class NewAnchors:
         return self.at(ranked[:room].sort().values), left_out
 
     def and_more(self, more: "NewAnchors") -> "NewAnchors":
-        """Append other anchors with the same further tensors."""
+        """Append other anchors that have the same further tensors."""
         return NewAnchors(
             torch.cat([self.positions, more.positions]),
             torch.cat([self.cells, more.cells]),
@@ -168,7 +168,7 @@ class AnchorDensifier(Densifier):
 
         Args:
             context: The step.
-            parameters: Its parameters, detached.
+            parameters: The parameters of the anchors, detached.
             request: The requests of the offsets.
         """
 

@@ -23,7 +23,7 @@ from crossgrad_core.plugin import DensifyContext, Parameters, Schedule, Selectio
 
 @dataclass(frozen=True)
 class Level:
-    """One cell size.
+    """One cell size of the growth, with its threshold.
 
     Attributes:
         cell: Edge of a cell, local units.
@@ -45,8 +45,8 @@ def grown(
 ) -> NewAnchors:
     """Return new anchors from the offsets of the present anchors, level by level.
 
-    Growth stops at the first level if that level adds no anchor. New anchors of this call occupy
-    their cells but do not grow themselves.
+    Growth stops after the first level if that level adds no anchor. Anchors added in this call
+    occupy their cells but are not sources of further growth.
 
     Args:
         parameters: `anchors` [P, 3], `offsets` [P, k, 3], `features` [P, F], `scales` [P, 6].
@@ -103,7 +103,7 @@ class AnchorControl(AnchorDensifier):
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
-        """See `HasUnusedOptions`."""
+        """Return the options without an effect; see `HasUnusedOptions`."""
         if self.levels > 1:
             return {}
         why = "there is one size of cells (levels = 1); leave it out"

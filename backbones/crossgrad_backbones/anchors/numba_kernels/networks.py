@@ -181,7 +181,7 @@ def scatter(
         out_log_scales: [P, 6] zero, written at `rows`.
         raw: [n or more, 11 k] output: gradient of the raw opacities, covariances and colours.
         tanhs: [A, k] opacities before the factor.
-        factors: [A] their factors.
+        factors: [A] factors of the opacities.
         offsets: [P, k, 3].
         colors: [G, 3] as drawn.
         v_means: [G, 3] gradient of the means.

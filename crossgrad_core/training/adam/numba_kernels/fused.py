@@ -73,7 +73,7 @@ def _update_chunks(
         addresses: [T, 4] addresses of each tensor's values, gradient and moments.
         sizes: [T] numbers of elements.
         numbers: [T, 9] coefficients of each tensor's step.
-        from_zero: [T] whether a tensor is uninitialised; zeros are then written to it first.
+        from_zero: [T], True if a tensor is uninitialised; zeros are then written to it first.
     """
     chunks = 0
     for size in sizes:

@@ -4,8 +4,8 @@ The bits are the same as with `fused` on a whole tensor. With a gradient of zero
 
     m = beta1 m,   v = beta2 v,   p -= step_size * (m / (sqrt(v) * root_scale + eps))
 
-with the flushes to zero of `coefficients`. So eight elements take any number of steps in registers,
-and memory is read and written only once.
+with the flushes to zero of `coefficients`. Eight elements therefore take any number of steps in
+registers, and memory is read and written only once.
 """
 
 import numpy as np
@@ -132,14 +132,14 @@ def catch_up(
 
     Args:
         jobs: From `share`.
-        whole: Whether to update all rows.
-        rows: [R] the rows to update, each once; unused if `whole`.
+        whole: True to update all rows.
+        rows: [R] the rows to update, without duplicates; unused if `whole`.
         width: Elements of a row.
         param: [N * width].
         exp_avg: [N * width].
         exp_avg_sq: [N * width].
         done: [N] number of steps that each row has taken; updated.
-        before: Number of steps before the table; every row has taken these.
+        before: Number of steps before the table; every row has taken these steps.
         steps: [T * NUMBERS] the table of later steps.
     """
     count = done.size if whole else rows.size
@@ -219,7 +219,7 @@ def _step_row(
 ) -> None:
     """Apply one step to a row of WIDE elements or more.
 
-    Its gradient is row `place` of `grad` if it was drawn, else zero.
+    The gradient of the row is row `place` of `grad` if the row was rendered, else zero.
     """
     at, begin, g = row * width, place * width, splat_wide(_ZERO)
     # The last sixteen elements overlap with earlier ones, so compute them before these are written.
@@ -257,13 +257,13 @@ def update_rows(
 
     Args:
         jobs: From `share`.
-        rows: [R], sorted, each once; consecutive rows are updated as one piece of memory.
+        rows: [R], sorted and unique; consecutive rows are updated as one piece of memory.
         width: Elements of a row.
         param: [N * width].
         grad: [R * width].
         exp_avg: [N * width].
         exp_avg_sq: [N * width].
-        numbers: Of the step, as in `fused`.
+        numbers: The coefficients of the step, as in `fused`.
     """
     wide = width >= WIDE
     room, together = (0, _SIDE_BY_SIDE) if wide else (_GATHERED * width, _GATHERED)
@@ -315,13 +315,13 @@ def update_all(
 
     Args:
         jobs: From `share`.
-        rows: [R], sorted, each once.
+        rows: [R], sorted and unique.
         width: Elements of a row.
         param: [N * width].
         grad: [R * width].
         exp_avg: [N * width].
         exp_avg_sq: [N * width].
-        numbers: Of the step, as in `fused`.
+        numbers: The coefficients of the step, as in `fused`.
     """
     count, together = param.size // width, _LINE * max(1, _AT_ONCE // _LINE // width)
     pulls = np.zeros(together * width, np.float32)

@@ -91,7 +91,10 @@ def near_copies(rng: np.random.Generator, blocks: int, views: int, elements: int
 
 
 def _apart(rng: np.random.Generator, blocks: int, elements: int) -> Rows:
-    """Return masks [B, 1, P]. At elements that they set to zero, small distances stay exact."""
+    """Return masks [B, 1, P].
+
+    Small distances are exact at elements that these masks set to zero.
+    """
     kept = rng.random((blocks, 1, elements)) < 0.6  # noqa: PLR2004
     kept[:, :, 0] = True
     return np.where(rng.random((blocks, 1, 1)) < 0.5, 1.0, kept)  # noqa: PLR2004

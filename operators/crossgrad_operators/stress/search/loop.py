@@ -38,8 +38,8 @@ class Extent:
     """The start and the extent of a search.
 
     Attributes:
-        seed: Seed of all random numbers. A longer search begins with the cases of a shorter one.
-        seconds: No round begins after this duration.
+        seed: Seed of all random numbers. A longer search begins with the cases of a shorter search.
+        seconds: No round begins after this time.
         rounds: Greatest number of rounds, or None.
         dtypes: Types of gradients, used in turn.
     """
@@ -130,7 +130,7 @@ def shrunk(subject: Subject, specimen: Sample, *, inside: bool) -> Sample:
 
     Args:
         subject: The operator.
-        specimen: A case with a large error inside the set, or with a long result outside.
+        specimen: A case with a large error inside the set, or with a long result outside the set.
         inside: True for an error inside the set.
     """
     least = KEPT * specimen.value
@@ -159,7 +159,7 @@ def _smaller(subject: Subject, rows: Rows, dtype: torch.dtype) -> Iterator[Rows]
 
 
 def _parts(count: int, least: int) -> Iterator[range]:
-    """Yield index ranges to leave out, the longest first, so that at least `least` remain."""
+    """Yield removable index ranges, the longest first, so that at least `least` indices remain."""
     size = count // 2
     while size:
         for first in range(0, count, size):

@@ -60,7 +60,7 @@ def _row(tally: WorstCases) -> dict[str, str | int | float]:
 
 
 def failed(tally: WorstCases) -> bool:
-    """Return whether a promise was broken."""
+    """Return True if a promise was broken."""
     return tally.broken > 0 or _too_often_outside(tally)
 
 

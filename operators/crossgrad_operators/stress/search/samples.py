@@ -19,7 +19,7 @@ from crossgrad_operators.stress.search.families import (
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A case and its value, which measures how bad the case is.
+    """A case and its value, which states how bad the case is.
 
     Attributes:
         rows: [K, P] gradients that are exact in their type.
@@ -61,7 +61,7 @@ Mutation = Callable[[np.random.Generator, Rows], Rows]
 
 
 def mutants(rng: np.random.Generator, parents: Sequence[Sample], admitted: ViewCounts) -> Batch:
-    """Return variants of one of the parents, sometimes with one row or element more or less."""
+    """Return variants of the parents, some of them with one row or element more or less."""
     parent = parents[int(rng.integers(len(parents)))]
     rows = parent.rows
     if rng.random() < 0.2:  # noqa: PLR2004

@@ -164,16 +164,16 @@ def meetings(
 ) -> Iterator[Row]:
     """Yield few admitted rows in which one value meets every value of the other factors.
 
-    First, the values of all factors are taken in turn. Values that do not occur in an admitted row
-    are then tried with the default values of the other factors, of which one at a time is changed.
-    Not every row is tried, because many factors have too many rows.
+    First, the values of all factors are combined in turn. Values that do not occur in an admitted
+    row are then tried with the default values of the other factors, of which one at a time is
+    changed. Not every row is tried, because many factors have too many rows.
 
     Args:
         place: Factor of the value.
         value: The value.
         values: The values of each factor.
         usual: Completes a row in which some values are given.
-        admits: Returns True if a row can work.
+        admits: Function that returns True if the components of a row can be combined.
     """
     missing = {(i, each) for i, some in enumerate(values) if i != place for each in some}
     for turn in range(max(map(len, values))):

@@ -78,7 +78,7 @@ def members_of(package: str) -> Members:
 
 
 def _cannot_be_combined(entry: Entry) -> str:
-    """Return why a component is left out; empty if it is not."""
+    """Return the reason why a component is left out; empty if it is not left out."""
     if [each.name for each in offers(entry.slot)].count(entry.name) > 1:
         return "two packages offer that name"
     try:
@@ -103,8 +103,9 @@ def combinations_of(members: Members, admits: Admits, *, full: bool) -> Iterator
     Args:
         members: The components that are combined.
         admits: Called with every requested combination; returns True if it can work.
-        full: True for all combinations with a component of the package. False for as few as bring
-            each of them together with every component of the other slots that it works with.
+        full: True for all combinations with a component of the package. False for the fewest
+            combinations in which each of them occurs with every component of the other slots that
+            it can work with.
     """
     ours = sorted((SLOTS.index(slot), name) for slot, name in members.own if slot in SLOTS)
     if ours:

@@ -1,4 +1,4 @@
-"""`crossgrad plugins matrix`: trains the combinations of a package and reports the results."""
+"""`crossgrad plugins matrix`: train the combinations of a package and report the results."""
 
 import traceback
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ class Tally:
     def admits(self, row: Row, slots: tuple[str, ...]) -> bool:
         """Return True if a run of the combination can start; record the reasons if it cannot.
 
-        An error other than a refusal occurs again in training, and is recorded then.
+        An error other than a refusal occurs again in training, where it is recorded.
         """
         try:
             reasons = reasons_to_refuse(config_of(row, slots))
@@ -76,17 +76,17 @@ def reason_of(error: BaseException) -> str:
 
 
 def train_matrix(package: str, *, full: bool) -> tuple[str, bool]:
-    """Train a package's components with all others.
+    """Train a package's components with all other components.
 
     Args:
         package: Name of a distribution, or of an import package that holds plugins.
-        full: All combinations instead of a pairwise design.
+        full: True for all combinations instead of a pairwise design.
 
     Returns:
         The report in 80 columns, and whether everything was trained or refused without failure.
 
     Raises:
-        UserError: See `members_of`.
+        UserError: For the reasons of `members_of`.
     """
     tally = Tally(members_of(package))
     progress = Progress(_PAUSE)
@@ -151,7 +151,7 @@ def report(tally: Tally, package: str) -> str:
 
 
 def _refusals(rows: Refused, slots: tuple[str, ...], tally: Tally) -> list[str]:
-    """Return the refusals in few lines, which contain no combination that was trained."""
+    """Return the refusals in few lines that contain no trained combination."""
     known = set(slots)
     trained = [each for each in tally.trained if {slot for slot, _ in each} == known]
     names = [dict(each) for each in trained]

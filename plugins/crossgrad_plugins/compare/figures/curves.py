@@ -23,7 +23,7 @@ _POINTS = 301
 
 
 def draw_curves(c: Comparison, cost: Cost) -> Drawn:
-    """Draw the main figure of all arms over one cost."""
+    """Draw the main metric of all arms over one cost."""
 
     def panel(ax: "Axes", scene: str) -> None:
         limits = draw_bands(ax, c, scene, c.quantity, cost)
@@ -98,7 +98,7 @@ def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
 
 
 def draw_regimes(c: Comparison) -> Drawn:
-    """Draw the final figure of each arm, overall and by regime."""
+    """Draw the final metric of each arm, overall and by regime."""
     look = looks([arm.name for arm in c.arms])
 
     def panel(ax: "Axes", scene: str) -> None:
@@ -134,7 +134,7 @@ def draw_regimes(c: Comparison) -> Drawn:
 
 
 def draw_profile(c: Comparison) -> Drawn | None:
-    """Draw a panel for each cost; return None with one arm or without a problem of all arms."""
+    """Draw a panel for each cost; return None for a single arm or without a problem of all arms."""
     by_cost = {cost: ratios([row for row in c.reached if row.cost == cost]) for cost in c.costs}
     shown = {cost.title: by for cost, by in by_cost.items() if any(by.values())}
     if len(c.arms) < 2 or not shown:  # noqa: PLR2004 - nothing to compare

@@ -40,7 +40,7 @@ _COLORS: Final = {
 
 
 def draw_differences(c: Comparison) -> Drawn | None:
-    """Draw all contrasts of the main figure; return None with a single arm."""
+    """Draw all contrasts of the main metric; return None for a single arm."""
     by_regime = (each for each in c.regimes if each.where != OVERALL)
     rows = [*c.ends, *c.equal, *by_regime][:_MOST_ROWS]
     if not rows:
@@ -84,7 +84,7 @@ def _heading(row: Contrast) -> str:
 
 
 def _draw(ax: "Axes", rows: Sequence[Contrast], scenes: Sequence[str]) -> list[float]:
-    """Draw the rows below the headings of their arms, and return the place of each row."""
+    """Draw the rows below the headings of their arms, and return the position of each row."""
     places: list[float] = []
     place = 0.0
     for heading, own in groupby(rows, _heading):

@@ -107,12 +107,11 @@ def draw_bands(
         ax: The panel.
         c: The comparison.
         scene: The scene.
-        quantity: The figure on the vertical axis.
+        quantity: The metric on the vertical axis.
         cost: The cost on the horizontal axis.
         unit: Value that is drawn as 1 on the vertical axis.
 
-    Returns:
-        The lowest [n] and highest [n] figure of each arm that has a curve.
+    Returns: The lowest [n] and highest [n] metric of each arm that has a curve.
     """
     look = looks([arm.name for arm in c.arms])
     limits = []
@@ -134,10 +133,11 @@ def draw_bands(
 def band(
     c: Comparison, arm: str, scene: str, quantity: Quantity, cost: Cost
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the cost, and the lowest, mean and highest figure over the seeds of an arm.
+    """Return the cost, and the lowest, mean and highest metric over the seeds of an arm.
 
-    A run's figure is interpolated between its evaluations. The arrays [n] cover the range of costs
-    that all runs share. They are empty if no run has a curve, or if the runs share no range.
+    A run's metric is interpolated between its evaluations. The arrays [n] cover the range of costs
+    that all runs have in common. The arrays are empty if no run has a curve, or if the runs have no
+    common range.
     """
     runs = [run for (at, _), run in c.main[arm].items() if at == scene]
     series = [(x, y) for x, y in (run.series(quantity.name, cost) for run in runs) if len(x)]

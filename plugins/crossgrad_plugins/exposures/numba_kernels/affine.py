@@ -38,7 +38,7 @@ def map_colors_back(
     """Write the gradient of the colours, and add up the gradient of the matrix.
 
     Args:
-        image: As for `map_colors`.
+        image: The image, as for `map_colors`.
         matrix: [12], as for `map_colors`.
         upstream: The gradient of the output of `map_colors`.
         gradient: Output: the gradient of the colours.

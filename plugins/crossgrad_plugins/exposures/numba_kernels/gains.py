@@ -2,8 +2,8 @@
 
 sRGB's curve has a straight part for dark values, and a power part above it. If a value is in the
 power part before and after the gain G, decoding, multiplying and encoding are one linear map of x:
-with o = 0.055, G^(1/2.4) (x + o) - o. If it is in the straight part before and after, the map is
-G x. Only values that change parts need a power; they are searched in blocks of eight values.
+with o = 0.055, G^(1/2.4) (x + o) - o. If x is in the straight part before and after, the map is G
+x. Only values that change parts need a power; they are found in blocks of eight values.
 """
 
 from typing import TypeAlias
@@ -63,7 +63,7 @@ def _exposed(value: np.float32, gain: np.float32) -> np.float32:
 
 @device
 def _slope(value: np.float32, taken: np.float32, gain: np.float32) -> np.float32:
-    """Return the derivative of one value after the gain by the value itself; needs no power."""
+    """Return the derivative of one value after the gain by the value itself, without a power."""
     if taken <= _THRESHOLD:
         if value <= _THRESHOLD:
             return gain
@@ -117,7 +117,7 @@ def expose_back(
     """Write the gradient of the values, and add up the gradient of the stops of each channel.
 
     Args:
-        image: As for `expose`.
+        image: The image, as for `expose`.
         taken: The output of `expose`.
         upstream: The gradient of the output of `expose`.
         gains: [24], as for `expose`.

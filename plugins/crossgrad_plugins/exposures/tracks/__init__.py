@@ -1,1 +1,1 @@
-"""Exposure from SfM tracks: the brightness of photos at the points that they share."""
+"""Exposure from SfM tracks: the brightness of photos at points that several photos show."""

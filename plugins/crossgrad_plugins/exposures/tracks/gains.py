@@ -1,11 +1,11 @@
 """Relative brightness of the photos of a scene, by a robust fit to SfM tracks.
 
-Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. It is solved by
-iteratively reweighted least squares, with the points eliminated. The remaining matrix couples each
-photo with the photos that share points with it. If these are few, as in a strip of hundreds of
-photos, the matrix is solved directly, because conjugate gradients would need many iterations. If
-they are many, conjugate gradients need few iterations and the direct solution is slow. If the
-photos form several parts that share no point, each part has a mean of 0.
+Model: stops of photo i at point j = gain_i + point_j, Huber's loss, mean gain 0. The system is
+solved by iteratively reweighted least squares, with the points eliminated. The remaining matrix
+couples each photo with the photos that show common points. If these photos are few, as in a strip
+of hundreds of photos, the matrix is solved directly, because conjugate gradients would need many
+iterations. If there are many such photos, conjugate gradients need few iterations and the direct
+solution is slow. If the photos form several parts without common points, each part has a mean of 0.
 """
 
 from collections.abc import Sequence
@@ -67,7 +67,7 @@ class Fit:
         before: Mean distance of the observations from the means of their points, stops. A point
             is weighted by the variance of the gains of the photos that show it, because only
             points that join photos of different gains test these gains.
-        after: Like `before`, after the gains are removed.
+        after: The same distance after the gains are removed.
         errors: [V] standard errors of the gains, stops; NaN for more photos than `_DENSE`.
     """
 
@@ -84,7 +84,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class TrackGains:
-    """The relative brightness of photos at points that they share.
+    """The relative brightness of photos at points that several photos show.
 
     Attributes:
         gains: [V] stops above the mean of the photos; 0 without enough observations.
@@ -128,7 +128,7 @@ class TrackGains:
 
     @property
     def evidence(self) -> str:
-        """The figures of the rule, as text."""
+        """The values that the rule compares, as text."""
         known = self.gains[self.known]
         if not len(known):
             return "no SfM tracks tell how bright the photos are beside each other"
@@ -214,7 +214,7 @@ def _errors(
 ) -> _Floats:
     """Return the standard errors [V] of the gains by weighted least squares.
 
-    Groups of photos that few points join have large errors, even with many observations.
+    Groups of photos that few points connect have large errors, even with many observations.
     """
     photos = len(parts)
     if photos > _DENSE:

@@ -47,9 +47,9 @@ class Observations:
 def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     """Measure the brightness of the scene's points in the photos of some views.
 
-    A photo is sampled at the projections of the points that it observed, 3 x 3 pixels for each.
-    Photos without such points are not decoded. A photo that cannot be decoded has no observations:
-    the run reports the error when it needs the photo.
+    A photo is sampled at the projections of the points that it observed, with 3 x 3 pixels for each
+    point. Photos without such points are not decoded. A photo that cannot be decoded has no
+    observations; the run reports the error when it needs the photo.
     """
     shared = _shared_points(scene, views)
     with ThreadPoolExecutor(_AT_ONCE) as pool:

@@ -2,9 +2,9 @@
 
 This is the readable definition, and the reference for tests of the fused kernel.
 
-Autograd launches more kernels, and most of them run for less time than the launch takes. The
+Autograd launches more kernels, and most of them run for less time than their launch takes. The
 explicit gradient uses sums and differences, as the fused CPU kernel does (`numba_kernels.fused`).
-It filters twelve planes forward and nine backward, instead of fifteen each.
+The function filters twelve planes forward and nine backward, instead of fifteen each.
 """
 
 from functools import cache
@@ -36,18 +36,18 @@ def l1_ssim_loss(
     ssim_weight: float = 0.2,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over the kept pixels and their channels.
+    """Return (1 - w) * L1 + w * (1 - SSIM), both averaged over the unmasked pixels and channels.
 
-    A masked-out pixel is 0 in both images before SSIM's windows are summed. It has no term of its
-    own in either mean, and receives exactly zero gradient. If no pixel is kept, the loss is 0.
+    A masked pixel is 0 in both images before SSIM's windows are summed. A masked pixel contributes
+    to neither mean, and receives exactly zero gradient. If no pixel counts, the loss is 0.
 
     Args:
         image: [H, W, C] floating point; values may be outside [0, 1].
         target: [H, W, C] floating point, or uint8 (then 255 means 1).
-        mask: [H, W] bool, True where the pixel counts; None keeps all.
+        mask: [H, W] bool, True where the pixel counts; None counts all pixels.
         ssim_weight: w in [0, 1].
         weights: [H, W] floating point, not negative: a pixel's weight in both means. The weights do
-            not affect the window sums of SSIM. None weights all pixels equally.
+            not affect the window sums of SSIM. None gives all pixels the same weight.
 
     Returns:
         Scalar of the image's type.
@@ -102,7 +102,7 @@ def _window_for(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the window on a device, copied only once, because a copy synchronises with the GPU.
 
     The first call may be in inference mode. The window is created outside inference mode, so that
-    calls with gradients can use it too.
+    calls with gradients can also use it.
     """
     with torch.inference_mode(mode=False):
         return gaussian_window().to(device, dtype)
@@ -130,7 +130,7 @@ def loss_and_gradient(
     Args:
         image: [H, W, C] floating point.
         target: [H, W, C] floating point, or uint8 (then 255 means 1).
-        mask: [H, W] bool; None keeps all.
+        mask: [H, W] bool; None counts all pixels.
         ssim_weight: w in [0, 1].
     """
     x = masked(image, mask).permute(2, 0, 1)
@@ -156,7 +156,7 @@ def _dissimilarity_and_slope(
     Args:
         sums: [C, H, W] image plus target.
         differences: [C, H, W] image minus target.
-        mask: [H, W] bool; None keeps all.
+        mask: [H, W] bool; None counts all pixels.
     """
     fields = torch.stack((sums, differences, sums * sums, differences * differences))
     mean_s, mean_d, square_s, square_d = blurred(fields)

@@ -16,7 +16,7 @@ _ALL: Final = 1 << 30
 def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
     """Return the function `Screen.count` of a view.
 
-    It keeps the projected data and the tile lists alive.
+    The function keeps the projected data and the tile lists alive.
 
     Args:
         meta: The metadata that gsplat's `rasterization` returns.

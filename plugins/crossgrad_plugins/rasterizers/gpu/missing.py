@@ -54,7 +54,7 @@ def compiler_missing(package: str) -> str | None:
 
 
 def is_compiled(package: str) -> bool:
-    """Return whether a package is installed with compiled kernels, without importing it."""
+    """Return True if a package is installed with compiled kernels; the package is not imported."""
     spec = find_spec(package)
     places = [] if spec is None else spec.submodule_search_locations or []
     return any(path for place in places for path in Path(place).glob("csrc.*"))

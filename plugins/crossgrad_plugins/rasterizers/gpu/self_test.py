@@ -32,7 +32,7 @@ class Look:
     Attributes:
         image: [H, W, 3].
         loss: Mean squared difference from a grey ramp.
-        gradients: Tensor name -> its gradient.
+        gradients: Tensor name -> gradient of the tensor.
     """
 
     image: Tensor
@@ -46,7 +46,8 @@ def self_test(rasterizer: Rasterizer, device: str) -> None:
     Known failures affect the first process and the first call, so the scene is rendered twice.
 
     Raises:
-        UserError: The rasterizer raises an exception, or its render differs from that of `torch`.
+        UserError: The rasterizer raises an exception, or its render differs from the render of
+            `torch`.
     """
     for harmonics in (False, True):
         expected = look_at(_reference(rasterizer), "cpu", harmonics=harmonics)

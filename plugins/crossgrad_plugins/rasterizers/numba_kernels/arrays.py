@@ -79,13 +79,13 @@ class DrawOptions:
     Attributes:
         max_alpha: Cap of a Gaussian's alpha, below 1.
         near: Gaussians are drawn if the depth of their centre is larger.
-        dilation: Added to both diagonal entries of the 2-D covariance, px^2.
+        dilation: Number that is added to both diagonal entries of the 2-D covariance, px^2.
         response: The response of a Gaussian in a pixel. `antialiased` lowers opacities to
             compensate the area that the dilation adds (Mip-Splatting's 2-D filter); `analytic` has
             no dilation.
-        squares: Whether a Gaussian touches only the tiles of the published 3-sigma square.
-        depth: Whether to composite the depth.
-        pixels: Whether to count the pixels of each Gaussian.
+        squares: True if a Gaussian touches only the tiles of the published 3-sigma square.
+        depth: True to composite the depth.
+        pixels: True to count the pixels of each Gaussian.
     """
 
     max_alpha: float = 0.99
@@ -107,7 +107,7 @@ class Projected:
         records: [N * RECORD] float32.
         owners: [N] int32, the Gaussian of each record.
         drawn: [chunks] int64, records per chunk.
-        limits: [N, 2] int32, columns of 16 pixels that each record may touch; None for no limits.
+        limits: [N, 2] int32, columns of 16 pixels that each record may touch; None means no limits.
         rows: [R] int32, the Gaussians that have a record, sorted; None if they are not needed.
     """
 
@@ -151,7 +151,7 @@ class Frame:
         options: The input options.
         projected: Drawn Gaussians.
         lists: Tile lists.
-        masks: [E] uint64, patches that each entry was blended into.
+        masks: [E] uint64, the patches into which each entry was blended.
     """
 
     image: Float32
@@ -174,7 +174,7 @@ class GaussianGradients:
         quats: [N, 4].
         scales: [N, 3].
         opacities: [N].
-        colors: [N, 3] by the rendered RGB (after the clamp of harmonics).
+        colors: [N, 3] by the rendered RGB (after the harmonics are clamped).
         dc: [N, 1, 3], or [R, 1, 3] for the drawn rows; None without harmonics.
         rest: [N, B - 1, 3], or [R, B - 1, 3] for the drawn rows; None without harmonics or if not
             requested.

@@ -1,8 +1,8 @@
 """Real spherical harmonics up to degree 3, for sixteen directions at once.
 
-LLVM vectorises branch-free loops over the directions: each number of a direction has a row of
-sixteen. The coefficient kernels need the numbers of one direction side by side instead; `turned`
-transposes them.
+LLVM vectorises branch-free loops over the directions: each component of the directions has a row of
+sixteen numbers. The coefficient kernels need all numbers of one direction side by side; `turned`
+transposes the rows for them.
 
 A Gaussian's coefficients are fifteen triples (red, green, blue), 45 floats. Three vectors contain
 five triples and one spare float each. Basis functions are copied to the lanes of their triples.
@@ -222,9 +222,9 @@ def sum_up(
 
     Args:
         bases: Basis functions from `row` on.
-        row: See `bases`.
+        row: First row of `bases` that is read.
         rest: Coefficients, contiguous; the Gaussian's coefficients begin at float `at`.
-        at: See `rest`.
+        at: First float of the Gaussian's coefficients in `rest`.
         colours: Sixteen floats are written; only the first three are used.
     """
     basis = load_wide(bases, row)
@@ -249,11 +249,11 @@ def spread(
     """Write the gradients of the coefficients.
 
     Args:
-        bases: As in `sum_up`.
-        row: As in `sum_up`.
+        bases: Basis functions from `row` on.
+        row: First row of `bases` and `v_rgb` that is read.
         v_rgb: The gradients of the colour, from `row` on.
         v_rest: Written from float `to` on.
-        to: See `v_rest`.
+        to: First float of `v_rest` that is written.
     """
     basis, three = load_wide(bases, row), load_wide(v_rgb, row)
     rgb, rgb_last = _rgb(three, three), _rgb_last(three, three)
@@ -275,7 +275,7 @@ def rest_basis_gradients(
 
     Args:
         v_rgb: The gradients of the colour, from `row` on.
-        row: See `v_rgb`.
+        row: First row of `v_rgb` that is read, and of `v_bases` that is written.
         rest: Coefficients.
         at: First float of the coefficients.
         v_bases: Written from `row` on: fifteen numbers and one unused number.

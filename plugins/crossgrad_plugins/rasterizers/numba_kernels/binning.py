@@ -138,12 +138,12 @@ def _spans(
     ends: NDArray[np.float32],
     place: int,
 ) -> None:
-    """Write the first and last tile reached in eight rows of tiles (first > last: none).
+    """Write the first and last reached tile in eight rows of tiles (first > last means none).
 
     The record at `at` belongs to ellipse k of the group.
 
-    The ends of an ellipse's rows form concave curves. Between two rows of pixels, their extremes
-    are at the ellipse's leftmost and rightmost point, or in the row nearest to that point.
+    The ends of an ellipse's rows form concave curves. The extremes between two rows of pixels are
+    at the ellipse's leftmost and rightmost point, or in the row nearest to that point.
     """
     zero = splat(np.float32(0.0))
     half = splat(np.float32(0.5))
@@ -186,9 +186,9 @@ def _find(
     k: int,
     boxed: bool,
 ) -> int:
-    """Write the tiles that record j (number k of its group) reaches to its slots, and count them.
+    """Write the tiles that record j (number k of its group) reaches to slots, and count them.
 
-    The spans of its first eight rows of tiles are already computed, unless the whole box is used.
+    The spans of the first eight rows of tiles are already computed, unless the whole box is used.
 
     Returns:
         The number of tiles.
@@ -243,9 +243,9 @@ def find_tiles(
         tile_columns: Tiles in a row of tiles.
         records: Flat records.
         boxes: [N, 4] tile boxes per record.
-        boxed: Whether to use all tiles of the boxes (records of the analytic response).
+        boxed: True to use all tiles of the boxes (records of the analytic response).
         drawn: [chunks] records per chunk.
-        buckets: [N, BUCKET] per record, completed.
+        buckets: [N, BUCKET] per record; completed here.
         tile_of_slot: [slots] written.
         counts: [PARTS, T] written: entries per part and tile; zero before.
         depths: [M] depths of the drawn records.

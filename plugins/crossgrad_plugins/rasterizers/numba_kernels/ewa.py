@@ -1,6 +1,7 @@
 """The elliptical weighted average (EWA) projection of one Gaussian, and its gradients.
 
-All values are float64: memory limits the speed of these kernels, and needles need the precision.
+All values are float64: the speed of these kernels is limited by memory, and thin Gaussians need the
+precision.
 """
 
 import math
@@ -70,7 +71,7 @@ def pinhole(
 
 @device
 def in_registers(pose: NDArray[np.float64]) -> Pose:
-    """Return a [3, 4] matrix as scalars, so that loops that write to memory need not reload it."""
+    """Return a [3, 4] matrix as scalars, which loops that write to memory need not reload."""
     return (
         (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
         (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
@@ -155,7 +156,7 @@ def times(a: Triple, b: Triple) -> Triple:
 
 @device
 def opacity_factor(raw_det: float, det: float) -> float:
-    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 if removed."""
+    """Return the factor that keeps the energy after dilation (Mip-Splatting); 0 means removed."""
     if not (raw_det > LEAST_DET and det > LEAST_DET):
         return 0.0
     return math.sqrt(raw_det / (det + LEAST_DET) + LEAST_DET)
@@ -234,8 +235,8 @@ def axes_gradient(
 ) -> Triple:
     """Return the gradients of A, B (as one number) and C of the analytic response.
 
-    The sums are sums of gradients by the logarithms of the standard deviations. A standard
-    deviation at its floor has no gradient, and the axes of a round Gaussian do not rotate.
+    The sums are sums over the gradients by the logarithms of the standard deviations. A standard
+    deviation at its lower bound has no gradient, and the axes of a round Gaussian do not rotate.
     """
     floor = SIGMA_FLOOR * SIGMA_FLOOR
     v_1 = 0.5 * sum_sigma_1 / variance_1 if variance_1 > floor else 0.0

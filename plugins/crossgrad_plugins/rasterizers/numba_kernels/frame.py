@@ -97,13 +97,13 @@ def backward(
     """Return the gradients of sum(image * v_image) + sum(alpha * v_alpha) + sum(depth * v_depth).
 
     Args:
-        frame: From `forward`; with a depth if `v_depth` is given.
+        frame: Frame that `forward` returned; it contains a depth if `v_depth` is given.
         v_image: [H, W, 3].
         v_alpha: [H, W] or None.
         v_depth: [H, W] or None.
-        absolute: Whether to compute the absolute gradients of the projected means.
-        directions: Whether to bin the directions of the pixels' gradients.
-        harmonics: Whether to compute the gradients of the harmonics of higher degrees.
+        absolute: True to compute the absolute gradients of the projected means.
+        directions: True to bin the directions of the pixels' gradients.
+        harmonics: True to compute the gradients of the harmonics of higher degrees.
     """
     gaussians, options, projected, lists = (
         frame.gaussians,
@@ -191,7 +191,7 @@ def backward(
 
 
 def _room(frame: Frame, field: str, like: Float32 | None) -> Float32 | None:
-    """Return an array for the gradient of one field: zeros for all Gaussians, or the drawn rows."""
+    """Return an array for a field's gradient: zeros for all Gaussians, or the drawn rows."""
     if like is None:
         return None
     rows = frame.projected.rows
@@ -263,10 +263,10 @@ def marked_pixels(
     """Return the number of marked pixels of a view in which each Gaussian was blended, [N].
 
     Args:
-        projected: From the view's `Frame`.
-        lists: From the view's `Frame`.
-        masks: From the view's `Frame`.
-        options: From the view's `Frame`.
+        projected: Field of the view's `Frame`.
+        lists: Field of the view's `Frame`.
+        masks: Field of the view's `Frame`.
+        options: Field of the view's `Frame`.
         marked: [H, W], non-zero if a pixel is marked.
     """
     counts = np.zeros(lists.slots, np.int32)
@@ -292,7 +292,7 @@ def _pixels(projected: Projected, lists: TileLists, counts: Int32) -> Int32:
 
 
 def _analytic(options: DrawOptions) -> Float32 | None:
-    """Return an array if the response is analytic, else None; kernels specialise on this type.
+    """Return an array if the response is analytic, else None; kernels are specialised by this type.
 
     The content of the array is not used. Kernels of the analytic response are compiled at first
     use.

@@ -1,7 +1,7 @@
 """Compilation of the kernels of this package, with IEEE arithmetic in the order of the source code.
 
 Without fast-math, results do not depend on choices of the compiler. Checks for infinities and NaN
-work as written.
+give correct results.
 """
 
 from collections.abc import Callable
@@ -19,5 +19,5 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def device(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that kernels call; it becomes part of the caller."""
+    """Compile a function that kernels call; the function becomes part of the calling kernel."""
     return inlined(function)

@@ -7,9 +7,9 @@ The 2-D Gaussian is stored by rows of pixels, which is well conditioned even for
 
 so a row is a 1-D Gaussian of variance V around k dy. Exponents are in units of log 2.
 
-Vector constants are passed as an argument. So they remain memory operands (in the first-level
-cache) of the instructions that use them. As literals in the kernel they would occupy registers,
-which are scarce there and slow the forward pass down.
+Vector constants are passed as an argument. So the constants remain memory operands (in the
+first-level cache) of the instructions that use them. If the constants were literals in the kernel,
+they would occupy registers, which are scarce in these kernels, and slow the forward pass down.
 """
 
 import math
@@ -89,7 +89,7 @@ Terms = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 def vector_constants(max_alpha: float) -> NDArray[np.float32]:
     """Return the constants for one cap of alpha, WIDE equal numbers each, except for the offsets.
 
-    There is one shared array for each cap; do not write to it.
+    All callers share one array for each cap and must not write to it.
     """
     shared = (
         max_alpha,
@@ -115,7 +115,8 @@ def vector_constants(max_alpha: float) -> NDArray[np.float32]:
 def terms_of(constants: NDArray[np.float32]) -> Terms:
     """Return the constants of `exp2`.
 
-    If they are loaded before a loop, they remain in registers on machines with 32 vector registers.
+    If the constants are loaded before a loop, they remain in registers on machines with 32 vector
+    registers.
     """
     return (
         load_wide(constants, 0),

@@ -34,7 +34,7 @@ def _axis(
     quat: NDArray[np.float32],
     scale: NDArray[np.float32],
 ) -> tuple[float, float]:
-    """Return a / |a|^2 with a the projection of the longest axis (one standard deviation), px."""
+    """Return a / |a|^2; a is the projected longest axis (one standard deviation), px."""
     pose = in_registers(camera.pose)
     x, y, z = to_camera(pose, (np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])))
     unit, _ = unit_quaternion(
@@ -77,8 +77,8 @@ def longest_axes(
         scales: [N, 3].
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
-        axes: [2 N] flat, written per record: a / |a|^2 with a the projected axis, one standard
-            deviation long, in pixels; 0 if it is seen end on.
+        axes: [2 N] flat, written per record: a / |a|^2, where a is the projected axis, one standard
+            deviation long, in pixels; 0 if the axis is seen end on.
     """
     chunks = drawn.shape[0]
     chunk = next_job(jobs, chunks)
@@ -104,7 +104,7 @@ def add_directions(
 
     Args:
         jobs: From `share`.
-        analytic: Whether the response is analytic.
+        analytic: True if the response is analytic.
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         buckets: [N, BUCKET] from binning.

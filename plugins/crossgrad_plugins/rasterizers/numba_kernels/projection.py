@@ -124,7 +124,7 @@ def _picked(
     chosen: NDArray[np.int64],
     picked: NDArray[np.float32],
 ) -> int:
-    """Copy the Gaussians of a block that may be drawn to consecutive places; return their number.
+    """Copy the Gaussians of a block that may be drawn to consecutive rows; return their number.
 
     `chosen` receives their indices; `picked` receives their means, quaternions, scales and
     opacities.
@@ -156,7 +156,7 @@ def _project_block(
     scales: NDArray[np.float32],
     found: NDArray[np.float64],
 ) -> None:
-    """Project the first `count` Gaussians, visible or not; branch-free, so it is vectorised.
+    """Project the first `count` Gaussians, visible or not, in a branch-free, vectorised loop.
 
     All arrays are flat, because LLVM must know the strides.
     """
@@ -184,7 +184,7 @@ def _project_block(
 
 @device
 def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[np.float32]) -> bool:
-    """Write the colour of Gaussian i to record j; return whether it is finite."""
+    """Write the colour of Gaussian i to record j; return True if the colour is finite."""
     red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
     records[j * RECORD + RED] = red
     records[j * RECORD + GREEN] = green
@@ -194,7 +194,7 @@ def _write_color(i: int, j: int, colors: NDArray[np.float32], records: NDArray[n
 
 @device
 def _give_slots(first: int, end: int, boxes: NDArray[np.int32], buckets: NDArray[np.int32]) -> int:
-    """Reserve a slot for each tile in the records' boxes; return the number of slots."""
+    """Reserve a slot for each tile in the boxes of the records; return the number of slots."""
     slots = 0
     for j in range(first, end):
         buckets[j, FIRST_SLOT] = slots
@@ -296,18 +296,18 @@ def project(
     Args:
         jobs: From `share`.
         camera: The view.
-        near: Least depth.
+        near: Least depth of a drawn Gaussian.
         dilation: Added to both variances, px^2.
-        antialiased: Whether opacities are lowered to compensate the area that the dilation adds.
-        analytic: Any vector selects records of the analytic response (without dilation); None:
-            plain.
-        limits: [N, 2] written per record: first and last column of 16 pixels that it may touch, by
-            the published footprint; None selects the footprint alpha >= 1/255.
+        antialiased: True if opacities are lowered to compensate the area that the dilation adds.
+        analytic: Any vector selects records of the analytic response (without dilation); None
+            selects the plain response.
+        limits: [N, 2] written per record: first and last column of 16 pixels that the record may
+            touch, by the published footprint; None selects the footprint alpha >= 1/255.
         means: [N, 3].
         quats: [N, 4] wxyz, any norm.
         scales: [N, 3] linear.
         opacities: [N].
-        colors: [N, 3] RGB; None leaves the records' colours to `sh_forward`.
+        colors: [N, 3] RGB; if None, `sh_forward` writes the colours of the records.
         radii: [N] written, pixels; 0 if nothing is touched.
         records: [N * RECORD] written.
         depths: [N] written per record.

@@ -81,7 +81,7 @@ def _unproject_block(
     analytic: NDArray[np.float32] | None,
     block: NDArray[np.float64],
 ) -> None:
-    """Compute the gradients of `count` Gaussians; branch-free, so it is vectorised."""
+    """Compute the gradients of `count` Gaussians; the loop is branch-free and is vectorised."""
     pose = in_registers(camera.pose)
     pose_x, pose_y, pose_z = pose[0][:3], pose[1][:3], pose[2][:3]
     for k in range(count):
@@ -199,7 +199,7 @@ def _fill_block(
     v_colors: NDArray[np.float32],
     v_absolute: NDArray[np.float32],
 ) -> tuple[int, int]:
-    """Fill a block with Gaussians that have gradients, and write gradients without projection.
+    """Fill a block with Gaussians that have gradients; write gradients that need no projection.
 
     Returns:
         The next record, and the number of Gaussians in the block; `numbers` receives their indices.
@@ -283,11 +283,11 @@ def project_backward(
 
     Args:
         jobs: From `share`.
-        camera: As in `project`; this holds for all arguments up to `owners`.
+        camera: The view.
         dilation: Px^2.
-        antialiased: Whether opacities were lowered.
-        analytic: Any vector selects the analytic response; None: plain.
-        with_depth: Whether the partial sums contain gradients of the depth.
+        antialiased: True if opacities were lowered.
+        analytic: Any vector selects the analytic response; None selects the plain response.
+        with_depth: True if the partial sums contain gradients of the depth.
         means: [N, 3].
         quats: [N, 4].
         scales: [N, 3].
@@ -296,8 +296,8 @@ def project_backward(
         owners: [N].
         buckets: [N, BUCKET] from binning.
         written: [slots] from `differentiate`.
-        partials: [(slots + 1) * PARTIAL] from `differentiate`, the last row zero.
-        v_means: [N, 3] written, zero for Gaussians without gradients; so are all below.
+        partials: [(slots + 1) * PARTIAL] from `differentiate`; the last row is zero.
+        v_means: [N, 3] written, zero for Gaussians without gradients, like all arrays below.
         v_quats: [N, 4].
         v_scales: [N, 3].
         v_opacities: [N].

@@ -97,7 +97,7 @@ def _row_hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Return whether the footprint covers a pixel centre in image row `y`."""
+    """Return True if the footprint covers a pixel centre in image row `y`."""
     dy = y + 0.5 - v
     left_over = (reach - dy * dy * inverse_c) * variance
     if not left_over >= 0.0:
@@ -119,7 +119,7 @@ def _hits(
     reach: float,
     width: int,
 ) -> bool:
-    """Return whether the footprint covers any pixel centre in the image rows y0 to y1."""
+    """Return True if the footprint covers any pixel centre in the image rows y0 to y1."""
     middle = clamped(np.floor(v), y0, y1)
     if _row_hits(middle, u, v, inverse_c, slope, variance, reach, width):
         return True
@@ -141,7 +141,7 @@ def _pixels(
     height: int,
     within: Rectangle,
 ) -> Rectangle:
-    """Return the pixels that a footprint may touch (x0 > x1 or y0 > y1: none)."""
+    """Return the pixels that a footprint may touch (x0 > x1 or y0 > y1 means none)."""
     return (
         max(first_pixel(u - extent_x), within[0]),
         min(last_pixel(u + extent_x, width), within[1]),
@@ -175,9 +175,9 @@ def place_record(
 def square(k: int, width: int, height: int, found: NDArray[np.float64]) -> tuple[int, Rectangle]:
     """Return the published radius of projected Gaussian k and the pixels that it may touch.
 
-    They are the pixels of all 16 x 16 tiles that overlap a square of that half-side around the
-    mean. A square outside the image has radius 0 (3DGS: three standard deviations; the squared half
-    difference of the variances is at least 0.1).
+    These pixels are the pixels of all 16 x 16 tiles that overlap a square around the mean; half the
+    side of the square is the published radius. The radius is 0 if the square is outside the image
+    (3DGS: three standard deviations; the squared half difference of the variances is at least 0.1).
     """
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, b, c = get(found, VARIANCE_X, k), get(found, COVARIANCE, k), get(found, VARIANCE_Y, k)
@@ -209,7 +209,7 @@ def first_tile(low: float) -> float:
 
 @device
 def last_tile(high: float) -> float:
-    """Return the last tile of the published grid at or before `high`, pixels; -1: none."""
+    """Return the last tile of the published grid at or before `high`, pixels, or -1 for none."""
     return max(np.floor((high - 0.5) / SQUARE), -1.0)
 
 
@@ -223,9 +223,9 @@ def _radius(extent: float) -> int:
 def log2_of(value: float) -> float:
     """Return log2 of a normal positive number, with an error below 1e-13.
 
-    For smaller numbers, 0 and negative numbers, the result is at most -1000. For NaN and infinity
-    it is undefined, so callers check their arguments. LLVM vectorises loops that call this
-    function, but not loops that call the C library.
+    For smaller positive numbers, 0 and negative numbers, the result is at most -1000. For NaN and
+    infinity the result is undefined, so callers check their arguments. LLVM vectorises loops that
+    call this function, but not loops that call the C library.
     """
     raw = np.float64(value).view(np.int64)
     exponent = (raw >> _MANTISSA_BITS) - _BIAS
@@ -272,8 +272,8 @@ def plain_shape(
 ) -> tuple[int, Rectangle, Plain]:
     """Return the radius of projected Gaussian k, its pixels, and the numbers of its record.
 
-    The radius is 0 if it touches no pixel. The function writes no array: Numba counts references to
-    the arrays of a function with several returns, which takes time.
+    The radius is 0 if the Gaussian touches no pixel. The function writes no array: if a function
+    has several returns, Numba counts references to its arrays, which takes time.
     """
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
@@ -327,7 +327,7 @@ def _covers(
     reach: tuple[float, float],
     opacity: float,
 ) -> bool:
-    """Return whether the analytic response touches pixel (x, y)."""
+    """Return True if the analytic response touches pixel (x, y)."""
     dx, dy = x + 0.5 - u, y + 0.5 - v
     along, across = axis[0] * dx + axis[1] * dy, axis[0] * dy - axis[1] * dx
     if abs(along) > reach[0] or abs(across) > reach[1]:
@@ -344,7 +344,7 @@ def analytic_shape(
     within: Rectangle,
     found: NDArray[np.float64],
 ) -> tuple[int, Rectangle, Analytic]:
-    """Like `plain_shape`, for the analytic response."""
+    """Return the same as `plain_shape`, for the analytic response."""
     nothing = 0, (1.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     u, v = get(found, MEAN_U, k), get(found, MEAN_V, k)
     a, c, det = get(found, VARIANCE_X, k), get(found, VARIANCE_Y, k), get(found, DETERMINANT, k)

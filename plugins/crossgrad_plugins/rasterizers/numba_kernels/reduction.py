@@ -21,7 +21,7 @@ def add_up(
     partials: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> bool:
-    """Sum the written rows of a record's slots; return whether there were any.
+    """Sum the written rows of a record's slots; return True if there was at least one.
 
     `partials` ends with a row of zeros.
     """

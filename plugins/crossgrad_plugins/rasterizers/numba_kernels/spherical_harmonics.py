@@ -40,7 +40,7 @@ _BLOCK = WIDE
 
 @device
 def _bring_near(rest: NDArray[np.float32], i: int) -> None:
-    """Prefetch the coefficients of Gaussian i."""
+    """Prefetch the coefficients of Gaussian i into the cache."""
     width = 3 * rest.shape[1]
     for at in range(0, width, _LINE):
         prefetch(rest, i * width + at)
@@ -91,7 +91,7 @@ def sh_forward(
         drawn: [chunks] from `project`.
         owners: [N] from `project`.
         records: Flat records, colours written; a record with a non-finite colour is not drawn.
-        radii: [N] set to 0 for records with a non-finite colour.
+        radii: [N], set to 0 for records with a non-finite colour.
     """
     count = (degree + 1) * (degree + 1)
     whole = count == BASIS and rest.shape[1] == HIGHER
@@ -148,7 +148,7 @@ def sh_backward(
 
     Args:
         jobs: From `share`.
-        degree: As in `sh_forward`; this holds for the next six arguments too.
+        degree: Active degree, 0 to 3.
         eye: [3].
         means: [N, 3].
         rest: [N, B - 1, 3].
@@ -158,9 +158,10 @@ def sh_backward(
         v_colors: [N, 3] gradients of the clamped colours.
         v_dc: [N, 1, 3] written for the drawn Gaussians; zero before.
         v_rest: [N, B - 1, 3] like `v_dc`, active degrees only; without rows if it is not written.
-        v_means: [N, 3] added to.
-        wanted: Whether `v_dc` and `v_rest` have a row for each record instead, in their order (such
-            rows are written whole, and need not be zero before), and whether `v_rest` is written.
+        v_means: [N, 3]; the gradients of the centres are added.
+        wanted: First value: True if `v_dc` and `v_rest` have a row for each record, in the order of
+            the records (such rows are written whole, and need not be zero before). Second value:
+            True if `v_rest` is written.
     """
     dc_by_rows, rest_by_rows, learns = wanted
     count = (degree + 1) * (degree + 1)

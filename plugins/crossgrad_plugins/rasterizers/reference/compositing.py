@@ -27,7 +27,7 @@ class Drawing:
 
     Attributes:
         size: Width and height of the image, pixels.
-        response: How a Gaussian fills a pixel.
+        response: The response, which says how a Gaussian fills a pixel.
         max_alpha: Cap of alpha; a capped alpha has no gradient.
         probed: Number R of the probe's columns.
     """
@@ -107,8 +107,8 @@ def composite(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor,
 
     Returns:
         `channels` [P, 5]: RGB, depth and accumulated opacity, without background; `touched` [G]
-        bool: whether the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
-        number of pixels in which it was blended.
+        bool: True if the Gaussian reaches alpha >= 1/255 in any pixel; `blended` [G] int64: the
+            number of pixels in which the Gaussian was blended.
     """
     touching, blended, weights = _blends(table, centers, drawing)
     colors_depths = table[:, drawing.probed + 3 : drawing.probed + 7]
@@ -151,7 +151,7 @@ class PixelCounter:
 
 
 def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, Tensor, Tensor]:
-    """Return [P, G] of a tile: if alpha >= 1/255, if the Gaussian was blended, and its weight."""
+    """Return [P, G] arrays of a tile: alpha >= 1/255, the Gaussian was blended, its weight."""
     columns = [drawing.probed, 2, 1, 4, table.shape[1] - drawing.probed - 7]
     probe, means, opacities, _, parameters = torch.split(table, columns, -1)
     dx, dy = offsets(means, probe, centers, drawing.size)

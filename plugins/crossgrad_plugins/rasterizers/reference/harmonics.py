@@ -25,7 +25,7 @@ def view_colors(gaussians: Gaussians, center: Tensor) -> Tensor:
 
 
 def coefficients_of(gaussians: Gaussians) -> Tensor | None:
-    """Return [N, (degree + 1)^2, 3] the bands up to the active degree; None if there are none."""
+    """Return [N, (degree + 1)^2, 3] the bands up to the active degree; None without bands."""
     if gaussians.sh_dc is None or gaussians.sh_rest is None:
         return gaussians.sh_dc
     active = gaussians.sh_rest[:, : (gaussians.sh_degree + 1) ** 2 - 1]
@@ -35,7 +35,7 @@ def coefficients_of(gaussians: Gaussians) -> Tensor | None:
 def harmonics(directions: Tensor, degree: int) -> Tensor:
     """Return [N, (degree + 1)^2] basis functions at unit vectors [N, 3].
 
-    Order and signs are as in 3DGS PLY files: per band l the orders m = -l..l, with the
+    Order and signs are as in 3DGS PLY files: for each band l the orders m = -l..l, with the
     Condon-Shortley phase.
     """
     x, y, z = directions.unbind(-1)

@@ -1,7 +1,8 @@
 """Projection from world space to the image plane (EWA splatting), and the response in a pixel.
 
-A response is a pair of functions. One maps a projection to a `Shape`. The other maps the offset of
-pixel centres from the mean to a coverage, so that alpha = min(max_alpha, opacity * coverage).
+A response is a pair of functions. The first function maps a projection to a `Shape`. The second
+function maps the offset of pixel centres from the mean to a coverage, so that alpha =
+min(max_alpha, opacity * coverage).
 """
 
 from dataclasses import dataclass
@@ -29,9 +30,9 @@ class Projection:
     Attributes:
         means: [N, 2] pixels.
         depths: [N] camera depth of the centre, local units.
-        xx: [N] entry of the 2-D covariance, px^2; likewise `xy` and `yy`.
-        xy: See `xx`.
-        yy: See `xx`.
+        xx: [N] entry of the 2-D covariance, px^2.
+        xy: [N] entry of the 2-D covariance, px^2.
+        yy: [N] entry of the 2-D covariance, px^2.
         det: [N] determinant of the 2-D covariance, px^4; not negative.
         factors: [N, 2, 3] projections of the three axes, one standard deviation long, pixels.
     """
@@ -48,14 +49,14 @@ class Projection:
 def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Projection:
     """Project Gaussians by the local affine approximation (EWA, Zwicker et al. 2001).
 
-    The function culls nothing. A row behind the camera or with a zero quaternion is not finite or
-    not meaningful; the caller leaves it out.
+    No Gaussian is culled. The row of a Gaussian that is behind the camera or has a zero quaternion
+    is not finite or has no meaning; the caller omits such rows.
 
     Args:
         means: [N, 3] local units.
         quats: [N, 4] wxyz, any length.
         scales: [N, 3] local units.
-        camera: The camera; cast to the type of `means`.
+        camera: The camera; it is cast to the type of `means`.
     """
     pose = camera.world_to_camera.to(means, non_blocking=True)
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
@@ -83,7 +84,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
 
 
 def _slopes(size: int, focal: float, center: float) -> tuple[float, float]:
-    """Return the range of x / z for the Jacobian: the image and a margin around it."""
+    """Return the range of x / z for the Jacobian: the image with a margin around it."""
     margin = JACOBIAN_MARGIN * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin
 
@@ -99,7 +100,7 @@ class Shape:
         peaks: [N] alpha at the mean, before the cap.
         reach: [N, 2] half-extents in pixels of a box that contains every pixel centre with
             alpha >= 1/255.
-        radii: [N] half-extent in pixels that is reported.
+        radii: [N] reported half-extent in pixels.
     """
 
     parameters: Tensor
@@ -127,11 +128,11 @@ def shape(projection: Projection, opacities: Tensor, dilation: float, response: 
 
 
 def coverage(dx: Tensor, dy: Tensor, parameters: Tensor, response: Response) -> Tensor:
-    """Return [P, N] share of its opacity that each Gaussian contributes to each pixel.
+    """Return [P, N] the share of the opacity that each Gaussian contributes to each pixel.
 
     Args:
-        dx: [P, N] mean minus pixel centre, pixels; likewise `dy`.
-        dy: See `dx`.
+        dx: [P, N] x of the mean minus the pixel centre, pixels.
+        dy: [P, N] y of the mean minus the pixel centre, pixels.
         parameters: [N, S] of `Shape`.
         response: The response that the parameters belong to.
     """
@@ -192,7 +193,7 @@ def _windowed(projection: Projection, opacities: Tensor) -> Shape:
 
 
 def _floored_root(squares: Tensor) -> Tensor:
-    """Return standard deviations of `squares`; at the floor they have no gradient."""
+    """Return the standard deviations of `squares`; at the lower bound they have no gradient."""
     return squares.clamp(min=SIGMA_FLOOR**2).sqrt()
 
 
@@ -200,7 +201,7 @@ def _window(offset: Tensor, sigma: Tensor) -> Tensor:
     """Return the mass of a 1-D Gaussian in a window of one pixel.
 
     The window's centre is at `offset` from the mean. The mass is F(x + h) - F(x - h) with F(x) =
-    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. It is computed as a
+    sigmoid(LINEAR x + CUBIC x^3), x = offset / sigma and h = 0.5 / sigma. The mass is computed as a
     product, so that precision is not lost for tails or for wide Gaussians.
     """
     x = -offset.abs() / sigma

@@ -18,14 +18,15 @@ SHORTEST = 1e-6
 
 @dataclass(frozen=True)
 class Recorder:
-    """The destination of the gradients of the drawn rows.
+    """The object that receives the gradients of the drawn rows.
 
     Attributes:
-        screen: Receives the gradients; each backward pass replaces the gradients of the last.
+        screen: Receives the gradients; each backward pass replaces the gradients of the previous
+            backward pass.
         index: [V] int64, the Gaussian of each drawn row.
         count: Number N of all Gaussians.
-        absolute: Whether absolute gradients were requested.
-        axes: [V, 2] longest axes if directions were requested; else None.
+        absolute: True if absolute gradients were requested.
+        axes: [V, 2] longest axes if directions were requested, else None.
     """
 
     screen: Screen
@@ -35,7 +36,7 @@ class Recorder:
     axes: Tensor | None = None
 
     def record(self, signed: Tensor, sums: Tensor) -> None:
-        """Store the gradients [V, 2] of the drawn rows, and the sums from their probes."""
+        """Store the gradients [V, 2] of the drawn rows, and the sums from the probe's gradients."""
         self.screen.mean_gradient = self._scattered(signed)
         if self.absolute:
             self.screen.abs_gradient = self._scattered(sums[:, :2])
@@ -57,10 +58,10 @@ class Recorder:
 
 
 def recorded(table: Tensor, recorder: Recorder) -> tuple[Tensor, Tensor]:
-    """Return the same table [V, C], which the backward pass records, and a probe [V, R].
+    """Return the same table [V, C], recorded by the backward pass, and a probe [V, R].
 
-    The first two columns are projected means. The probe reaches the pixels like the means and
-    changes nothing there. Its gradient contains sums over pixels (see `offsets`).
+    The first two columns are projected means. The probe is passed to the pixels like the means, but
+    does not change the image. The gradient of the probe contains sums over pixels (see `offsets`).
     """
     result: tuple[Tensor, Tensor] = _Recorded.apply(table, recorder)  # type: ignore[no-untyped-call]
     return result
@@ -72,8 +73,8 @@ def offsets(
     """Return the mean minus the pixel centre for every pixel and Gaussian: dx [P, G] and dy [P, G].
 
     The backward pass sums the pixels' gradients for the means. For the probe's first two columns it
-    sums their absolute values. For the columns after the axes, if there are any, it sums the result
-    of `binned_directions`.
+    sums their absolute values. For the columns after the axes, if there are such columns, it sums
+    the result of `binned_directions`.
 
     Args:
         means: [G, 2] pixels.
@@ -131,7 +132,7 @@ def longest_axes(factors: Tensor, scales: Tensor) -> Tensor:
 
     Args:
         factors: [N, 2, 3] from `Projection`: the projections of the three axes.
-        scales: [N, 3]; of equal scales, the first counts as the largest.
+        scales: [N, 3]; if scales are equal, the first scale counts as the largest.
     """
     longest = scales.argmax(-1)[:, None, None].expand(-1, 2, 1)
     axis = factors.gather(-1, longest).squeeze(-1)
@@ -145,7 +146,7 @@ def binned_directions(
     """Return [G, BINS, FIELDS] of `Screen.directions`, summed over some pixels.
 
     Args:
-        gradients: [2, P, G] by the projected mean of each Gaussian, of each pixel.
+        gradients: [2, P, G] gradient of each pixel by the projected mean of each Gaussian.
         offsets: [2, P, G] pixel centre minus mean, pixels.
         axes: [G, 2] from `longest_axes`.
         size: Width and height of the image, pixels.

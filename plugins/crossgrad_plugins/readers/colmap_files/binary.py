@@ -126,7 +126,7 @@ def read_binary(folder: Path) -> ColmapModel:
     """Read `cameras.bin`, `images.bin` and, if it exists, `points3D.bin`.
 
     Raises:
-        UserError: A file is truncated, too long, or has another content than its name says.
+        UserError: A file is truncated, too long, or its content does not match its name.
     """
     with _open(folder / "cameras.bin") as file:
         cameras = by_id(_read_cameras(file), file.path)
@@ -142,7 +142,7 @@ def read_binary(folder: Path) -> ColmapModel:
 
 
 class _Walk:
-    """A position in a binary file. It cannot move past the end of the file."""
+    """A reading position in a binary file. The position cannot move past the end of the file."""
 
     def __init__(self, path: Path, data: mmap.mmap | bytes) -> None:
         self.path = path
@@ -150,7 +150,7 @@ class _Walk:
         self.at = 0
 
     def skip(self, size: int) -> int:
-        """Move on by `size` bytes and return the position of the first."""
+        """Move on by `size` bytes, and return the position of the first of these bytes."""
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise UserError(

@@ -11,7 +11,7 @@ _PARENTS = ("sparse", "colmap/sparse")
 
 
 def find_models(scene: Path) -> list[Path]:
-    """Return the model folders of a scene: `sparse/0`, `sparse/1` ..., `sparse`, or the scene.
+    """Return a scene's model folders: `sparse/0`, `sparse/1` ..., `sparse`, or the scene itself.
 
     Models in `colmap/sparse` are included. The models are sorted by number.
     """
@@ -58,7 +58,7 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
 
 
 def check_scene_folder(scene: Path) -> None:
-    """Refuse an unreadable folder, and the model's folder in place of the scene's folder.
+    """Refuse an unreadable folder, and a model's folder where a scene's folder is expected.
 
     Raises:
         UserError: The path is missing, is a file, is not readable, or is inside `sparse`.

@@ -82,7 +82,7 @@ class _Lines:
                 yield line
 
     def next(self) -> bytes | None:
-        """Return the next line, of any kind, or None at the end."""
+        """Return the next line, even if it is empty or a comment, or None at the end."""
         self._number += 1
         line = next(self._lines, None)
         return None if line is None else line.strip()
@@ -102,7 +102,7 @@ def _integer(word: bytes, most: int = _MOST) -> int:
     """Return a whole number without a sign.
 
     Raises:
-        ValueError: The word is not such a number, or the number is too large.
+        ValueError: The word is not a whole number without a sign, or the number is too large.
     """
     if not _INTEGER.fullmatch(word) or int(word) > most:
         raise ValueError(word)
@@ -189,7 +189,7 @@ _COUNT = struct.Struct("<Q")
 
 
 def has_model(folder: Path) -> bool:
-    """Return whether a folder contains the cameras and images of a COLMAP model."""
+    """Return True if a folder contains the cameras and images of a COLMAP model."""
     return _has(folder, "bin") or _has(folder, "txt")
 
 
@@ -210,7 +210,7 @@ def read_model(folder: Path) -> ColmapModel:
     """Read a model. If binary and text files exist, the binary files are read, as in COLMAP.
 
     Raises:
-        UserError: A file is missing, truncated, or has another content than its name says.
+        UserError: A file is missing or truncated, or its content does not match its name.
     """
     return read_binary(folder) if _has(folder, "bin") else read_text(folder)
 

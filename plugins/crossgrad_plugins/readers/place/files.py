@@ -45,8 +45,8 @@ def of_list(path: Path, names: Collection[str]) -> Measured:
 
     Args:
         path: The file.
-        names: The photos of the scene. In the list, names may lack their folders, and may differ
-            in suffix or case.
+        names: The photos of the scene. Names in the list may lack folders, and may differ in suffix
+            or case.
 
     Raises:
         UserError: The file cannot be read, a line lacks numbers, or the system is unknown.
@@ -99,7 +99,7 @@ def _folded(name: str) -> str:
 
 
 def _by_file(names: Collection[str], said: Callable[[str], str] = str) -> dict[str, str]:
-    """Return the photos by `said` of their whole name, or of their file name if it is unique."""
+    """Return the photos of the names in `said`: by whole name, or by file name if it is unique."""
     files = {name: said(PurePosixPath(name).name) for name in names}
     whole = {name: said(name) for name in names}
     found: dict[str, str] = {}
@@ -169,7 +169,8 @@ def _positions(
     Args:
         database: The database.
         names: The photos.
-        most: Greatest number of rows read from a table. Damaged pages can form an endless cycle.
+        most: Greatest number of rows read from a table. The number is limited because damaged pages
+            can form an endless cycle.
     """
     found = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(found, most)}

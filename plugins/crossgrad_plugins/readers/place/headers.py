@@ -35,7 +35,7 @@ def of_headers(files: Mapping[str, Path], source: str) -> Measured:
     """Return the places in the EXIF headers of photos. Photos without a place are omitted.
 
     Args:
-        files: Name -> file. A missing file, or a file that is not a photo, is ignored.
+        files: Name -> file. Missing files, and files that are not photos, are ignored.
         source: Description of the photos, for messages.
     """
     return measured(((name, _header(path)) for name, path in files.items()), source)

@@ -41,13 +41,13 @@ def at(scene: Scene, place: Georeference) -> Scene:
 
 
 def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
-    """Return the scene at the place given by the GPS of its photos, if they are sufficient.
+    """Return the scene at the place given by the GPS of its photos, if enough photos have GPS.
 
     Args:
         scene: The scene.
         raw: The raw scene from which `scene` was made.
-        named: A list of places, or a folder with the original photos. If given, it is the only
-            source.
+        named: A list of places, or a folder with the original photos. If it is given, no other
+            source is used.
 
     Raises:
         UserError: The named source is missing or cannot be read.
@@ -125,7 +125,7 @@ def _named(path: Path, names: list[str]) -> Measured:
 
 
 def _fitted(scene: Scene, views: list[View], measured: Measured) -> "OnEarth | str":
-    """Return the place fitted to photos with a measured place, or the reason why it failed."""
+    """Return the place fitted to photos with a measured place, or the reason why the fit failed."""
     from crossgrad_plugins.georeference.ellipsoid import geocentric, place_at
     from crossgrad_plugins.georeference.frames import fit_similarity
     from crossgrad_plugins.georeference.on_earth import OnEarth
@@ -164,11 +164,12 @@ def by_code(scene: Scene, code: str) -> Scene:
 
     Args:
         scene: The scene.
-        code: Such as `epsg:32633`. `epsg:4978` means geocentric coordinates of WGS 84.
+        code: The coordinate system, such as `epsg:32633`. `epsg:4978` means geocentric coordinates
+            of WGS 84.
 
     Raises:
-        UserError: The system does not exist, the scene is outside of it, or the system stretches
-            unevenly.
+        UserError: The system does not exist, the scene is outside of its area, or the system is not
+            uniform in scale.
     """
     from crossgrad_plugins.georeference.ellipsoid import place_at
     from crossgrad_plugins.georeference.on_earth import OnEarth

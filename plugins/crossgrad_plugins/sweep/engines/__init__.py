@@ -1,6 +1,6 @@
-"""Engines that carry out runs: this machine, a Ray cluster, or Slurm; each is one function.
+"""Engines that carry out runs: this machine, a Ray cluster, or Slurm; each engine is one function.
 
-An engine is imported when a sweep names it.
+An engine is imported only if a sweep names it.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -42,8 +42,8 @@ class Work:
         out: Folder of the sweep, visible on all machines.
         folder: Working folder of the runs, visible on all machines.
         threads: Threads per run.
-        workers: Number of runs in parallel; None leaves it to the engine.
-        memory: Maximum memory of a run, GiB; None leaves it to the engine.
+        workers: Number of runs in parallel; None means that the engine decides.
+        memory: Maximum memory of a run, GiB; None means that the engine decides.
         options: Options of the engine as the user gave them.
         machine: The division of this machine; None for an engine that runs elsewhere.
         stop: The stop requests of the user.
@@ -66,8 +66,8 @@ class Work:
 
         Args:
             name: Name of the worker.
-            cores: Numbers of its cores; empty for any cores.
-            memory: Maximum memory of a run in bytes; None for the limit of the user.
+            cores: Numbers of the worker's cores; empty means any cores.
+            memory: Maximum memory of a run in bytes; None means the limit of the user.
         """
         if memory is None and self.memory is not None:
             memory = int(self.memory * 2**30)
@@ -80,9 +80,9 @@ class Engine(Protocol):
     def __call__(self, work: Work) -> Iterator[None]:
         """Carry out runs; their folders and records hold the results.
 
-        Yields several times a second, so that the sweep can show its progress. A run whose process
-        or machine dies is tried again; a run that fails is not. Once `work.stop.count` is above
-        zero, no run is started, and active runs stop with a checkpoint.
+        The function yields several times a second, so that the sweep can show its progress. A run
+        whose process or machine died is tried again; a run that failed is not tried again. When
+        `work.stop.count` is above zero, no run is started, and active runs stop with a checkpoint.
 
         Raises:
             UserError: The engine, one of its options, or its cluster is missing; no run started.

@@ -1,4 +1,4 @@
-"""The engine for a Ray cluster: a task for each run; a lost machine only costs time.
+"""The engine for a Ray cluster: each run is one task; if a machine is lost, only time is lost.
 
 Options: `address` of the cluster (default: RAY_ADDRESS, else this machine).
 """
@@ -24,7 +24,7 @@ _PATIENCE = 10.0
 
 
 def carry_out(work: Work) -> Iterator[None]:
-    """Carry out runs as tasks; Ray repeats the tasks of a machine that it has lost."""
+    """Carry out runs as tasks; if a machine is lost, Ray repeats its tasks."""
     ray = _connected(work)
     try:
         crew = _WorkerPool(work, ray)

@@ -1,4 +1,4 @@
-"""The engine for a Slurm cluster, through submitit: a job for each run.
+"""The engine for a Slurm cluster, which uses submitit: each run is one job.
 
 Options: `cluster` (slurm, or local to test it on this machine), `time` in minutes (1440), and these
 options of sbatch: `partition`, `account`, `qos`, `constraint`, `exclude`, `nodelist`, `gres`,
@@ -64,11 +64,11 @@ def script(work: Work) -> str:
 
 
 class Task:
-    """A run as a Slurm job; submitit submits it again if Slurm preempts it.
+    """A run as a Slurm job; submitit submits the job again if Slurm preempts it.
 
     Args:
         job: The run.
-        worker: The worker that carries it out.
+        worker: The worker that carries out the run.
     """
 
     def __init__(self, job: Job, worker: Worker) -> None:
@@ -81,7 +81,7 @@ class Task:
         return carried_out(self.job, self.worker, f"slurm-{submitit.JobEnvironment().job_id}")
 
     def checkpoint(self) -> object:
-        """Return the job that continues after preemption; the run finds its own checkpoint."""
+        """Return the job that continues after preemption from the checkpoint of the run."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(self)

@@ -1,8 +1,8 @@
 """The photometric loss and its gradient in one pass over the image (Numba, CPU, float32).
 
 x is the image and y the target; s = x + y and d = x - y. With s and d, SSIM needs four windowed
-means instead of five: M_s, M_d, E[s^2], E[d^2]. Its factors have no cancellation between the two
-images:
+means instead of five: M_s, M_d, E[s^2], E[d^2]. The factors of this form have no cancellation
+between the two images:
 
     SSIM = (M_s^2 - M_d^2 + 2 C1) (V_s - V_d + 2 C2) / ((M_s^2 + M_d^2 + 2 C1) (V_s + V_d + 2 C2)),
 
@@ -12,9 +12,9 @@ variances are differences of nearly equal numbers. Therefore s and d are taken r
 their mean over the tile (per channel).
 
 The image is divided into tiles whose size depends only on the image's size. A tile is processed row
-by row with ring buffers of sixteen rows (s, d, mask; a, b, c). So the working set stays in the
-second-level cache, and memory does not grow with the image. Every tile recomputes its halo, so
-tiles are independent and the result has the same bits for any number of threads.
+by row with ring buffers of sixteen rows (s, d, mask; a, b, c). The working set therefore stays in
+the second-level cache, and memory does not grow with the image. Every tile recomputes its halo, so
+that tiles are independent and the result has the same bits for any number of threads.
 """
 
 from typing import TypeAlias
@@ -136,18 +136,17 @@ def loss_terms(
     gradient: NDArray[np.float32] | None = None,
     ssim_weight: float = 0.2,
 ) -> tuple[float, float]:
-    """Return the means of |x - y| and of 1 - SSIM over the kept pixels; write the gradient.
+    """Return the means of |x - y| and of 1 - SSIM over the unmasked pixels; write the gradient.
 
     Args:
         image: [H, W, 3], C-contiguous.
         target: [H, W, 3], C-contiguous; 8-bit values are divided by 255.
-        mask: [H, W], True where the pixel counts; None keeps all.
+        mask: [H, W], True where the pixel counts; None counts all pixels.
         gradient: [H, W, 3], C-contiguous, receives the gradient of (1 - w) * L1 + w * (1 - SSIM);
-            None skips that half of the work.
+            None omits its computation.
         ssim_weight: w.
 
-    Returns:
-        L1 and 1 - SSIM; both 0 if no pixel is kept.
+    Returns: L1 and 1 - SSIM; both are 0 if no pixel counts.
     """
     height, width, _ = image.shape
     kept = height * width if mask is None else int(np.count_nonzero(mask))

@@ -138,7 +138,7 @@ def load_row(
 ) -> None:  # fmt: skip
     """Load s, d (relative to their centres) and the mask of a row into the rings.
 
-    Outside the image and at masked-out pixels, both images are 0.
+    Outside the image and at masked pixels, both images are 0.
     """
     first = CHANNELS * (box[2] - 2 * RADIUS)  # float column of the image at the ring's column 0
     count = CHANNELS * (box[3] - box[2] + 4 * RADIUS)
@@ -249,7 +249,7 @@ def _sum_squares(
 def down(ring: _Floats, start: int, row: int) -> tuple[Lanes, Lanes]:
     """Return the window sums over the rows of a ring, around `row` and around the next row.
 
-    Both are computed together, because they share most of their data, which comes from the
+    Both sums are computed together, because they share most of their data, which comes from the
     second-level cache.
 
     Args:

@@ -56,7 +56,8 @@ def sum_rows(scratch: _Floats, row: int, columns: int) -> None:
 def ssim_row(scratch: _Floats, row: int, columns: int, partial: int) -> None:
     """Write 1 - SSIM of a row to the line, and a, b, c to their rings.
 
-    They are 0 for pixels that do not count. The column sums of the row begin at element `partial`.
+    The values are 0 for pixels that do not count. The column sums of the row begin at element
+    `partial`.
     """
     slot = (row & (SLOTS - 1)) * STRIDE
     zero, one, two = splat_wide(_ZERO), splat_wide(_ONE), splat_wide(_TWO)

@@ -1,1 +1,1 @@
-"""Kernels over the pixels of tiles: forward, backward, and what both count."""
+"""Kernels over the pixels of tiles: forward, backward, and the parts that both passes share."""

@@ -6,10 +6,10 @@ sigma1 sigma2 W(u, sigma1) W(v, sigma2) of the opacity. The window W of one pixe
 
     W(u, sigma) = F((|u| + 1/2) / sigma) - F((|u| - 1/2) / sigma).
 
-Let t = |u| / sigma, h = 1 / (2 sigma), c the cubic, and D = c(t + h) - c(t - h) in closed form.
-Then W = (1 - exp(-D)) / ((1 + U) (1 + L)) with U = exp(c(t - h)) and L = exp(-c(t + h)), so that
-exp(-D) = U L. For small D, a series replaces 1 - exp(-D), so that wide Gaussians do not lose
-precision by cancellation. The derivatives below use the same terms.
+Let t = |u| / sigma and h = 1 / (2 sigma), let c be the cubic, and let D = c(t + h) - c(t - h) in
+closed form. Then W = (1 - exp(-D)) / ((1 + U) (1 + L)) with U = exp(c(t - h)) and L = exp(-c(t +
+h)), so that exp(-D) = U L. For small D, a series replaces 1 - exp(-D), so that wide Gaussians do
+not lose precision by cancellation. The derivatives use the same terms.
 """
 
 import math
@@ -79,16 +79,16 @@ ROW_V = TILE_HEIGHT
 
 @device
 def main_axes(a: float, b: float, c: float, det: float) -> tuple[float, float, float, float]:
-    """Return cosine and sine of the longer axis, and both variances, px^2.
+    """Return cosine and sine of the longer axis, and the variances along both axes, px^2.
 
     A round Gaussian has no main axes; the axes of the image are used. The angle is in (-90, 90]
-    degrees. It is halved without trigonometric functions, so that loops over this function are
-    vectorised.
+    degrees. The angle is halved without trigonometric functions, so that loops over this function
+    are vectorised.
 
     Args:
         a: Entry of the undilated covariance [[a, b], [b, c]], px^2.
-        b: See `a`.
-        c: See `a`.
+        b: Entry of the undilated covariance, px^2.
+        c: Entry of the undilated covariance, px^2.
         det: Determinant of the covariance.
     """
     half = 0.5 * (a - c)
@@ -148,7 +148,7 @@ def fill_axis_rows(
     rows: NDArray[np.float32],
     base: int,
 ) -> np.uint64:
-    """Like `footprint.fill_rows`: return the patches within reach along both main axes."""
+    """Return the patches within reach along both main axes, like `footprint.fill_rows`."""
     half, zero = _number(0.5), _number(0.0)
     middle = _number(MIDDLE)
     dx = (splat_wide(left) + middle) - broadcast_wide(records, record + U_WHOLE)
@@ -185,7 +185,7 @@ def _power(x: Lanes) -> Lanes:
 
 @device
 def _share(difference: Lanes, both: Lanes) -> Lanes:
-    """Return 1 - exp(-D) given D >= 0 and exp(-D), accurate to a few roundings also for small D."""
+    """Return 1 - exp(-D) from D >= 0 and exp(-D), to a few roundings also for small D."""
     series = _number(_SERIES[4])
     series = fma(series, difference, _number(_SERIES[3]))
     series = fma(series, difference, _number(_SERIES[2]))
@@ -198,7 +198,7 @@ def _share(difference: Lanes, both: Lanes) -> Lanes:
 def _window_terms(
     offset: Lanes, inverse_sigma: Lanes, constants: NDArray[np.float32]
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
-    """Return U, L, 1 - exp(-D) and (1 + U) (1 + L); powers are clamped to 2**-100 .. 2**100."""
+    """Return U, L, 1 - exp(-D) and (1 + U) (1 + L); the powers are clamped to 2**-100 .. 2**100."""
     zero, one = _number(0.0), _number(1.0)
     t, h = magnitude(offset) * inverse_sigma, _number(0.5) * inverse_sigma
     least, most = _number(-100.0), _number(100.0)
@@ -235,10 +235,10 @@ def coverages(
 
     Args:
         peak: 2 pi sigma1 sigma2 times the opacity.
-        u: Pixels; likewise `v`.
-        v: See `u`.
-        inverse_1: 1 / sigma1; likewise `inverse_2`.
-        inverse_2: See `inverse_1`.
+        u: Offset along the first main axis, pixels.
+        v: Offset along the second main axis, pixels.
+        inverse_1: 1 / sigma1.
+        inverse_2: 1 / sigma2.
         constants: From `vector_constants`.
     """
     first = _window_terms(u, inverse_1, constants)
@@ -286,8 +286,8 @@ def coverage_gradients(
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
     """Return alpha as `coverages` does, and the derivatives of its logarithm.
 
-    The derivatives are by u, v, sigma1 and sigma2, each times its sigma. They are undefined for
-    tiny alpha.
+    The derivatives are by u, v, sigma1 and sigma2, each times its sigma. The derivatives are
+    undefined for tiny alpha.
     """
     upper_1, lower_1, share_1, both_1 = _window_terms(u, inverse_1, constants)
     upper_2, lower_2, share_2, both_2 = _window_terms(v, inverse_2, constants)

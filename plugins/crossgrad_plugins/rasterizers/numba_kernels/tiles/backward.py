@@ -1,14 +1,14 @@
-"""Gradients of the tiles' pixels, summed per entry (Gaussian and tile), front to back.
+"""Gradients of the tiles' pixels, summed per entry (a Gaussian in a tile), front to back.
 
-S is the contribution of all Gaussians behind the current one to the linearised loss. Its start
-value is the gradient of the pixel times the pixel. c is the gradient times the Gaussian's colour.
-Then
+Let S be the contribution of all Gaussians behind the current Gaussian to the linearised loss. The
+start value of S is the gradient of the pixel times the pixel. c is the gradient times the
+Gaussian's colour. Then
 
     dL/d(alpha) = T c - S / (1 - alpha),
 
 so one pass in drawing order is enough, and the transmittance T has the same bits as in the forward
-pass. A gradient of the accumulated opacity only reduces the start value of S by this gradient times
-the final transmittance. The accumulated depth is one more colour channel.
+pass. A gradient of the accumulated opacity only reduces the start value of S: by this gradient
+times the final transmittance. The accumulated depth is treated as one more colour channel.
 """
 
 import numpy as np
@@ -119,10 +119,10 @@ def _respond(
     capped: NDArray[np.float32] | None,
     responses: NDArray[np.float32],
 ) -> None:
-    """Write the plain response in patches, one after the other.
+    """Write the plain response in patches, one patch after another.
 
-    This is a separate loop, because nothing in it depends on the transmittance that the previous
-    Gaussian leaves in a patch. So the processor can work on several patches at once.
+    This is a separate loop, because the response does not depend on the transmittance that the
+    previous Gaussian leaves in a patch. So the processor can work on several patches at once.
     """
     decay = broadcast_wide(records, record + DECAY)
     terms = terms_of(constants)
@@ -209,8 +209,9 @@ def _moments(
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]:
     """Return SUM_1, SUM_D, SUM_Y, SUM_DD, SUM_YY, SUM_DY, SUM_ABS_X and SUM_ABS_Y in eight lanes.
 
-    Both halves of a patch's lanes have the same rows and therefore the same dy, so they are added
-    before the multiplication by dy. Six sums of eight lanes also fit into sixteen vector registers.
+    The two halves of a patch's lanes belong to the same rows and have the same dy, so they are
+    added before the multiplication by dy. After this addition, six sums of eight lanes fit into
+    sixteen vector registers.
     """
     # d(exponent)/d(mean y) = log 2 (2 row_decay dy - 2 slope decay dx)
     decay_row = broadcast(records, record + ROW_DECAY)
@@ -264,7 +265,7 @@ def _gather(
 ) -> None:
     """Sum the gradients of one plain Gaussian over patches into partials[partial:].
 
-    `capped` is None for Gaussians whose alpha reaches the cap in no pixel.
+    `capped` is None if the alpha of the Gaussian reaches the cap in no pixel.
     """
     _respond(patches, records, record, rows, base, constants, capped, responses)
     sum_red, sum_green, sum_blue, sum_depth = _blend(
@@ -298,7 +299,7 @@ def _gather_analytic(
     partials: NDArray[np.float32],
     partial: int,
 ) -> None:
-    """Like `_gather`, for the analytic response."""
+    """Sum the gradients like `_gather`, for the analytic response."""
     red = broadcast_wide(records, record + RED)
     green = broadcast_wide(records, record + GREEN)
     blue = broadcast_wide(records, record + BLUE)
@@ -472,7 +473,8 @@ def differentiate(
         v_alpha: [H, W] gradient by alpha, or None.
         v_depth: [H, W] gradient by the depth, or None.
         absolute: Any vector selects the sums of absolute gradients; None omits them.
-        analytic: As in `composite`.
+        analytic: Any vector selects records of the analytic response; None selects the plain
+            response.
         partials: [slots * PARTIAL] written for slots of entries with a mask.
         written: [slots] 1 written for slots of entries with a mask; zero before.
     """

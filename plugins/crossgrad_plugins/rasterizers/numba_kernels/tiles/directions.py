@@ -1,11 +1,11 @@
 """Gradients of single pixels by a Gaussian's projected mean, and their directions.
 
-This is a separate pass after the backward pass, for densifiers that need directions. It renders the
-tiles again and sums per entry and bin the fields of
+This is a separate pass after the backward pass, for densifiers that need directions. The pass
+renders the tiles again and sums, per entry and bin, the fields of
 `crossgrad_core.contract.gaussians.Screen.directions`.
 
-The operations are those of `backward`, in the same order, so the gradients have the same bits. Only
-the operations for sums of other gradients are left out.
+The operations are the same as in `backward`, in the same order, so the gradients have the same
+bits. Only the operations for sums of other gradients are left out.
 """
 
 import numpy as np
@@ -133,11 +133,11 @@ def _spread(
     """Add the gradients of two columns of four pixels to the sums of their bins.
 
     Args:
-        gx: Gradients by the projected mean, px^-1; likewise `gy`.
-        gy: See `gx`.
-        along: Positions along the axis, standard deviations.
-        width: Width of the image, pixels; likewise `height`. Directions are in NDC units.
-        height: See `width`.
+        gx: Gradients by the x of the projected mean, px^-1.
+        gy: Gradients by the y of the projected mean, px^-1.
+        along: Positions along the axis, in standard deviations.
+        width: Width of the image, pixels. Directions are in NDC units.
+        height: Height of the image, pixels.
         places: [LANES] buffer for `along`.
         binned: [BINS * FIELDS * LANES].
     """
@@ -201,9 +201,9 @@ def mean_gradients(
     v_depth: NDArray[np.float32] | None,
     analytic: NDArray[np.float32] | None,
 ) -> tuple[Lanes, Lanes]:
-    """Blend into a patch; return its pixels' gradients by the projected mean (x and y).
+    """Blend a Gaussian into a patch; return the pixels' gradients by the projected mean (x and y).
 
-    Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records in
+    Gradients of plain records are in units of 2 log 2 px^-1; gradients of analytic records are in
     px^-1.
     """
     row = base + row_of(patch)
@@ -328,7 +328,7 @@ def bin_directions(
 
     Args:
         jobs: From `share`.
-        starts: As in `differentiate`; so are all arguments up to `analytic`, except `axes`.
+        starts: [T + 1] first entry of each tile.
         entries: [E, 2].
         masks: [E].
         records: Records of the drawn Gaussians, flat.
@@ -340,7 +340,7 @@ def bin_directions(
         v_image: [H, W, 3].
         v_alpha: [H, W] or None.
         v_depth: [H, W] or None.
-        analytic: Any vector selects the analytic response; None: plain.
+        analytic: Any vector selects the analytic response; None selects the plain response.
         found: [slots * SUMS] written for slots of entries with a mask.
     """
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH

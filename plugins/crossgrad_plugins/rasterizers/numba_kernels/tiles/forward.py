@@ -99,7 +99,7 @@ _DEPTHS = PATCHES * _STATE
 def _start(
     state: NDArray[np.float32], width: int, height: int, constants: NDArray[np.float32]
 ) -> np.uint64:
-    """Clear the state of a tile of width x height pixels; return its patches as bits."""
+    """Clear the state of a tile of width x height pixels; return the tile's patches as bits."""
     state[:] = np.float32(0.0)
     live = np.uint64(0)
     x = load_wide(constants, OFFSETS) + splat_wide(np.float32(MIDDLE))
@@ -151,8 +151,7 @@ def _coverage(
 ) -> tuple[Lanes, np.uint64]:
     """Compute the analytic response in a patch.
 
-    Returns:
-        Alpha, and `left` without the patch if it is out of reach.
+    Returns: Alpha, and the bits `left`, without the bit of the patch if the patch is out of reach.
     """
     cosine, sine = broadcast_wide(records, record + COSINE), broadcast_wide(records, record + SINE)
     inverse_1 = broadcast_wide(records, record + INVERSE_1)
@@ -239,7 +238,7 @@ def _finish_row(
     image: NDArray[np.float32],
     alpha: NDArray[np.float32],
 ) -> None:
-    """Add the background to eight pixels and write them from a flat index on."""
+    """Add the background to eight pixels, and write the pixels from a flat index on."""
     through = magnitude(passed)
     store_triples(
         image,
@@ -334,7 +333,7 @@ def _composite(
     limits: NDArray[np.int32] | None,
     masks: NDArray[np.uint64],
 ) -> None:
-    """Composite one tile and write to `masks` the patches that each entry was blended into."""
+    """Composite one tile, and write to `masks` the patches into which each entry was blended."""
     columns = (image.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     top = (tile // columns) * TILE_HEIGHT
     left = (tile % columns) * TILE_WIDTH
@@ -405,9 +404,11 @@ def composite(
         image: [H, W, 3] written.
         alpha: [H, W] written.
         depth: [H, W] written, or None.
-        counts: [slots] pixels blended per slot, written; zero before. None: not counted.
-        analytic: Any vector selects records of the analytic response; None: plain.
-        limits: [N, 2] first and last column of 16 pixels per record; None: no limits.
+        counts: [slots] pixels blended per slot, written; zero before. None means that pixels are
+            not counted.
+        analytic: Any vector selects records of the analytic response; None selects the plain
+            response.
+        limits: [N, 2] first and last column of 16 pixels per record; None means no limits.
         masks: [E] patches per entry, written; zero before.
     """
     tiles = starts.shape[0] - 1

@@ -1,8 +1,8 @@
 """The number of marked pixels in which each Gaussian of a rendered view was blended.
 
-This is a separate pass after a render, for callers that mark pixels only when they know the render.
-It uses the tile lists of the forward pass and repeats the blending, without colours, in the patches
-with a marked pixel. The operations and decisions are the same as in `forward`.
+This is a separate pass after a render, for callers that can mark pixels only after they have the
+render. The pass uses the tile lists of the forward pass and repeats the blending, without colours,
+in the patches with a marked pixel. The operations and decisions are the same as in `forward`.
 """
 
 import numpy as np
@@ -140,7 +140,7 @@ def count_marked(
     analytic: NDArray[np.float32] | None,
     counts: NDArray[np.int32],
 ) -> None:
-    """Count, per entry, the marked pixels of its tile in which it was blended.
+    """Count, for each entry, the marked pixels of its tile in which the entry was blended.
 
     Args:
         jobs: From `share`.
@@ -150,7 +150,7 @@ def count_marked(
         records: Records of the drawn Gaussians, flat.
         constants: From `vector_constants`.
         marked: [H, W], non-zero if a pixel counts.
-        analytic: As in `composite`.
+        analytic: Any vector selects the analytic response; None selects the plain response.
         counts: [slots] written; zero before.
     """
     columns = (marked.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH

@@ -232,16 +232,15 @@ def blend(
 
     Args:
         alpha: The Gaussian's alpha in the pixels, at most the cap; 0 where it is not drawn.
-        odds: alpha / (1 - alpha); negative where alpha is capped and does not depend on parameters.
+        odds: alpha / (1 - alpha); negative for pixels where alpha is capped and has no gradient.
         capped: None if no odds are negative.
         weighted_color: The gradients of the pixels times the colour of the Gaussian.
         state: State of the tile.
         at: First element of the patch's state.
         constants: From `vector_constants`.
 
-    Returns:
-        The weights of the Gaussian in the pixels, and alpha times the loss' gradient by alpha: the
-        gradient by the exponent and by the logarithm of the opacity.
+    Returns: The weights of the Gaussian in the pixels, and alpha times the gradient of the loss by
+    alpha, which is the gradient by the exponent and by the logarithm of the opacity.
     """
     zero = splat_wide(np.float32(0.0))
     before = load_wide(state, at + PASSED)
