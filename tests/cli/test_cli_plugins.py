@@ -186,6 +186,7 @@ def test_show_prints_options_bounds_docstring_and_package(ran, third_party):
         assert words in out
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("slot", list(GROUPS))
 def test_show_fits_every_bundled_plugin_into_80_columns(ran, slot):
     for entry in registry.offers(slot):

@@ -56,6 +56,7 @@ def ended(number, moment, *arguments, **options):
 LOADING = "loading libraries"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("number", "moment", "last"),
     [
@@ -204,6 +205,7 @@ def runs(tmp_path_factory):
     return dict(zip(CASES, zip(folders, map(int, done.stdout.split()), strict=True), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_signal_in_a_run_gives_the_expected_messages_and_exit_code(runs, case):
     number, _, words, step, results = CASES[case]

@@ -46,6 +46,7 @@ def installed(folder, monkeypatch):
     return plugins
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("slot", OFFERED)
 def test_a_generated_plugin_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
     name = f"made-new-{slot}"

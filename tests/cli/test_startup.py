@@ -32,6 +32,7 @@ LOG = logging.getLogger("crossgrad_core.numerics.kernel_cache")
 STAGES = logging.getLogger("crossgrad_core.training.start")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "arguments",
     [("run", "SCENE"), ("eval", "RUN"), ("render", "RUN"), ("export", "RUN"), ("diagnose", "S"),

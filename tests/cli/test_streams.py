@@ -98,6 +98,7 @@ def in_ascii(*arguments):
     )
 
 
+@pytest.mark.slow
 def test_a_run_prints_its_results_folder_on_every_terminal(foreign):
     folder, done = foreign
     assert done.returncode == 0, done.stderr
@@ -106,6 +107,7 @@ def test_a_run_prints_its_results_folder_on_every_terminal(foreign):
     assert r"Łódź\x1b[31m" in log and "\x1b" not in log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["export", "render", "compare"])
 def test_a_command_prints_its_output_path_on_every_terminal(
     foreign, command, tmp_path, monkeypatch
@@ -146,6 +148,7 @@ def test_streams_of_another_kind_are_not_wrapped():
     assert streams._lasting(other) is other
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("redirections", ["| head -1", ">&-", "2>&-", ">&- 2>&-", ">&- 2>&- <&-"])
 def test_a_list_printed_to_a_closed_pipe_ends_quietly(redirections):
     command = f"{shlex.quote(sys.executable)} -m crossgrad_core plugins list"
@@ -161,6 +164,7 @@ def scene(tmp_path_factory):
     return write_tiny_scene(tmp_path_factory.mktemp("scene") / "tiny", views=5)
 
 
+@pytest.mark.slow
 def test_a_training_continues_after_the_readers_of_its_output_end(scene, tmp_path):
     out = tmp_path / "run"
     command = [*CROSSGRAD, "run", str(scene), "--steps", "20", "--threads", "1", "--out", str(out)]

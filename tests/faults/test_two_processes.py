@@ -18,6 +18,7 @@ def at_once(reference, second, *command):
     return sorted((reference.nursery.wait(), second.wait()), key=lambda end: end.code)
 
 
+@pytest.mark.slow
 def test_a_second_run_into_the_same_folder_is_refused(reference, second, tmp_path):
     folder = tmp_path / "run"
     works, refused = at_once(reference, second, *reference.command(folder))

@@ -29,6 +29,7 @@ def told(found) -> str:
     return "\n\n".join(f"{kind}\n{what.detail}\n{case}" for kind, (what, case) in found.items())
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_short_fuzz_search_finds_no_defect(name, tmp_path):
     target = TARGETS[name]
@@ -79,6 +80,7 @@ def _has(module, name):
     return True
 
 
+@pytest.mark.slow
 def test_the_makefile_runs_the_fuzz_search():
     (path,) = set(re.findall(r"PYTHONPATH=(\S+) .*-m crossgrad_fuzz", MAKEFILE.read_text()))
     arguments = [sys.executable, "-m", "crossgrad_fuzz", "--help"]

@@ -48,6 +48,7 @@ def test_the_guard_finds_each_way_to_call_the_compiler(source):
     assert list(compilers_in(source))
 
 
+@pytest.mark.slow
 def test_all_kernels_load_if_no_folder_can_hold_a_cache():
     modules = [name.removesuffix(".py").replace("/", ".") for name in KERNELS]
     modules = [name.removesuffix(".__init__") for name in modules]

@@ -302,6 +302,7 @@ def test_the_batch_rule_scales_with_the_number_of_views(views):
         assert rates_at(setup, step) == pytest.approx(wanted, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_adam_under_the_batch_rule_agrees_with_torch():
     rng = torch.Generator().manual_seed(3)
     start = torch.randn(50, generator=rng)

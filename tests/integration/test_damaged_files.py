@@ -84,6 +84,7 @@ def damaged(whole, place, file, damage):
     return copy
 
 
+@pytest.mark.slow
 @THOROUGH
 def test_resuming_a_damaged_run_gives_the_same_results_or_is_refused(
     stopped, finished, tmp_path, capsys, thorough
@@ -101,6 +102,7 @@ def test_resuming_a_damaged_run_gives_the_same_results_or_is_refused(
             assert contents(run) == before, (file, damage)
 
 
+@pytest.mark.slow
 @THOROUGH
 @pytest.mark.parametrize(
     "name", ["eval", pytest.param("export", marks=SLOW), pytest.param("render", marks=SLOW)]
@@ -221,6 +223,7 @@ def test_a_damaged_prepared_scene_gives_the_same_export_or_is_refused(
             assert found.is_refused and not (tmp_path / "a.ply").exists(), (file, damage, found)
 
 
+@pytest.mark.slow
 @THOROUGH
 def test_continuing_a_damaged_sweep_gives_the_same_table_or_is_refused(tmp_path, capsys, thorough):
     scene = write_tiny_scene(tmp_path / "tiny", views=4, width=32, height=24, points=60)

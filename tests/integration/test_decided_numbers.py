@@ -14,6 +14,7 @@ def test_the_file_of_known_numbers_contains_all_combinations():
     assert [name for name, _ in CHOSEN] == [*KNOWN]
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("first", range(0, len(CHOSEN), CHUNK))
 def test_automatically_chosen_numbers_equal_the_recorded_numbers(first):
     chunk = CHOSEN[first : first + CHUNK]

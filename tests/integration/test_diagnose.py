@@ -56,6 +56,7 @@ def same(a, b):
 OBSERVER = {"name": "diagnostics", "every": 6, "views": 4}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "settings",
     [
@@ -89,6 +90,7 @@ def test_each_probe_records_its_duration(scene, tmp_path):
     assert all(seconds > 0 for seconds in probing.values())
 
 
+@pytest.mark.slow
 def test_a_resumed_run_continues_its_diagnostics_table(scene, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     run(scene, whole, observers=[OBSERVER])

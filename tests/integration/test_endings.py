@@ -96,6 +96,7 @@ class Broken:
         return answer
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "case",
     [
@@ -145,6 +146,7 @@ def test_a_photo_that_cannot_be_read_at_an_evaluation_keeps_the_run(
     assert_same(out, whole)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "case",
     [
@@ -245,6 +247,7 @@ def hangup():
     signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("hangup")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_run_after_its_step(scene, whole, tmp_path, with_plugin, capsys, number):
@@ -389,6 +392,7 @@ class Leaves:
         return DensifyResult(Edit(values={name: Rows(each, rows) for name, each in values.items()}))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ZeroDivisionError("by zero")])
 def test_an_error_in_the_removal_of_floaters_loses_no_results(
     scene, tmp_path, with_plugin, monkeypatch, error

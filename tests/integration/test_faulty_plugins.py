@@ -174,6 +174,7 @@ def test_a_run_that_loses_all_primitives_reports_so(scene, tmp_path, monkeypatch
     assert "no primitive" not in capsys.readouterr().err
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("options", "words"),
     [

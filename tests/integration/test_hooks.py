@@ -91,6 +91,7 @@ CHECKS = [
 ]
 
 
+@pytest.mark.sampled(26)
 @pytest.mark.parametrize(("slot", "name", "check"), CHECKS)
 def test_each_plugin_keeps_the_contract_of_its_slot(slot, name, check):
     check(load_plugin(slot, name))
@@ -119,6 +120,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("case", CASES)
 def test_a_resumed_run_ends_with_the_bits_of_an_uninterrupted_run(scene, tmp_path, case):
     settings = {**ALTOGETHER, **CASES[case]}
@@ -234,6 +236,7 @@ def stops_of(out):
     return dict(zip(state.values["photos"], state.tensors["value.stops"].tolist(), strict=True))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", [1, 3])
 @pytest.mark.parametrize("backbone", ["vanilla", "scaffold"])
 def test_gains_per_photo_identify_the_darker_photos(scene, tmp_path, views, backbone):

@@ -69,6 +69,7 @@ def sparse(tmp_path_factory):
     return made
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("points", [0, 1, 2])
 @pytest.mark.parametrize("initializer", sorted(entries("initializers")))
 def test_every_initializer_trains_a_scene_with_few_or_no_points(

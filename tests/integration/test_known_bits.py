@@ -25,6 +25,7 @@ def test_trained_bits_equal_the_recorded_bits(name, reference, tmp_path):
     assert known_bits.made(name, tmp_path) == reference[name]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["vanilla", "scaffold", "exposure"])
 def test_bits_do_not_depend_on_the_thread_that_does_a_job(name, monkeypatch, tmp_path):
     usual = known_bits.made(name, tmp_path / "usual")

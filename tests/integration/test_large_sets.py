@@ -27,6 +27,7 @@ def trained(scene, out, *, check=False, **reading):
     return bits(out)
 
 
+@pytest.mark.slow
 def test_photos_from_memory_disk_cache_and_files_give_the_same_bits(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("CROSSGRAD_CACHE", str(tmp_path / "cache"))
     in_memory = trained(scene, tmp_path / "in memory")

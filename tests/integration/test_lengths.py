@@ -130,6 +130,7 @@ def test_seconds_end_a_run_before_max_views_is_reached(scene, tmp_path):
     assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_with_seconds_and_max_views_ends_at_max_views(scene, tmp_path):
     out = tmp_path / "run"
     run(scene, tmp_path / "whole", seconds=60.0, max_views=12, rasterizer={"name": "torch"})
@@ -193,6 +194,7 @@ def test_a_dry_run_with_seconds_prints_its_configuration(scene, tmp_path, capsys
     assert app.run(again, dry_run=True, verbosity=-1) == 0
 
 
+@pytest.mark.slow
 def test_runs_with_one_and_two_views_per_step_edit_after_the_same_views():
     one, two = (trained(views=k, max_views=144, min_refinements=6)[2] for k in (1, 2))
     assert len(one.edits) == len(two.edits) == 6

@@ -27,6 +27,7 @@ def photos_alone(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_photos_recipe_makes_a_scene_that_can_be_trained(tmp_path):
     photos_alone(tmp_path / "scene" / "images")
     (tmp_path / "poses.py").write_text(RECIPE, encoding="utf-8")

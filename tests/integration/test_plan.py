@@ -185,6 +185,7 @@ LEFT_OUT = (
 )
 
 
+@pytest.mark.slow
 def test_unused_components_are_not_imported(scene, tmp_path):
     out = tmp_path / "run"
     arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--out", out]
@@ -212,6 +213,7 @@ def test_sh_bands_that_the_plan_leaves_out_are_not_allocated(scene, tmp_path, mo
     assert b"f_rest" not in names
 
 
+@pytest.mark.slow
 def test_without_a_plan_the_planner_is_not_imported(scene, tmp_path):
     arguments = [sys.executable, "-c", _LOADED, "run", scene, *FEW, "--plan", "off", "--dry-run"]
     done = subprocess.run(

@@ -50,6 +50,7 @@ def run(scene, out, **options):
     return cg.run(scene, out=out, quiet=True, **{**OPTIONS, **options})
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_process_have_the_bits_of_the_command(scene, reference, tmp_path):
     first = run(scene, tmp_path / "first")
     run(scene, tmp_path / "other", backbone="mip", operator="sum", threads=1, steps=3,
@@ -239,6 +240,7 @@ def test_importing_the_core_imports_no_heavy_library():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "changed",
     [

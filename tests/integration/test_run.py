@@ -92,6 +92,7 @@ def test_the_written_config_repeats_the_run(scene, tmp_path):
     assert quality(tmp_path / "a") == quality(tmp_path / "b")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("sampler", ["epoch", "random", "near-far"])
 def test_a_stopped_run_continues_bit_for_bit(scene, tmp_path, sampler):
     # Edits fall before and behind the stop.

@@ -102,6 +102,7 @@ def test_a_scene_change_that_misplaces_parameters_is_always_refused(root, change
             look(How(accept_scene=True))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("change", ["a photo", "held out"])
 def test_read_only_commands_accept_a_changed_scene_with_accept_scene(root, change, capsys):
     spoilt(root / "scene", change)

@@ -123,6 +123,7 @@ def test_the_example_plugins_keep_their_contracts(crossgrad):
     assert "17 of 17 plugins keep the contract of their slot" in report
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("broken")
 def test_a_broken_example_plugin_fails_the_check_with_the_reasons(python):
     code, report = checked(python, "crossgrad-example")

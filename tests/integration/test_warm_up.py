@@ -40,6 +40,7 @@ print(json.dumps(sorted(kernels() - before)))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [{"steps": 160}, {"seconds": 3.0}], ids=["steps", "seconds"])
 def test_training_compiles_no_kernel_after_the_warm_up(tmp_path, length):
     settings = {
@@ -84,6 +85,7 @@ print(json.dumps([len(before), sorted(kernels() - before)]))
 """
 
 
+@pytest.mark.slow
 def test_the_helper_process_compiles_every_kernel_that_a_run_uses():
     done = subprocess.run(
         [sys.executable, "-c", BESIDE], capture_output=True, text=True, timeout=300, check=False

@@ -82,6 +82,7 @@ def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
     assert "config.yaml was changed since this run began" in capsys.readouterr().err
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [

@@ -61,6 +61,7 @@ def check(row, steps):
         assert int(drawn.sum()) == sum(len(set(record.views)) for record in records)
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
 def test_the_design_contains_all_pairs_of_exposures_backbones_and_views(row):
     check(row, FEW)

@@ -86,6 +86,7 @@ def check(row):
     assert all(torch.isfinite(tensor).all() for tensor in state.parameters.values())
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("row", DESIGN, ids=" x ".join)
 def test_the_design_contains_all_pairs_of_resolutions_backbones_and_views(row):
     check(row)

@@ -51,6 +51,7 @@ def test_every_benchmark_case_is_accepted_by_crossgrad(script, tmp_path):
         configured(case.config(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gaussians", [0, 500])
 def test_short_cases_run_in_the_process_of_the_benchmark(script, tmp_path, monkeypatch, gaussians):
     """Measured here on the CPU, with what a GPU would be asked left out."""

@@ -27,6 +27,7 @@ def town(tmp_path_factory):
     return folder, pycolmap.Reconstruction(str(folder / "sparse" / "0"))
 
 
+@pytest.mark.slow
 def test_points_are_at_the_positions_that_photos_show(town):
     folder, model = town
     assert len(model.images) == 18

@@ -35,6 +35,7 @@ def double(backbone, parameters, rows):
     return {n: t.detach().double().requires_grad_(n in names) for n, t in few.items()}
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_gradients_through_the_rasterizer_pass_a_numerical_check(options):
     backbone = Scaffold(**{"offsets": 2, "feature": 8, **options})

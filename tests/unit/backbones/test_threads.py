@@ -14,6 +14,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "colors", "sh_dc", "sh_rest")
 pytestmark = pytest.mark.usefixtures("keeps_threads")
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("name", "options"),
     [*((name, {}) for name in entries("backbones")), ("scaffold", {"feature_bank": True})],

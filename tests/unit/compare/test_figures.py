@@ -17,6 +17,7 @@ from crossgrad_plugins.compare.figures.style import (
 WORDS, WIDE = "ochota_kap_hybrid, gain ", "W"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("length", "letters", "share"),
     [
@@ -47,6 +48,7 @@ def test_a_legend_fits_its_figure_for_labels_of_any_length(length, letters, shar
     assert [text.replace("\n", "") for text in texts] == labels
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("beside", [1, 2, 3, 4])
 @pytest.mark.parametrize(
     "scene", ["city", "ochota_kap_hybrid_gain", "a b c" * 30, "x" * 90, "_", "$y_$", "城" * 5]
@@ -69,6 +71,7 @@ def test_each_arm_has_its_own_color_dash_and_marker(arms):
     assert len({(look.color, look.marker) for look in found}) == arms
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("arms", [2, 8, 14, 28])
 def test_a_legend_of_many_arms_does_not_shrink_the_panels(arms):
     names = [f"two views, equal views, statistics of one view, {index}" for index in range(arms)]

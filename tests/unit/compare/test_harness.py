@@ -66,11 +66,13 @@ SELVES = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("scenes", "pairs", "law"), SELVES)
 def test_a_method_is_seldom_reported_different_from_itself(scenes, pairs, law):
     assert self_comparisons(scenes=scenes, pairs=pairs, law=law) <= 16
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("pairs", "effects"), [(10, (0.1, -0.1, 0.2, -0.2, 0.0)), (12, (0.1, -0.1, 0.2, -0.2))]
 )
@@ -83,6 +85,7 @@ def test_one_diverged_run_does_not_make_two_equal_methods_different(scenes):
     assert self_comparisons(scenes=scenes, pairs=12, noise=0.03, diverged=15.0) <= 16
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("law", [NORMAL, HEAVY])
 @pytest.mark.parametrize("scenes", [1, 4])
 def test_a_real_difference_is_found(scenes, law):
@@ -90,6 +93,7 @@ def test_a_real_difference_is_found(scenes, law):
     assert share(Verdict.DIFFERENT, 0.3, scenes=scenes, law=law, noise=noise) >= 0.8
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("law", [NORMAL, HEAVY])
 @pytest.mark.parametrize("scenes", [1, 4])
 def test_equal_methods_are_called_equivalent(scenes, law):

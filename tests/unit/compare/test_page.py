@@ -194,6 +194,7 @@ def test_the_worst_views_are_shown_with_photo_render_and_error(written):
     assert text.count("data:image/jpeg;base64,") == 3 * 5
 
 
+@pytest.mark.slow
 def test_only_a_comparison_is_replaced_and_the_same_runs_give_the_same_bytes(written, tmp_path):
     runs = [str(path) for path in sorted(written.parent.glob("?-?"))]
     before = {path.name: path.read_bytes() for path in written.rglob("*.*")}
@@ -266,6 +267,7 @@ def page_with(folder, capsys, name):
     return (folder / "out" / "index.html").read_text(), said.out + said.err
 
 
+@pytest.mark.slow
 def test_names_create_no_html_elements_or_attributes(tmp_path, capsys):
     plain, _ = page_with(tmp_path / "plain", capsys, "a harmless name")
     page, said = page_with(tmp_path / "evil", capsys, EVIL)
@@ -278,6 +280,7 @@ def test_names_create_no_html_elements_or_attributes(tmp_path, capsys):
             assert len({len(row) for row in csv.reader(file, strict=True)}) == 1, table
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no Chromium")
 def test_a_browser_executes_no_code_from_a_run_name(tmp_path, capsys):
     page_with(tmp_path, capsys, EVIL.replace("alert(1)", "document.title='run'"))

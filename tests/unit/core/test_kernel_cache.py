@@ -174,6 +174,7 @@ print(moved(x), *[len(moved.stats.cache_misses)])
 """
 
 
+@pytest.mark.slow
 def test_two_processes_that_compile_at_once_save_both_kernels(package):
     program = BOTH.format(package=package.name)
     path = os.pathsep.join([str(package.parent), *filter(None, sys.path)])

@@ -303,6 +303,7 @@ def test_a_run_whose_length_follows_the_clock_keeps_the_minimum_number_of_edits(
         assert len(done) + len(edits) >= FEWEST_EDITS
 
 
+@pytest.mark.sampled(20)
 @pytest.mark.parametrize("text", ["1", "2", "1..2@0.5"])
 @pytest.mark.parametrize("seed", range(20))
 def test_repeated_changes_of_length_keep_past_events_and_reschedule_later_ones(text, seed):

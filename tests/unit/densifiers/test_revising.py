@@ -274,6 +274,7 @@ class Slow:
         return self._image()
 
 
+@pytest.mark.slow
 def test_decoding_photos_for_an_edit_counts_as_loading_time():
     scene = sample_scene()
     views = tuple(replace(view, photo=Slow(view.photo)) for view in scene.views)

@@ -83,6 +83,7 @@ def observed(densifier, scale):
     return state.states["densifier"].per_primitive
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", NAMES)
 def test_statistics_do_not_depend_on_the_render_scale(name):
     full = observed(name, 1.0)

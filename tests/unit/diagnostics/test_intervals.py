@@ -25,6 +25,7 @@ REPETITIONS = 120
 SLACK = 3 * (0.95 * 0.05 / REPETITIONS) ** 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "dimension", "sizes", "ratio"),
     [

@@ -79,6 +79,7 @@ def test_groups_of_different_exposure_are_found_with_few_shared_points(joining, 
     assert gains.differ
 
 
+@pytest.mark.sampled(15)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("joining", [0, 2, 4, 16, 200])
 @pytest.mark.parametrize(

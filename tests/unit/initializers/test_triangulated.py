@@ -71,6 +71,7 @@ def test_a_scene_without_points_is_refused_with_the_options_that_add_points(bare
     assert setup.selection.initializer == FEW
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("backbone", sorted(entries("backbones")))
 def test_every_backbone_can_start_from_triangulated_points(bare, backbone):
     """The points have no sizes and opacities of their own: the backbone has to find some."""

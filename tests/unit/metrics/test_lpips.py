@@ -101,6 +101,7 @@ def of_torchmetrics(monkeypatch, net, images, *, scales):
     return float(network(one, two, normalize=scales))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
     ("kind", "net", "scales"),

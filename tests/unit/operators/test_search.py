@@ -109,6 +109,7 @@ def test_the_correct_operator_passes_the_search():
     assert not any(map(failed, search([symmetric_as(Symmetric())], Extent(rounds=8))))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("rounds", [4, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [*sorted(ORACLES), "chain"])
 def test_a_short_search_finds_no_result_outside_the_stated_bounds(name, rounds):
@@ -122,6 +123,7 @@ def test_the_stated_bounds_are_documented():
         assert f"| {name} | " in page and f" | {promise.factor_words} |" in page
 
 
+@pytest.mark.slow
 def test_a_longer_search_begins_with_the_cases_of_a_shorter_search():
     once = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))
     again = search([symmetric_as(SeldomOff())], Extent(rounds=3, seed=5))

@@ -85,6 +85,7 @@ def test_mgda_is_at_least_as_good_as_torchjd(views, ask):
         assert ((found - expected) ** 2).sum() <= excess + 1e-12 * (expected @ expected)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("views", VIEWS)
 def test_mgda_agrees_with_torchjd_if_every_view_has_a_positive_weight(views, ask):
     """Frank and Wolfe's steps converge fast where the shortest point lies well inside."""

@@ -306,6 +306,7 @@ def test_modes_are_separated_by_the_grouping_with_the_clearest_gap(name, groupin
     assert evidence_of(name).grouping.name == grouping
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("views", [12, 30, 60, 200])
 @pytest.mark.parametrize("law", ["uniform", "normal", "exponential", "lognormal"])
 def test_distances_without_a_gap_form_one_mode(law, views):
@@ -570,6 +571,7 @@ _GIVEN = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(_POINT, min_size=1, max_size=14),

@@ -157,6 +157,7 @@ def test_wrong_pairs_are_outvoted_and_removed(made):
     assert settled == {lost}
 
 
+@pytest.mark.slow
 def test_mapping_continues_if_a_photo_has_no_pair_left(made, tmp_path):
     """One photo is misplaced; all pairs of another one tell of nothing, so that they go aside."""
     model, path = made
@@ -223,6 +224,7 @@ def test_a_photo_moves_from_a_smaller_model_to_the_largest(made, tmp_path):
     assert all(close_to(poses_of(large)[number], truth[number]) for number in truth)
 
 
+@pytest.mark.slow
 def test_a_refinement_round_with_fewer_supporting_matches_is_discarded(made):
     """Mapping goes on and throws all photos but two about, as often as it is asked."""
     model, path = made

@@ -254,6 +254,7 @@ def name(request):
     return request.param
 
 
+@pytest.mark.sampled(60)
 @pytest.mark.parametrize("case_name", CASES)
 def test_each_rasterizer_agrees_with_the_reference(name, case_name):
     made, exact = settled(CASES[case_name]())

@@ -50,6 +50,7 @@ def test_gradients_of_geometry_opacity_and_rgb_pass_a_numerical_check(response, 
     check_gradients(gaussians, names, every_entry=every_entry)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 def test_gradients_of_spherical_harmonics_pass_a_numerical_check(sh_degree):
     gaussians = smooth_gaussians(20, CAMERA, sh_degree=sh_degree)

@@ -186,6 +186,7 @@ def test_formats_with_matrices_train_to_the_same_bits(reader, trained):
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("reader", ROUNDED)
 def test_formats_with_rounded_cameras_train_nearly_alike(reader, trained):
     ours, theirs = trained(reader), trained("colmap")

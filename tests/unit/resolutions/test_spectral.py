@@ -211,6 +211,7 @@ def test_the_shorter_side_keeps_a_minimum_of_pixels(resolution, width, height):
             assert 0 < scale <= 1.0
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("name", ["adc", "mcmc", "revising", "none"])
 @pytest.mark.parametrize(("total", "mode"), [(20, "scaled"), (3000, "scaled"), (30_000, "scaled"),
                                              (700, "absolute"), (30_000, "absolute")])  # fmt: skip
@@ -234,6 +235,7 @@ def test_views_have_full_size_after_the_end_of_density_control(name, total, mode
 PLANS = [ViewsPerStepSpec(), ViewsPerStepSpec((3,)), ViewsPerStepSpec((1, 4), (0.3,))]
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 @pytest.mark.parametrize("unit", ["views", "steps"])
 @pytest.mark.parametrize(

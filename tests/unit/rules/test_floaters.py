@@ -93,6 +93,7 @@ def expected(setup, state):
     return found
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize("seed", range(3))
 def test_floaters_are_the_primitives_near_a_camera_that_no_training_photo_shows(backbone, seed):

@@ -85,6 +85,7 @@ def expected(setup, state, bound):
     return wanted
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("seed", "bound", "at_once"),
     [(0, None, 1), (1, None, 2**20), (2, 0.2, 1), (3, 0.2, 2**20), (4, 3.0, 1), (5, 3.0, 2**20)],
@@ -131,6 +132,7 @@ def test_scales_below_the_bound_are_not_clamped():
         assert torch.equal(scales, torch.full_like(scales, size))
 
 
+@pytest.mark.slow
 def test_a_run_in_seconds_reports_the_rule_after_its_length_is_planned(tmp_path, capsys):
     command = ("run", "--seconds", 1, "--max-size", 48, "--threads", 1, "--out", tmp_path / "run")
     assert ended(*command) == 0

@@ -60,6 +60,7 @@ def changes(setup):
     return found, state
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("plugins", [(), (Decay,)], ids=["alone", "with a term"])
 @pytest.mark.parametrize(
     "settings",

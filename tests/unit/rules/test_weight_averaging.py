@@ -114,6 +114,7 @@ def runs(request):
     return SimpleNamespace(setups=setups, again=trained(setups["both"], state=again)[0], **found)
 
 
+@pytest.mark.sampled(2)
 def test_learning_rates_are_the_published_ones_until_they_decay(runs):
     blocks = runs.setups["plain"].trained_blocks
     of = {name: block.lr for block in blocks for name in block.tensors}

@@ -92,6 +92,7 @@ def test_ordinary_lenses_lose_no_pixel_and_keep_the_frame_of_pycolmap(
     assert calibration.cost.kept == pytest.approx(calibration.cost.seen, abs=7.0)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("seed", range(12))
 def test_counted_pixels_increase_monotonically_from_the_centre_for_any_lens(seed: int) -> None:
     rng = np.random.default_rng(seed)

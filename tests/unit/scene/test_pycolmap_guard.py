@@ -1,6 +1,8 @@
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import os, signal, sys
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
@@ -16,6 +18,7 @@ print("saved")
 """
 
 
+@pytest.mark.slow
 def test_importing_pycolmap_changes_neither_signals_nor_png_files(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(tmp_path / "a.png")],

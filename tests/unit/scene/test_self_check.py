@@ -84,6 +84,7 @@ def test_the_search_covers_all_kinds_of_contradictions(contradictions):
     assert tuple(contradictions.KINDS) == KINDS
 
 
+@pytest.mark.sampled(18)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 2, 4])
 def test_each_kind_of_contradiction_is_reported_with_cause_or_photos(

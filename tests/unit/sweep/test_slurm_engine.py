@@ -27,6 +27,7 @@ def states(work):
     return [each.state for each in found]
 
 
+@pytest.mark.slow
 def test_the_local_executor_executes_all_runs_and_a_dead_run_again(tmp_path):
     work = made(tmp_path, ["finish", "fail", "die_once"], {"cluster": "local"}, workers=3)
     for _ in engine("slurm")(work):

@@ -1044,6 +1044,7 @@ def test_an_error_of_the_component_is_passed_on(check, make, error):
         check(make)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("checks", "make"),
     [

@@ -84,6 +84,7 @@ SEEN: dict[str, set[str]] = {}
 PLAIN = {"RegularizeContext.gaussians", "ViewRecord.gaussians"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Kinds, KindsOfGradients, KindsOfTheModel])
 def test_checks_pass_the_same_types_to_hooks_as_a_run(kind):
     SEEN.clear()

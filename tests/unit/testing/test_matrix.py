@@ -87,6 +87,7 @@ def run_pytest(folder, *arguments):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_the_pytest_option_adds_the_combinations_to_the_tests(tmp_path):
     (tmp_path / "conftest.py").write_text(CONFTEST)
     ended = run_pytest(tmp_path, "--crossgrad-matrix", "mine")
@@ -95,6 +96,7 @@ def test_the_pytest_option_adds_the_combinations_to_the_tests(tmp_path):
     assert "refused before training: densifier anchor" in ended.stdout
 
 
+@pytest.mark.slow
 def test_the_pytest_option_reports_an_unknown_package(tmp_path):
     ended = run_pytest(tmp_path, "--crossgrad-matrix", "no-such-package")
     assert ended.returncode == pytest.ExitCode.USAGE_ERROR

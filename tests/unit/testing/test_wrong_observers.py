@@ -118,5 +118,6 @@ def test_a_wrong_observer_is_refused_with_the_right_reason(check, make, words, s
         check(make)
 
 
+@pytest.mark.slow
 def test_a_buffer_of_constant_size_is_allowed():
     observers.nothing_piles_up(KeepsOnce)

@@ -368,6 +368,7 @@ def test_future_steps_cost_more_if_photos_become_larger():
     assert seconds_ahead(run, reached(50), 1.0) == pytest.approx(50)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("views", ["1", "3", "1..2@0.5"])
 @pytest.mark.parametrize("name", ["full", "octaves", "spectral", "strided"])
 def test_the_probe_separates_the_cost_per_pixel(monkeypatch, name, views):

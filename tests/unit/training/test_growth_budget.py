@@ -79,6 +79,7 @@ def test_the_growth_curve_is_the_published_curve(start, budget, events, share):
     assert curve(events, events, start, budget) == budget
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", GREEDY)
 def test_every_growing_densifier_follows_the_budget_curve(name):
     free = counts_of(setup_of(name))
@@ -172,6 +173,7 @@ def test_growth_and_budget_follow_the_settings(settings, growth, bound):
     assert ("growth" in shown) == (growth == "budget" and "growth" not in settings)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("growth", ["unbounded", "budget"])
 @pytest.mark.parametrize("name", GREEDY)
 def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name, growth):

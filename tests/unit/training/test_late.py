@@ -77,6 +77,7 @@ def test_rates_beyond_single_precision_are_infinite_without_a_warning(monkeypatc
         assert torch.equal(found[:4], torch.full((4, 3), -torch.inf))
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("most", [0.2, 2.0])
 @pytest.mark.parametrize("seed", range(10))
 def test_deferred_steps_have_the_bits_of_immediate_steps(monkeypatch, seed, most):
@@ -144,6 +145,7 @@ def test_a_step_with_many_rows_updates_all_rows(monkeypatch, shape, share):
     assert both.same()
 
 
+@pytest.mark.slow
 def test_ten_thousand_deferred_steps_have_the_bits_of_immediate_steps(long_wait):
     assert long_wait[0].same()
 
@@ -301,6 +303,7 @@ def everything(state):
 THIRD = {"rules": {"sparse-sh": {"every": 3}}}
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("settings", "plugins"),
     [
@@ -333,6 +336,7 @@ def test_runs_with_deferred_steps_have_the_bits_of_runs_without(monkeypatch, set
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("settings", "stop"),
     [

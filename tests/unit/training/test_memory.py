@@ -97,6 +97,7 @@ def looked(monkeypatch, available=GIB, **settings):
 OTHERS = 3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("views", [2, 5])
 def test_all_stored_gradients_are_counted(monkeypatch, views):
     look = looked(monkeypatch, views=views, operator={"name": "pcgrad"})
@@ -108,11 +109,13 @@ def test_a_sum_stores_no_gradient_of_a_single_view(monkeypatch):
     assert look.alive - OTHERS <= look.demand.gradients == 2
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("operator", ["sum", "pcgrad"])
 def test_no_gradient_is_alive_during_an_edit(monkeypatch, operator):
     assert looked(monkeypatch, views=2, operator={"name": operator}).left == OTHERS
 
 
+@pytest.mark.slow
 def test_more_views_leave_less_free_memory(monkeypatch):
     operator = {"name": "pcgrad"}
     few, many = (looked(monkeypatch, views=k, operator=operator) for k in (2, 8))
@@ -129,6 +132,7 @@ def test_memory_is_not_shown_on_systems_without_this_information(monkeypatch):
     assert "5 primitives" in line and "memory" not in line
 
 
+@pytest.mark.slow
 def test_no_module_requires_a_module_that_only_some_systems_have():
     absent = "import sys; sys.modules.update(dict.fromkeys(['resource', 'fcntl', 'termios']))\n"
     ours = "import crossgrad_core.run.app, crossgrad_core.run.postprocess.evaluate\n"

@@ -83,6 +83,7 @@ def aside(means, seed):
     return torch.nextafter(means, torch.from_numpy(signs).to(means)).requires_grad_()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", OFFSETS)
 def test_a_moved_scene_is_the_same_to_2e_9_and_its_psnr_within_the_spread(
     tmp_path, in_place, spread, offset

@@ -35,6 +35,7 @@ FRESH = "CROSSGRAD_COUNTED_DEVICE"
 needs_device = pytest.mark.skipif(FRESH not in os.environ, reason="run in a process of their own")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(counted.REGISTER is None, reason="this torch has no backends in Python")
 def test_the_device_tests_of_this_file_pass_in_a_separate_process(request):
     """Runs the tests of this file that need the device."""
