@@ -4,7 +4,8 @@ import pytest
 from crossgrad_faults import laws
 
 
-@pytest.mark.parametrize("at", [pytest.param(2, marks=pytest.mark.slow), 9])
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [2, 9])
 def test_a_run_survives_jumps_of_the_system_clock(reference, tmp_path, at):
     folder = tmp_path / "run"
     fault = {"below": str(folder), "at": at, "what": "jump"}

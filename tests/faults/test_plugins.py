@@ -19,6 +19,7 @@ def fails(reference, folder, hook, call, error="RuntimeError"):
     return reference.nursery.run(*reference.command(folder, "--config", str(settings)))
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("hook", [name for name in HOOKS if name not in UNUSED])
 def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_can_be_resumed(
     reference, thorough, tmp_path, hook
@@ -36,6 +37,7 @@ def test_a_plugin_that_fails_in_any_hook_is_named_and_the_run_can_be_resumed(
         kept(reference, folder, hook)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("error", ["MemoryError", "OSError"])
 def test_errors_of_other_types_in_a_plugin_leave_a_run_that_can_be_resumed(
     reference, tmp_path, error
