@@ -49,7 +49,7 @@ class ComponentChoice(BaseModel):
     def _choice(cls, value: object) -> object:
         if isinstance(value, Mapping | ComponentChoice):
             return value
-        raise ValueError("the name of a component, or a mapping with its name and options")
+        raise ValueError("must be the name of a component, or a mapping with its name and options")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -332,7 +332,10 @@ class RunConfig(BaseModel):
         names = [choice.name for choice in value]
         twice = dict.fromkeys(name for name in names if names.count(name) > 1)
         if twice:
-            raise ValueError(f"each one once, with all its options; {', '.join(twice)} comes twice")
+            raise ValueError(
+                f"must name each component once, with all its options; {', '.join(twice)} is "
+                "named twice"
+            )
         return value
 
     @field_validator("rules", mode="before")

@@ -124,7 +124,10 @@ class Vanilla(Backbone):
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
         if gaussians.sh_dc is None:
-            raise ValueError("only spherical-harmonics Gaussians can be adopted")
+            raise ValueError(
+                "only a backbone with spherical-harmonics Gaussians can start from Gaussians "
+                "of a file"
+            )
         opacities = gaussians.opacities.clamp(1e-6, 1.0 - 1e-6)
         tensors = {
             "means": gaussians.means.clone(),

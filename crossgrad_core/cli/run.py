@@ -35,10 +35,10 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
     typed = list(_typed(given))
     if typed:
         raise UserError(
-            "a resumed run keeps its settings and its scene",
+            "settings and the scene cannot be changed when a run is resumed",
             where=listed(typed),
             expected="--device, --threads, --stop-after, --accept-scene, --accept-plugins, "
-            "--check, -q and -v, and nothing else",
+            "--check, -q and -vonly",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )

@@ -153,9 +153,9 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")
     if frames is not None and path is None:
         raise UserError(
-            "--frames does nothing without --path zoom",
+            "--frames has no effect without --path zoom",
             where="--frames",
-            todo="leave out --frames, or draw a zoom path",
+            todo="leave out --frames, or add --path zoom",
         )
     announce()
     from crossgrad_core.run.postprocess import render
@@ -172,7 +172,7 @@ def _check_together(option: tuple[str, object], other: tuple[str, object], why: 
     """Refuse an option that would do nothing together with another one."""
     if option[1] is not None and other[1] is not None:
         raise UserError(
-            f"{option[0]} does nothing beside {other[0]}: {why}",
+            f"{option[0]} has no effect together with {other[0]}: {why}",
             where=option[0],
             todo=f"leave out {option[0]}, or {other[0]}",
         )

@@ -42,11 +42,13 @@ class LearningRate:
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
         if not all(0.0 <= rate < inf for rate in rates):
-            raise ValueError(f"learning rates are finite and not negative; found {rates}")
+            raise ValueError(f"learning rates must be finite and not negative; found {rates}")
         if self.initial > 0.0 and self.final == 0.0:
-            raise ValueError("a learning rate cannot fade to 0 log-linearly; name a small one")
+            raise ValueError(
+                "a learning rate cannot decay log-linearly to 0; choose a small positive final rate"
+            )
         if not 0.0 < self.few_passes < inf:
-            raise ValueError(f"`few_passes` is a positive number; found {self.few_passes}")
+            raise ValueError(f"`few_passes` must be a positive number; found {self.few_passes}")
 
     @property
     def decays(self) -> bool:
@@ -93,9 +95,13 @@ class Block:
         """
         if self.kind not in get_args(BlockKind):
             kinds = get_args(BlockKind)
-            raise ValueError(f"block {self.name}: the kind {self.kind!r} is none of {kinds}")
+            raise ValueError(
+                f"block {self.name}: the kind must be one of {kinds}; found {self.kind!r}"
+            )
         if not isinstance(self.tensors, tuple) or not isinstance(self.lr, LearningRate):
-            raise TypeError(f"block {self.name}: tensors is a tuple of names, lr a LearningRate")
+            raise TypeError(
+                f"block {self.name}: `tensors` must be a tuple of names, and `lr` a LearningRate"
+            )
 
     @property
     def frozen(self) -> bool:

@@ -86,11 +86,11 @@ class ViewsPerStepSpec:
             raise ValueError(_FORM) from error
         inside = (0.0, *shares, 1.0)
         if not all(a < b for a, b in pairwise(inside)):
-            raise ValueError("must have ascending shares above 0 and below 1")
+            raise ValueError("must list shares in ascending order, each above 0 and below 1")
         if min(counts) < 1:
             raise ValueError(_FORM)
         if any(a == b for a, b in pairwise(counts)):
-            raise ValueError("must change from one number to another one")
+            raise ValueError("must have two different numbers")
         return cls(counts, shares)
 
     @override

@@ -78,7 +78,7 @@ def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
     missing = [name for name in DECIDED if name not in table and not is_given(config, name)]
     if missing:
         raise UserError(
-            f"recipe {config.recipe.name} does not decide every setting",
+            f"recipe {config.recipe.name} does not decide every setting that it must decide",
             where=f"{type(recipe).__module__}:{type(recipe).__qualname__}.decide",
             expected=f"a row for each of {listed(DECIDED)}",
             found=f"no row for {listed(missing)}",

@@ -40,7 +40,7 @@ def as_user_error(
         return UserError(
             f"{subject} has no option {key!r}",
             where=where,
-            expected=f"one of {listed(options)}" if options else "no options; it has none",
+            expected=f"one of {listed(options)}" if options else "no options: it has none",
             todo=sentences(did_you_mean(place[-1], options), more, todo),
         )
     return UserError(

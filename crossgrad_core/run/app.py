@@ -86,7 +86,7 @@ def check_clock(config: RunConfig) -> None:
         return
     if config.device != AUTO and torch.device(config.device).type != "cpu":
         raise UserError(
-            "CPU time does not tell what a GPU does",
+            "CPU time does not include the time of a GPU",
             where="--clock cpu",
             expected="--device cpu",
             found=f"--device {config.device}",
@@ -95,7 +95,7 @@ def check_clock(config: RunConfig) -> None:
     threads = torch.get_num_threads()
     if threads > 1:
         raise UserError(
-            "CPU time counts threads that wait for others, as they spin",
+            "CPU time would include threads that only wait for other threads",
             where="--clock cpu",
             expected="one thread",
             found=f"{threads} threads",
@@ -194,9 +194,9 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         return _end(resumed(resume, settings, way, **accepted), way)
     if accept_plugins:
         raise UserError(
-            "only a run that is continued has something to compare with",
+            "--accept-plugins has no effect on a new run",
             where="--accept-plugins",
-            todo="leave it out, or name the run with --resume",
+            todo="leave it out, or name a run to resume with --resume",
         )
     if accept_scene:
         settings = layered([settings, {"data.accept_scene": True}])
@@ -286,18 +286,19 @@ def with_defaults(config: RunConfig) -> RunConfig:
     given = {unit: length for unit, length in lengths.items() if length is not None}
     if "steps" in given and len(given) > 1:
         raise UserError(
-            "a run has one length: in steps, in views or in seconds, or views within seconds",
+            "more than one length of the run was given; a run has a length in steps, in "
+            "views or in seconds, or in views with a limit in seconds",
             where="--steps, --max-views, --seconds",
             found=listed(f"{length:g} {unit}" for unit, length in given.items()),
-            todo="leave --steps out, or all but it",
+            todo="leave --steps out, or give only --steps",
         )
     if config.scene is None and config.reader.name == PREPARING_READER:
         raise UserError(
-            "there are no photos to prepare",
+            "--prepare needs a folder of photos",
             where="--prepare",
             expected="a folder of photos",
-            found="no SCENE; the bundled scene is ready to train on",
-            todo="crossgrad run PHOTOS --prepare",
+            found="no SCENE; the bundled scene is used and needs no preparation",
+            todo="name the folder: crossgrad run PHOTOS --prepare",
         )
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
@@ -319,9 +320,9 @@ def _tried_out() -> Iterator[None]:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
         raise UserError(
-            "a step that was tried out before the training failed",
+            "a trial step failed before the training started",
             found=": ".join([*notes_on(error), reason_of(error)]),
-            todo="look at settings, such as --rate-factor and --loss, and at the photos",
+            todo="check the settings, such as --rate-factor and --loss, and the photos",
         ) from error
 
 
@@ -433,7 +434,7 @@ def resumed(
         damaged = set(changed_files(folder)) - {CONFIG}  # Its settings are compared by themselves.
         if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
-                "the run is finished",
+                "the run is finished, so that it cannot be resumed",
                 where=folder,
                 found=f"all {total} steps done",
                 todo=f"start a new run; --init {folder / files[1]} starts from its Gaussians",
@@ -441,13 +442,13 @@ def resumed(
         stop, follows_clock = setup.config.stop_after, setup.config.planned_seconds is not None
         if stop is not None and (stop <= step or (stop > total and not follows_clock)):
             raise UserError(
-                "the run is past the step at which it is to stop"
+                "--stop-after names a step that the run has already passed"
                 if stop <= step
-                else "the run ends before the step at which it is to stop",
+                else "--stop-after names a step after the end of the run",
                 where="--stop-after",
                 expected=f"a step from {step + 1} to {total}",
                 found=str(stop),
-                todo="name one of these, or leave it out to train to the end",
+                todo="name a step in this range, or leave --stop-after out to train to the end",
             )
         if step < total:
             state.clock.load += _decoded(setup, way)

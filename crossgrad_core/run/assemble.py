@@ -76,10 +76,10 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
         able = [each for each in entries("readers") if accepts(each, path)]
         if len(able) > 1:
             raise UserError(
-                "the scene can be read in several ways",
+                "the scene folder contains files of several formats",
                 where=path,
-                found=f"files of the readers {listed(able)}",
-                todo=f"choose one, such as --reader {able[0]}",
+                found=f"files for the readers {listed(able)}",
+                todo=f"choose a reader, such as --reader {able[0]}",
             )
         # If no reader recognises the folder, one reader explains what is missing.
         near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
@@ -240,11 +240,11 @@ def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     steps = views.steps_of(config.max_views)
     if steps == 0:
         raise UserError(
-            "the run is shorter than its first step",
+            "--max-views is smaller than the number of views of the first step",
             where="--max-views",
-            expected=f"at least {views.counts[0]}, the views of a step",
+            expected=f"at least {views.counts[0]}, the number of views of the first step",
             found=str(config.max_views),
-            todo="ask for more --max-views, or for fewer --views",
+            todo="raise --max-views, or lower --views",
         )
     if config.seconds is not None:
         return config
@@ -302,9 +302,10 @@ def refuse(reasons: tuple[str, ...]) -> None:
     """
     if reasons:
         raise IncompatibleSelectionError(
-            "these components cannot work together",
+            "the selected components cannot work together",
             found="; ".join(reasons),
-            todo="choose another combination (crossgrad plugins show NAME tells what each needs)",
+            todo="choose another combination (`crossgrad plugins show NAME` lists the "
+            "requirements of a component)",
         )
 
 

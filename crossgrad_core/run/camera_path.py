@@ -84,11 +84,11 @@ def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Came
     known = known[:: 1 + len(known) // MOST_VIEWS]
     if len(known) < 2:  # noqa: PLR2004 - two ends
         raise UserError(
-            "the photos give no zoom path",
+            "no zoom path can be computed from the photos",
             where=f"--path {ZOOM}",
-            expected=f"two photos that observe {FEWEST_SEEN} SfM points or more",
+            expected=f"two photos that each observe at least {FEWEST_SEEN} SfM points",
             found=f"{len(known)}",
-            todo="give a file of cameras: --path FILE.json",
+            todo="give a camera path as a file: --path FILE.json",
         )
     distances = np.array([_distance(view.camera, points[view.seen]) for view in known])
     first, last = _ends(known, distances, len(points))
@@ -176,7 +176,7 @@ def _read(path: Path, similarity: Similarity) -> CameraPath:
         raise as_user_error(error, _Path, subject=f"camera path {path}", todo=_TODO) from error
     except (FileNotFoundError, ValueError) as error:
         raise UserError(
-            "unreadable camera path", where=f"--path {path}", found=str(error), todo=_TODO
+            "the camera path cannot be read", where=f"--path {path}", found=str(error), todo=_TODO
         ) from error
     size = round(found.render_width), round(found.render_height)
     cameras = [_camera(frame, size, similarity, path) for frame in found.camera_path]
@@ -187,9 +187,9 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
     matrix = np.array(frame.camera_to_world).reshape(4, 4)
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
         raise UserError(
-            "a camera of the path has no last row of a pose",
+            "the last row of a camera's pose is wrong",
             where=f"{path}, camera_to_world",
-            expected="16 numbers row by row, the last four 0, 0, 0, 1",
+            expected="16 numbers, row by row; the last four are 0, 0, 0, 1",
             found=str(matrix[3].tolist()),
             todo=_TODO,
         )
@@ -198,7 +198,7 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
     rotation = turned / np.where(lengths > 0, lengths, 1.0)
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise UserError(
-            "a camera of the path has no rotation",
+            "the pose of a camera contains no valid rotation",
             where=f"{path}, camera_to_world",
             expected="three orthogonal axes, right-handed",
             found=str(frame.camera_to_world),
@@ -257,9 +257,9 @@ def _is_pose(pose: object) -> bool:
 
 def _refused(expected: str, found: str) -> UserError:
     return UserError(
-        "this is no camera to draw",
+        "the argument is not a camera that can be rendered",
         where="Run.render",
         expected=expected,
         found=found,
-        todo="take one of `run.scene.views`, or change it with `dataclasses.replace`",
+        todo="use one of `run.scene.views`, or a copy made with `dataclasses.replace`",
     )

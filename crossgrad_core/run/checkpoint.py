@@ -111,10 +111,10 @@ def damaged(folder: Path, found: str) -> UserError:
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
-        "damaged checkpoint",
+        "the checkpoint is damaged",
         where=folder,
         found=found,
-        todo=f"remove it; the run then goes on from {others[-1].name}"
+        todo=f"remove it; the run then continues from {others[-1].name}"
         if others
         else "start the run again",
     )
@@ -188,7 +188,7 @@ def check_json(value: object, where: str) -> None:
     """
     if wrong := no_json(value):
         raise UserError(
-            "state that a checkpoint cannot hold",
+            "a plugin's state contains values that a checkpoint cannot hold",
             where=where,
             expected="numbers, strings, lists, dictionaries with text keys, None",
             found=wrong,
@@ -204,9 +204,9 @@ def read_state(folder: Path) -> dict[str, Any]:
     """
     if not folder.is_dir():
         raise UserError(
-            "no such checkpoint",
+            "the checkpoint does not exist",
             where=folder,
-            todo="name a folder below checkpoints/ in the folder of a run",
+            todo="name a folder in checkpoints/ of a run",
         )
     try:
         state = read_json(folder / STATE)
@@ -218,11 +218,11 @@ def read_state(folder: Path) -> dict[str, Any]:
         raise damaged(folder, f"{STATE} is not the state of a checkpoint")
     if state["format"] != FORMAT:
         raise UserError(
-            "checkpoint of another format version",
+            "the checkpoint was written in another format version",
             where=folder,
             expected=f"version {FORMAT} (crossgrad {VERSION})",
             found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
-            todo="continue with the version of crossgrad that wrote it",
+            todo="resume with the version of crossgrad that wrote it",
         )
     _check_whole(state, folder)
     return state
@@ -462,9 +462,9 @@ def latest(run: Path) -> Path:
         if steps:
             return steps[max(steps)]
     raise UserError(
-        "no checkpoint to continue from",
+        "there is no checkpoint to resume from",
         where=run,
-        expected=f"the folder of a run with {CHECKPOINTS}/step-.../{STATE} in it",
+        expected=f"the folder of a run that contains {CHECKPOINTS}/step-.../{STATE}",
         found="a PLY file, which holds no optimizer state" if run.suffix == ".ply" else "",
         todo="name the folder of a run; use --init FILE.ply to start a new run from Gaussians",
     )

@@ -84,9 +84,10 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     views = tuple(view for view, known in zip(moved, trained, strict=True) if not known)
     if not views:
         raise UserError(
-            "the run was trained on all views of this scene",
+            "there are no views to evaluate: the run was trained on all views of this scene",
             where=f"--on {path}",
-            todo="name another capture of the place; leave --on out for the held-out views",
+            todo="name another capture of the same place, or leave --on out to evaluate the "
+            "held-out views",
         )
     alike = _alike(setup.scene.points, points)
     return Elsewhere(other.name, views, points, len(moved) - len(views), alike)
@@ -140,11 +141,11 @@ def _check_place(
     share = float(np.mean(np.all(np.abs(what - middle) <= MARGIN * half, axis=1)))
     if share < LEAST_SHARED:
         raise UserError(
-            "this scene lies elsewhere",
+            "the other capture does not overlap with the scene of the run",
             where=f"--on {path}",
-            expected="a capture of the same place, in the coordinates of the run's scene",
-            found=f"{share:.0%} of its points lie within the run's",
-            todo="align the two models first, or find the poses of all photos in one go",
+            expected="a capture of the same place, in the coordinate system of the run's scene",
+            found=f"{share:.0%} of its points are inside the run's scene",
+            todo="align the two models first, or estimate the poses of all photos together",
         )
 
 

@@ -26,7 +26,7 @@ def choose_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise UserError(
-            f"there is no device {name!r}",
+            f"the device name {name!r} is unknown",
             where="--device",
             expected="auto, cpu, cuda or cuda:N",
             todo="leave --device out to run on a GPU if one can be used, or use --device cpu",
@@ -57,7 +57,7 @@ def _require_cuda(device: torch.device) -> None:
     else:
         found, todo = f"devices cuda:0 to cuda:{count - 1}", "choose one of them"
     raise UserError(
-        f"torch sees no device {str(device)!r}",
+        f"torch cannot use the device {str(device)!r}",
         where="--device",
         found=f"torch {torch.__version__}: {found}",
         todo=f"use --device cpu, or {todo}",

@@ -173,11 +173,11 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
     if changed:
         raise UserError(
-            "config.yaml was changed since this run began",
+            "settings in config.yaml have changed since the run was started",
             where=f"settings {listed(changed)}; step {checkpoint.step}",
             expected=listed(f"{key}: {stored.get(key)}" for key in changed),
             found=listed(f"{key}: {ours.get(key)}" for key in changed),
-            todo="put them back, or start a new run with the changed file (--config)",
+            todo="restore the old values, or start a new run with the changed file (--config)",
         )
 
 
@@ -245,7 +245,7 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
 
 def _misfit(checkpoint: Checkpoint, expected: str, found: str) -> UserError:
     return UserError(
-        "the checkpoint does not fit the run",
+        "the checkpoint does not match the run",
         where=f"the checkpoint of step {checkpoint.step}",
         expected=expected,
         found=found,
@@ -382,12 +382,13 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
     for status in _WITH_RESULTS:
         if step := summarised_step(folder, status):
             raise UserError(
-                "the checkpoints of the run are gone",
+                "the checkpoints of the run are missing",
                 where=folder / CHECKPOINTS,
-                expected=f"step {step}, which the results in the folder are of",
+                expected=f"the checkpoint of step {step}, the step of the results in the folder",
                 found="none",
-                todo="its files are as they were, and --init with its point_cloud.ply starts from "
-                "its Gaussians; `crossgrad run --config FOLDER/config.yaml` repeats it elsewhere",
+                todo="nothing was changed; --init with the run's point_cloud.ply starts a new run "
+                "from its Gaussians, and `crossgrad run --config FOLDER/config.yaml` repeats "
+                "the run in a new folder",
             )
 
 
@@ -404,10 +405,10 @@ def require_checkpoint(folder: Path) -> None:
         raise UserError(
             "the run has no checkpoint yet",
             where=folder,
-            found=writer or "a run that was ended before its first checkpoint",
-            todo="wait for the first one"
+            found=writer or "a run that ended before its first checkpoint",
+            todo="wait for the first checkpoint"
             if writer
-            else f"crossgrad run --resume {folder} begins it again",
+            else f"start it again: crossgrad run --resume {folder}",
         )
 
 
@@ -510,10 +511,10 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     frozen = sorted(set(settings) - CHANGEABLE)
     if frozen:
         raise UserError(
-            "a resumed run keeps its settings",
+            "settings cannot be changed when a run is resumed",
             where=f"settings {listed(frozen)}",
-            expected=f"none but {listed(sorted(CHANGEABLE))}",
-            todo="leave them out, or start a new run",
+            expected=f"only {listed(sorted(CHANGEABLE))}",
+            todo="leave these settings out, or start a new run",
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
@@ -543,5 +544,5 @@ def _check_device(name: str, folder: Path) -> None:
         raise UserError(
             "the run was trained on CUDA, and torch sees no CUDA device here",
             where=f"{folder / CONFIG}, device: {name}",
-            todo="add --device cpu, or go on where there is one",
+            todo="add --device cpu, or resume the run on a machine with a CUDA device",
         )

@@ -77,7 +77,7 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
         raise UserError(
             f"no installed rasterizer runs on device {wanted.device}",
             where="--rasterizer",
-            todo="install one, or use --device cpu",
+            todo="install a rasterizer for this device, or use --device cpu",
         )
     chosen = fastest_able(speeds, wanted, notes) or _ranked(speeds)[0]
     why = f"the fastest of {len(speeds)} here" if len(speeds) > 1 else "the only one here that runs"

@@ -113,9 +113,9 @@ def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None
             "the scene has no SfM points to start from",
             where=config.scene or scene.name,
             found=_clouds_in(config.scene),
-            todo=f"find some in the photos (--initializer {INITIALIZER_WITHOUT_POINTS}), or start "
-            "from those of a point cloud (--points FILE), from the Gaussians of a file (--init "
-            "FILE.ply) or from random points (--init random)",
+            todo=f"find points in the photos (--initializer {INITIALIZER_WITHOUT_POINTS}), "
+            "start from a point cloud (--points FILE), from the Gaussians of a PLY file "
+            "(--init FILE.ply) or from random points (--init random)",
         )
 
 
@@ -131,12 +131,13 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -
         return
     if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
         raise UserError(
-            "no training photo shows any of the scene's points: there is nothing to train",
+            "no SfM point of the scene is visible in a training photo, so nothing can be trained",
             where=config.scene or scene.name,
-            expected="points and cameras in one frame, with the cameras looking at the points",
-            found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
-            todo="mend the model, or find points in the photos "
-            f"(--initializer {INITIALIZER_WITHOUT_POINTS})",
+            expected="cameras that look at the points, in the same coordinate system",
+            found=f"{len(scene.points):,} points, none of them visible in "
+            f"{len(scene.train_views)} photos",
+            todo="correct the model, or find points in the photos (--initializer "
+            f"{INITIALIZER_WITHOUT_POINTS})",
         )
 
 
@@ -147,8 +148,9 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
         raise UserError(
             f"rasterizer {name} has no option {listed(decided)}, which the recipe sets",
             where=f"--recipe {config.recipe.name}",
-            expected=f"a rasterizer with the option {listed(decided)}",
-            todo="leave --rasterizer out: auto takes one that has it; or choose another recipe",
+            expected="a rasterizer with this option",
+            todo="leave --rasterizer out, so that `auto` chooses a rasterizer with the "
+            "option, or choose another recipe",
         )
 
 
@@ -187,9 +189,9 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
             notes.append(f"metric {name} is left out: metrics.csv has a column {listed(twice)}")
         else:
             raise UserError(
-                f"two columns of metrics.csv would be called {listed(twice)}",
+                f"two columns of metrics.csv would have the same name: {listed(twice)}",
                 where=f"metrics {listed((*metrics, name))}; regimes {listed(regimes)}",
-                expected="figures whose names are no other's, nor those of another one in a regime",
+                expected="a different column name for every metric and regime",
                 todo=f"leave metric {name} out, or rename the folder of photos",
             )
     return metrics
@@ -200,9 +202,9 @@ def _check_form(name: str, form: str) -> None:
         format(0.0, form)
     except (TypeError, ValueError) as error:
         raise UserError(
-            f"metric {name} has a figure that cannot be shown",
-            where="its form",
-            expected="one that formats floating-point numbers, such as .4f or .0f",
+            f"a value of metric {name} cannot be formatted",
+            where="the format of the metric",
+            expected="a format for floating-point numbers, such as .4f or .0f",
             found=repr(form),
             todo=f"repair the plugin, or leave metric {name} out",
         ) from error
@@ -227,9 +229,10 @@ def _grouping_choice(
         return _or_default(config.grouping, name)
     if config.grouping is not None:
         raise UserError(
-            "neither the sampler nor the operator uses a grouping that could have options",
+            "options of a grouping were given, but neither the sampler nor the operator "
+            "uses a grouping",
             where="grouping",
-            todo="name the grouping with --grouping, or leave its options out",
+            todo="choose a grouping with --grouping, or leave its options out",
         )
     notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
     return None

@@ -65,10 +65,10 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     ]
     if found:
         raise UserError(
-            "settings that would do nothing",
+            "some settings would have no effect",
             where=listed(name for name, _ in found),
             found="; ".join(f"{name}: {why}" for name, why in found),
-            todo="leave them out, or change what keeps them from doing something",
+            todo="leave them out, or change the setting that makes them ineffective",
         )
 
 

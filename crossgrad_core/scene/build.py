@@ -90,9 +90,10 @@ def _all_blank(names: Sequence[str], root: Path) -> UserError:
     return UserError(
         "every pixel of every training photo is masked",
         where=root,
-        expected="white in a mask, or opaque in a photo with transparency, where a pixel counts",
+        expected="a pixel that is white in its mask, or opaque in a photo with transparency",
         found=f"no such pixel in {name_some(names)}",
-        todo="invert the masks if black is meant to count, or rename their folder to train without",
+        todo="invert the masks if black marks the pixels to use, or rename the mask "
+        "folder to train without masks",
     )
 
 
@@ -112,18 +113,18 @@ def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
     path = next(filter(is_file, (option, raw.root / option)), None)
     if path is None:
         raise UserError(
-            "the file of points is not there",
+            "the point file does not exist",
             where=option,
-            expected="a PLY, LAS or LAZ file, as it is or within the scene",
+            expected="a PLY, LAS or LAZ file, as a path or as a path below the scene folder",
             todo="check the path: --points FILE",
         )
     cloud = read_cloud(path, path.name)
     if cloud.gaussians:
         raise UserError(
-            "a PLY of Gaussians in place of points",
+            "the point file contains Gaussians instead of points",
             where=path,
-            expected="positions and colours",
-            todo=f"--init {option} starts from its Gaussians",
+            expected="a file with positions and colours",
+            todo=f"use --init {option} to start from its Gaussians",
         )
     check_seen(cloud, raw.views, path, "cut the cloud to what the photos show; or leave it out")
     views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in raw.views)

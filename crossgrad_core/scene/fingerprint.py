@@ -159,7 +159,7 @@ def mark_of(path: Path) -> FileMark:
             "a file of the scene cannot be read",
             where=path,
             found=error.strerror or str(error),
-            todo="put it back, or make it readable",
+            todo="restore the file, or make it readable",
         ) from error
     return FileMark(bytes=size, sha256=digest.hexdigest(), whole=whole)
 

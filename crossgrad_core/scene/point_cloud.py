@@ -94,7 +94,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise UserError(
-            "PLY file without positions",
+            "the PLY file has no positions",
             where=path,
             expected="vertices with properties x, y and z",
             found=f"no {', '.join(missing)}",
@@ -150,7 +150,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
     found = sum(count for count, _ in rows)
     if found < expected:
         raise UserError(
-            "LAS file ends too early",
+            "the LAS file is incomplete: its end is missing",
             where=path,
             expected=f"{expected:,} points",
             found=f"{found:,} points",
@@ -182,7 +182,7 @@ def _require_laspy(path: Path) -> None:
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
         raise UserError(
-            "point clouds in LAS and LAZ need a package that is not installed",
+            "point clouds in LAS and LAZ format need a package that is not installed",
             where=path,
             expected=f"the package {missing[0]}",
             todo="pip install 'crossgrad[las]', or convert the points to PLY",

@@ -71,15 +71,21 @@ def check_seen(
         return
     cause = _likely_cause(tried, views)
     raise UserError(
-        "the points lie in no photo: "
-        + (f"the {cause}" if cause else "they stand in another frame than the cameras"),
+        "no photo shows the SfM points: "
+        + (
+            f"the {cause}"
+            if cause
+            else "the points are in another coordinate system than the cameras"
+        ),
         where=where,
-        expected="points in the coordinates of the cameras",
-        found=f"{int(shown.sum())} of {len(shown)} points in a photo ({points.source})",
-        todo="correct the poses: after that change the photos show the points"
+        expected="points in the coordinate system of the cameras",
+        found=f"{int(shown.sum())} of {len(shown)} points visible in a photo ({points.source})",
+        todo="correct the poses; the photos will then show the points"
         if cause
-        else f"export points and cameras in one frame; or {todo} and start from random points "
-        "(--init random)",
+        else (
+            f"export points and cameras in one coordinate system; or {todo} and start "
+            "from random points (--init random)"
+        ),
     )
 
 

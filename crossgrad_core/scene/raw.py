@@ -118,9 +118,9 @@ def check_views(raw: RawScene) -> None:
     """
     if not raw.views:
         raise UserError(
-            "the scene has no posed image",
+            "the scene has no image with a pose",
             where=raw.root,
-            todo="check that the poses were estimated: at least one image must be registered",
+            todo="estimate the poses again: at least one image must be registered",
         )
     for view in raw.views:
         _check_name(raw, view.name)
@@ -128,10 +128,10 @@ def check_views(raw: RawScene) -> None:
     twice = [name for name, number in names.items() if number > 1]
     if twice:
         raise UserError(
-            "several poses belong to one image name",
+            "several images of the model have the same name",
             where=raw.root,
             found=name_some(twice),
-            todo="keep one image of each name in the model",
+            todo="keep only one image of each name in the model",
         )
     for view in raw.views:
         _check_view(raw, view)
@@ -187,12 +187,12 @@ def _check_name(raw: RawScene, name: str) -> None:
         )
     if not is_possible_name(name):
         raise UserError(
-            "an image name that no photo can be found or listed by",
+            "the image name is not valid",
             where=raw.root,
             expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file "
             f"or folder and {LONGEST_NAME} in all",
             found=ascii(name),
-            todo="rename the image in the model, and its photo",
+            todo="rename the image in the model and its photo",
         )
 
 
@@ -201,11 +201,15 @@ def _check_view(raw: RawScene, view: RawView) -> None:
     view.calibration.check(where)
     pose = view.world_to_camera
     if not (np.abs(pose) <= FARTHEST).all():  # False for NaN
-        raise UserError("a pose is not finite", where=where, todo="remove or re-estimate the image")
+        raise UserError(
+            "a pose contains numbers that are not finite",
+            where=where,
+            todo="remove the image, or estimate its pose again",
+        )
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
         raise UserError(
-            "a pose is not a rotation and a shift",
+            "a pose does not consist of a rotation and a translation",
             where=where,
             expected="an orthonormal, right-handed rotation",
             found=str(rotation.round(4).tolist()),

@@ -135,10 +135,10 @@ def _split_by_lists(
     both = sorted(listed[0] & listed[1])
     if both:
         raise UserError(
-            "views are listed for training and for testing",
+            "a view is listed for both training and testing",
             where=places[1],
             found=name_some(both),
-            todo=f"leave each name in one of {TRAIN_LIST} and {TEST_LIST}",
+            todo=f"remove each name from one of {TRAIN_LIST} and {TEST_LIST}",
         )
     train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
     if not train:
@@ -163,9 +163,9 @@ def _matches_nothing(
     return UserError(
         what,
         where=place,
-        expected=f"names below the image folder, such as {min(names)}",
+        expected=f"names of photos relative to the image folder, such as {min(names)}",
         found=name_some(sorted(listed)) if listed else "no name",
-        todo="mend the lists, add the photos that they name, or use --split every",
+        todo="correct the lists, add the missing photos, or use --split every",
     )
 
 
@@ -196,7 +196,7 @@ def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
             "the list of views cannot be read",
             where=path,
             found=str(error),
-            todo="save it as text in UTF-8, one name a line, or remove it",
+            todo="save the list as UTF-8 text with one name per line, or remove it",
         ) from error
     cleaned = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
     names = [name for name in cleaned if name and not name.startswith("#")]

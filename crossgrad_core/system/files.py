@@ -38,7 +38,7 @@ def free_bytes(path: Path) -> int:
 def disk_full(path: Path, needed: int | None) -> UserError:
     """Return the error for a full disk; `needed` is the size in bytes of the file to write."""
     return UserError(
-        "not enough disk space",
+        "there is not enough disk space",
         where=path,
         expected=f"{size_text(needed)} free" if needed is not None else "",
         found=f"{size_text(free_bytes(path))} free",
@@ -49,10 +49,10 @@ def disk_full(path: Path, needed: int | None) -> UserError:
 def read_only(path: Path) -> UserError:
     """Return the error for a place that is not writable."""
     return UserError(
-        "cannot write here",
+        "crossgrad cannot write to this path",
         where=path,
-        expected="a folder that you may write to",
-        todo="check its permissions, or choose another place",
+        expected="a folder with write permission",
+        todo="check its permissions, or choose another path",
     )
 
 
@@ -61,9 +61,9 @@ def path_too_long(path: object) -> UserError:
     return UserError(
         "the path is too long for the file system",
         where=path,
-        expected="names of at most 255 bytes, and at most 4,096 bytes in all, on most systems; "
-        "results need some of these",
-        todo="choose a shorter one",
+        expected="names of at most 255 bytes, and on most systems at most 4,096 bytes in "
+        "total, including the names of the result files",
+        todo="choose a shorter path",
     )
 
 
@@ -94,7 +94,9 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
             raise read_only(path) from error
         if error.errno in _IN_THE_WAY:
             what, found = "something else is in the way", error.strerror or ""
-            raise UserError(what, where=path, found=found, todo="move it elsewhere") from error
+            raise UserError(
+                what, where=path, found=found, todo="move it to another path"
+            ) from error
         if is_too_long(error):
             raise path_too_long(path) from error
         raise

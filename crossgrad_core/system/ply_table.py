@@ -98,9 +98,9 @@ def read_vertices(path: Path) -> Vertices:
                 return Vertices(read(file, path, header, element, before), header.comments)
             before.append(element)
     raise UserError(
-        "PLY file without vertices",
+        "the PLY file has no vertices",
         where=path,
-        expected="an element called vertex",
+        expected="an element named vertex",
         found=listed(element.name for element in header.elements),
         todo="export the Gaussians or points as a PLY file of vertices",
     )
@@ -123,7 +123,7 @@ def _require_file(path: Path) -> None:
     if not is_file(path):
         other = "a pipe or device in place of a file" if os.path.exists(path) else "nothing"
         raise UserError(
-            "no such PLY file",
+            "the PLY file does not exist",
             where=path,
             found="a folder" if os.path.isdir(path) else other,
             todo="check the path",
@@ -132,7 +132,7 @@ def _require_file(path: Path) -> None:
 
 def _malformed(path: Path, found: str) -> UserError:
     return UserError(
-        "not a readable PLY file",
+        "the PLY file cannot be read",
         where=path,
         found=found,
         todo="copy, download or export the file again",
@@ -142,9 +142,9 @@ def _malformed(path: Path, found: str) -> UserError:
 def _read_header(file: BinaryIO, path: Path) -> Header:
     if file.readline(8).strip() != b"ply":
         raise UserError(
-            "not a PLY file",
+            "the file is not a PLY file",
             where=path,
-            expected="a first line that says ply",
+            expected="a first line that contains only ply",
             todo="name a PLY file, such as the point_cloud.ply of a run",
         )
     lines = _header_lines(file, path)
@@ -202,7 +202,7 @@ def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
 def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
     if element.fields is None:
         raise UserError(
-            "PLY file with lists where vertices are expected",
+            "the PLY file contains lists among its vertices",
             where=path,
             found=f"list properties in the element {element.name}",
             todo="export the Gaussians or points without faces",
@@ -212,7 +212,7 @@ def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
 
 def _truncated(path: Path, expected: str, found: str) -> UserError:
     return UserError(
-        "PLY file ends too early",
+        "the PLY file is incomplete: its end is missing",
         where=path,
         expected=expected,
         found=found,
@@ -260,5 +260,5 @@ def _read_ascii(
 
 def _parsed(lines: list[bytes]) -> NDArray[np.float64]:
     if any(b"_" in line for line in lines):
-        raise ValueError("Python's digit groups are no numbers of PLY")
+        raise ValueError("digits are grouped with underscores, which PLY does not allow")
     return np.array([line.split() for line in lines], dtype=np.float64)

@@ -59,9 +59,9 @@ def read_json(path: Path, most: int = LARGEST) -> object:
     try:
         value: object = json.loads(read_file(path, _JSON, most).decode("utf-8-sig"))
     except RecursionError as error:
-        raise ValueError("lists or objects within each other without an end") from error
+        raise ValueError("lists or objects are nested too deeply") from error
     except FileNotFoundError as error:
-        raise FileNotFoundError("there is no such file") from error
+        raise FileNotFoundError("the file does not exist") from error
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
     return value

@@ -98,14 +98,14 @@ def read_yaml(text: str) -> object:
             twice, or contains a value that a setting cannot have.
     """
     if len(text) > MOST_BYTES:
-        raise yaml.YAMLError(f"more than {MOST_BYTES // 1024} KiB")
+        raise yaml.YAMLError(f"the file is larger than {MOST_BYTES // 1024} KiB")
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
         return None if node is None else _Values().of(node, 0)
     except (ValueError, OverflowError) as error:
         # PyYAML raises these for escapes beyond Unicode and for endless version numbers.
-        raise yaml.YAMLError(f"an escape or number that does not exist ({error})") from error
+        raise yaml.YAMLError(f"an escape sequence or number is not valid ({error})") from error
     finally:
         loader.dispose()
 
@@ -134,7 +134,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
         return {}
     if not isinstance(settings, dict):
         raise UserError(
-            f"{what} holds no settings",
+            f"{what} contains no settings",
             where=path,
             expected="lines such as `steps: 3000`",
             found=f"a {type(settings).__name__}",
@@ -195,13 +195,13 @@ class _Values:
 
 def _word(text: str) -> str:
     if _IMPOSSIBLE.search(text):
-        raise ValueError("a character that no file can hold")
+        raise ValueError("the file contains a character that is not allowed")
     return text
 
 
 def _integer(text: str) -> int:
     if len(text) > MOST_DIGITS:
-        raise ValueError("a number with too many digits")
+        raise ValueError("the file contains a number with too many digits")
     return int(text)
 
 
@@ -209,7 +209,7 @@ def _float(text: str) -> float:
     # Python writes `.inf` as `inf`.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
-        raise ValueError("not a number, which no setting can be")
+        raise ValueError("a value is NaN, which no setting can be")
     return value
 
 

@@ -36,7 +36,7 @@ def _require_points(more: object) -> None:
     if more is None:
         return
     if not isinstance(more, MorePoints):
-        raise ContractError(f"more_points() answers {type(more).__name__}, not MorePoints")
+        raise ContractError(f"more_points() returned {type(more).__name__}, not MorePoints")
     count = len(more.positions)
     shapes = {"positions": (count, 3), "colors": (count, 3), "sizes": (count,)}
     for name, shape in {**shapes, "opacities": (count,)}.items():

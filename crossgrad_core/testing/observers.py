@@ -184,8 +184,9 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
         raise
     except (Exception, SystemExit) as error:
         raise ContractError(
-            f"step {step}: a hook of the observer raises {in_one_line(error)}; expected that an "
-            "observer ends no run: catch what can fail, and leave out what failed"
+            f"step {step}: a hook of the observer raises {in_one_line(error)}; an "
+            "observer must not end a run: catch errors, and leave out the part that "
+            "failed"
         ) from error
 
 
@@ -305,7 +306,7 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
     if not isinstance(answer, kind):  # Formatting the answer takes long, so it is not done before.
-        raise ContractError(f"a hook answers {answer!r:.60}, not {kind.__name__}")
+        raise ContractError(f"a hook returned {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
         require(isinstance(state, PluginState), f"the state of {name} is {state!r}, no PluginState")
         revived(state)

@@ -29,8 +29,8 @@ def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
             except UserError:
                 continue
             except Exception as error:
-                raise ContractError(f"reading {path} raises {error!r}, not a UserError") from error
-            raise ContractError(f"reading {path}, which is no scene, raises nothing")
+                raise ContractError(f"reading {path} raised {error!r}, not a UserError") from error
+            raise ContractError(f"reading {path}, which is not a scene, raised no error")
 
 
 def folders_stay_as_they_are(make: Make[Reader]) -> None:

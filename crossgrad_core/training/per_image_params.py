@@ -81,13 +81,13 @@ def _content(path: Path) -> dict[str, Any]:
         content = read_json(path)
     except (FileNotFoundError, ValueError) as error:
         raise UserError(
-            "the values of photos cannot be read", where=path, found=str(error), todo=_TODO
+            "the file of photo parameters cannot be read", where=path, found=str(error), todo=_TODO
         ) from error
     if not isinstance(content, dict) or not _is_of_photos(content):
         raise UserError(
             "the file does not contain parameters of photos",
             where=path,
-            expected=f"an object with the format {PHOTO_VALUES_FORMAT} and photos",
+            expected=f"an object with the fields format ({PHOTO_VALUES_FORMAT}) and photos",
             found=str(list(content))[:80] if isinstance(content, dict) else type(content).__name__,
             todo=_TODO,
         )
@@ -111,7 +111,7 @@ def _value(path: Path, exposure: object, plain: object, like: Tensor) -> Tensor:
 
 def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserError:
     return UserError(
-        "the values of photos do not fit the exposure of the run",
+        "the photo parameters in the file belong to another exposure model",
         where=path,
         expected=expected,
         found=f"{found}, written by exposure {exposure}",
@@ -166,7 +166,7 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
     rows = [row for row, name in enumerate(names) if name in known]
     if not rows:
         raise UserError(
-            "the file has values of no training photo",
+            "the file contains no values for the training photos",
             where=path,
             expected=f"photos such as {names[0]}",
             found=listed(list(known)[:3]),
@@ -190,9 +190,9 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
     names = [view.name for view in setup.train_views] if setup.per_photo else []
     if held != names:
         raise UserError(
-            "the checkpoint holds values of other photos than those that are trained on",
+            "the checkpoint contains values of photos that the run does not train on",
             where=f"exposure {setup.selection.names['exposure']}",
-            todo="go on with the photos and the split of that run",
+            todo="resume with the same photos and the same split",
         )
 
 
@@ -303,7 +303,7 @@ def _check(setup: Setup, does: str, value: Tensor) -> None:
     if right and _is_finite(value):
         return
     raise UserError(
-        f"exposure {setup.selection.names['exposure']} {does} what cannot be values of photos",
+        f"exposure {setup.selection.names['exposure']} {does} invalid photo parameters",
         expected=f"finite float32 tensors of {photos} rows, one for each training photo",
         found=f"{value.dtype} of shape {list(value.shape)}",
         todo="choose another --exposure, or repair the plugin",

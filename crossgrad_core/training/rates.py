@@ -33,7 +33,7 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
     found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
     if found != [(rows, columns) for columns in _AXES]:
         raise UserError(
-            "the axes that the backbone names are none of Gaussians",
+            "the axes that the backbone names do not have the shapes of Gaussians",
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),

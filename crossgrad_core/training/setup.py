@@ -108,8 +108,8 @@ class OperatorScale:
 
     def _not_finite(self, name: str, views: int) -> UserError:
         return UserError(
-            f"operator {type(self._operator).__name__} gives {views} equal gradients a weight that "
-            "is not finite",
+            f"operator {type(self._operator).__name__} returned a weight that is not "
+            f"finite for {views} equal gradients",
             where=f"block of {name}",
             expected="finite weights for finite gradients",
             todo="use another operator, or report this to the operator's author",

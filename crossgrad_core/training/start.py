@@ -196,7 +196,7 @@ def _begun(setup: Setup) -> Scene:
     if not wrong:
         return begun
     raise UserError(
-        f"initializer {setup.selection.names['initializer']} adds what cannot be points",
+        f"initializer {setup.selection.names['initializer']} returned invalid points",
         where=f"{type(initializer).__name__}.more_points",
         expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0 or NaN, opacities [N] "
         "in (0, 1) or NaN",
@@ -238,11 +238,12 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
     have = [name for name, tensor in parameters.items() if isinstance(tensor, Tensor)]
     if not set(wanted) <= set(have):
         raise UserError(
-            f"{type(setup.backbone).__name__}.{method} makes other tensors than its blocks name",
+            f"{type(setup.backbone).__name__}.{method} returned tensors with other names "
+            "than its blocks use",
             where=f"backbone {setup.selection.names['backbone']}",
             expected=listed(wanted),
             found=listed(have) or "none",
-            todo="repair the plugin, or choose another one",
+            todo="repair the plugin, or choose another backbone",
         )
     return parameters
 

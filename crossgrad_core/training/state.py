@@ -237,18 +237,20 @@ class TrainState:
                 raise UserError(
                     f"a checkpoint cannot hold the state of plugin {name}",
                     where=f"{hook.name}, {wrong}",
-                    expected="plain numbers, texts, lists and dictionaries with texts as keys in "
-                    "`values`, dense tensors of the run elsewhere",
+                    expected="plain numbers, strings, lists and dictionaries with string keys in "
+                    "`values`; dense tensors of the run in `tensors`",
                     todo="repair the plugin (docs/hooks.md)",
                 )
         taken = TAKEN.intersection(states)
         stolen = taken - SLOTS.intersection(_answering(hook)) if taken else taken
         if stolen:
             raise UserError(
-                f"a plugin answers with a state called {min(stolen)!r}, which belongs to crossgrad",
+                f"a plugin stores its state under the name {min(stolen)!r}, which is reserved "
+                "for crossgrad",
                 where=f"{hook.name}, one of {listed(_answering(hook))}",
-                expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
-                todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
+                expected=f"another name than {listed(sorted(TAKEN))}",
+                todo="repair the plugin: use the plugin's name as the key of its state "
+                "(docs/hooks.md)",
             )
         self.states.update(states)
 
@@ -296,7 +298,7 @@ def _answering(hook: HookCaller) -> list[str]:
 
 def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> UserError:
     return UserError(
-        f"a plugin answers with something else for {what}",
+        f"a plugin returned a value of a wrong type for {what}",
         where=f"{hook.name}, one of {listed(_answering(hook))}",
         expected=expected,
         found=type(found).__name__,
@@ -475,8 +477,8 @@ def check_start(state: TrainState) -> None:
         for name, tensor in tensors.items():
             if not is_finite(tensor):
                 raise TrainingFailedError(
-                    f"{kind} {name} is not finite in the state of step {state.step} that training "
-                    f"was to go on from; {_way_out(state.step)}"
+                    f"{kind} {name} is not finite in the state of step {state.step}, from which "
+                    f"training would continue; {_way_out(state.step)}"
                 )
 
 

@@ -14,7 +14,7 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
     """
     if context.labels is None:
         raise UserError(
-            f"operator {operator} needs to know which group each view comes from",
+            f"operator {operator} needs the group of each view",
             expected="views with labels",
             found="views without labels",
             todo="choose a sampler that draws from groups, such as near-far",

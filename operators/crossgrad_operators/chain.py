@@ -132,8 +132,8 @@ def _remainders(
 
 def _reshaped(link: MatrixOperator, rows: int, views: int) -> UserError:
     return UserError(
-        f"operator {component_name(link)} cannot be followed by another one",
-        expected=f"as many directions as views, {views}",
+        f"operator {component_name(link)} must be the last operator of a chain",
+        expected=f"one direction for each of the {views} views",
         found=str(rows),
-        todo="put it last in the chain",
+        todo="move it to the end of the chain",
     )

@@ -87,13 +87,13 @@ class TorchJD(GramianOperator):
                 f"TorchJD has no weighting named {self.weighting!r}",
                 where="operator.weighting",
                 expected=f"one of {', '.join(filter(None, known))}",
-                todo="choose one of these with --set operator.weighting=NAME",
+                todo="choose one of these weightings with --set operator.weighting=NAME",
             )
         if hasattr(found, "reset"):
             raise UserError(
-                f"TorchJD's {name} remembers earlier steps and could not be resumed",
+                f"TorchJD's {name} stores state between steps, so that a run could not be resumed",
                 where="operator.weighting",
-                todo="use crossgrad's own operator of that name, or another weighting",
+                todo="use crossgrad's operator of the same name, or another weighting",
             )
         return self._called(found)
 
@@ -102,7 +102,7 @@ class TorchJD(GramianOperator):
             return kind(**dict(self.options))
         except (ImportError, TypeError, ValueError) as error:
             raise UserError(
-                f"TorchJD's {kind.__name__} cannot be made",
+                f"TorchJD's {kind.__name__} cannot be created",
                 where="operator.options",
                 found=str(error),
                 todo=f"set the arguments of {kind.__name__}: --set 'operator.options={{...}}'",

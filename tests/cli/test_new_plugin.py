@@ -122,9 +122,9 @@ def test_nothing_is_overwritten(ran, tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Upper", "cannot be the name"),
-        ("class", "cannot be the name"),
-        ("../up", "cannot be the name"),
+        ("Upper", "is not a valid name"),
+        ("class", "is not a valid name"),
+        ("../up", "is not a valid name"),
         ("numpy", "an installed package numpy"),
         ("pcgrad", "crossgrad_operators.projection"),
     ],

@@ -298,8 +298,8 @@ def test_options_of_an_observer_that_is_not_there_are_refused():
         ("=3", "KEY=VALUE"),
         ("operator..c=3", "KEY=VALUE"),
         ("operator.c=[1", "not valid YAML"),
-        ("steps.c=1", "plain setting"),
-        ("steps.c.d=1", "plain setting"),
+        ("steps.c=1", "has no options of its own"),
+        ("steps.c.d=1", "has no options of its own"),
     ],
 )
 def test_assignments_that_make_no_sense_are_refused(config, assignment, words):
@@ -314,7 +314,7 @@ def test_unknown_keys_are_left_to_the_validation():
     ("text", "words"),
     [
         ("steps: [1\n", "line 2"),
-        ("- a\n- b\n", "holds no settings"),
+        ("- a\n- b\n", "contains no settings"),
         ("steps: 1\nsteps: 2\n", "'steps' occurs twice"),
     ],
 )

@@ -71,7 +71,7 @@ def test_a_run_that_was_killed_before_its_table(whole, killed):
 def test_a_step_to_stop_at_that_is_past_or_never_comes_is_refused(killed, stop):
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
     before = (killed / "log.txt").read_bytes()
-    where = "past the step" if stop < 3 else "ends before the step"
+    where = "already passed" if stop < 3 else "after the end of the run"
     with pytest.raises(UserError, match=rf"{where}(.|\n)*a step from 3 to (.|\n)*found: +{stop}"):
         app.run({"stop_after": stop}, resume=killed, verbosity=-1)
     assert (killed / "log.txt").read_bytes() == before
@@ -79,7 +79,7 @@ def test_a_step_to_stop_at_that_is_past_or_never_comes_is_refused(killed, stop):
 
 
 def test_its_settings_stay(killed):
-    with pytest.raises(UserError, match="keeps its settings"):
+    with pytest.raises(UserError, match="settings cannot be changed"):
         app.run({"seed": 4}, resume=killed, verbosity=-1)
 
 
@@ -99,5 +99,5 @@ def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
 
 def test_a_new_run_into_its_folder_is_told_to_resume(killed):
     settings = {"scene": "nowhere", "out": str(killed), "steps": 2}
-    with pytest.raises(UserError, match="continue that run with --resume"):
+    with pytest.raises(UserError, match="resume that run with --resume"):
         app.run(settings, verbosity=-1)

@@ -433,7 +433,7 @@ class WeighingBy:
     ids=["negative", "NaN", "infinite", "a row short", "whole numbers", "an array of NumPy"],
 )
 def test_pixel_weights_that_no_loss_can_use_are_refused(change, found):
-    with pytest.raises(UserError, match="a plugin weighs pixels") as refused:
+    with pytest.raises(UserError, match="invalid pixel weights") as refused:
         trained(1, WeighingBy(change))
     assert found in refused.value.found
     assert refused.value.where.startswith("hook crossgrad_pixel_weights of watch0, photo ")

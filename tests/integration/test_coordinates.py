@@ -168,7 +168,7 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
     new = {path.name for path in trained.iterdir()} - before.keys()
     assert {"point_cloud_utm.ply", "point_cloud_utm.georef.json"} <= new
     assert {name: (trained / name).read_bytes() for name in before} == before
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export.exported(trained, file_format=None, out=None, coordinates="utm")
     with pytest.raises(UserError, match=r"no such coordinates(?s:.*)epsg:32633"):
         export.exported(trained, file_format=None, out=None, coordinates="gauss")
@@ -176,7 +176,7 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
 
 def test_an_existing_georef_file_next_to_a_named_output_is_not_replaced(trained, tmp_path):
     (tmp_path / "a.georef.json").write_text("mine")
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
     assert (tmp_path / "a.georef.json").read_text() == "mine"
 

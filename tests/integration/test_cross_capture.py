@@ -100,14 +100,14 @@ def test_a_zoom_path_is_rendered_as_frames_and_a_video(trained, tmp_path, capsys
     (video,) = folder.glob("video.*")
     assert f"3 frames in {folder}, video {video}" in capsys.readouterr().out
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         render.render_path(trained, "zoom", frames=2, out=folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     # In the run's own folder a video takes the place of the one before.
     for frames in (3, 2):
         render.render_path(trained, "zoom", frames=frames, out=None)
     assert len(list((trained / "renders").glob("*/path_zoom/video.*"))) == 1
-    with pytest.raises(UserError, match="frames of a zoom path"):
+    with pytest.raises(UserError, match="applies only to a zoom path"):
         render.render_path(trained, "path.json", frames=2, out=None)
 
 

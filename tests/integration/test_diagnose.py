@@ -144,13 +144,13 @@ def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):
 
 
 def test_bad_requests_are_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="either a scene"):
+    with pytest.raises(UserError, match="both a scene and a run"):
         diagnose(scene, tmp_path, {}, QUICK, None)
     with pytest.raises(UserError, match="nosuch"):
         diagnose(scene, None, {}, Options(grouping=ComponentChoice(name="nosuch")), tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "diagnostics.csv").touch()
-    with pytest.raises(UserError, match="holds a report"):
+    with pytest.raises(UserError, match="already contains a report"):
         diagnose(scene, None, {}, QUICK, tmp_path / "b")
     with pytest.raises(UserError, match="not the folder of a run"):
         diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")
@@ -161,7 +161,7 @@ def test_too_few_photos_are_refused_as_such(tmp_path, photos):
     scene = write_tiny_scene(tmp_path / "few", views=photos)
     with pytest.raises(UserError) as told:
         diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
-    assert told.value.what == "too few training photos to be probed"
+    assert told.value.what == "too few training photos for a probe"
     assert "4 at least" in told.value.expected and "sampler" not in told.value.todo
 
 
@@ -170,7 +170,7 @@ def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
     mine = tmp_path / name
     mine.write_text("mine")
     for options, out in ((QUICK, tmp_path), (replace(QUICK, signature=mine), tmp_path / "out")):
-        with pytest.raises(UserError, match="the file exists"):
+        with pytest.raises(UserError, match="the output file already exists"):
             diagnose(scene, None, {"threads": 1}, options, out)
         assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
@@ -187,7 +187,7 @@ def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
 def test_options_that_would_do_nothing_are_refused(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert ended("diagnose", *arguments) == 2
-    assert f"{arguments[-2 if len(arguments) > 1 else 0]} does nothing" in capsys.readouterr().err
+    assert f"{arguments[-2 if len(arguments) > 1 else 0]} has no effect" in capsys.readouterr().err
 
 
 def failing_from(monkeypatch, first):

@@ -123,7 +123,7 @@ def test_rates_fall_to_a_hundredth_and_zero_keeps_the_start(varied, tmp_path):
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
     assert run(varied, tmp_path / "more", exposure=kept) == 0
     assert photos(tmp_path / "one") == photos(tmp_path / "more")
-    with pytest.raises(UserError, match="do nothing") as caught:
+    with pytest.raises(UserError, match="have no effect") as caught:
         run(varied, tmp_path / "idle", exposure={**kept, "decay": 0.5})
     assert "exposure.decay" in caught.value.where
 
@@ -174,23 +174,23 @@ WRONG = {
     "another file": (b'{"status": "finished"}', "does not contain parameters"),
     "other photos": (
         b'{"format": 1, "exposure": "gain", "photos": {"x.png": {"stops": 0}}}',
-        "of no training photo",
+        "no values for the training photos",
     ),
     "another exposure": (
         b'{"format": 1, "exposure": "channel", "photos": {"0001.png": {"stops": [0, 0, 0]}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "other parameters": (
         b'{"format": 1, "exposure": "x", "photos": {"0001.png": {"matrix": 0}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "no numbers": (
         b'{"format": 1, "exposure": "gain", "photos": {"0001.png": {"stops": "bright"}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "not finite": (
         b'{"format": 1, "exposure": "gain", "photos": {"0001.png": {"stops": NaN}}}',
-        "do not fit",
+        "another exposure model",
     ),
 }
 
@@ -207,7 +207,7 @@ def test_a_wrong_file_is_refused_before_anything_is_written(varied, tmp_path, ca
 
 def test_values_for_an_exposure_without_any_are_refused(scene, tmp_path):
     (tmp_path / "values.json").write_text("{}")
-    with pytest.raises(UserError, match="do nothing") as caught:
+    with pytest.raises(UserError, match="have no effect") as caught:
         run(scene, tmp_path / "run", exposure_from=str(tmp_path / "values.json"))
     assert "no values of photos" in caught.value.found
 

@@ -191,7 +191,7 @@ def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, c
         (("--resolution", "unfit"), "made_up_faulty.py:68"),
         (("--loss", "infinite"), "the photometric loss is not finite"),
         (("--loss", "infinite", "--seconds", "1"), "the photometric loss is not finite"),
-        (("--loss", "vector"), "a step that was tried out before the training failed"),
+        (("--loss", "vector"), "a trial step failed before the training started"),
         (("--densifier", "typo"), "there is no tensor 'mean' with a row for each primitive"),
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",

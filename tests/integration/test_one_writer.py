@@ -57,7 +57,7 @@ def test_a_folder_that_was_filled_while_the_run_compiled_is_refused(scene, tmp_p
         return 0.0
 
     monkeypatch.setattr(app, "warm_up", another_run_comes_and_goes)
-    with pytest.raises(UserError, match="results are never overwritten"):
+    with pytest.raises(UserError, match="never overwrites results"):
         app.run({"scene": str(scene), "out": str(out), "steps": 2}, verbosity=-1)
     assert (out / "metrics.csv").read_text() == "precious"
 

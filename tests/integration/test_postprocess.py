@@ -70,7 +70,7 @@ def test_baking_for_a_view_leaves_the_file_of_the_summary_alone(finished, capsys
     files = (finished / name for name in ("point_cloud.ply", "point_cloud_street__0002.ply"))
     own, baked = (read_ply(file).logit_opacities for file in files)
     assert own.shape != baked.shape or (own != baked).any()
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export_file(finished, camera="street/0002.png")
     with pytest.raises(UserError, match="no view 'nobody'"):
         export_file(finished, camera="nobody")
@@ -114,7 +114,9 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
         before = content(finished)
         evaluate.evaluate(finished)
         assert "overall" in capsys.readouterr().out
-        assert "another process writes" in caplog.text and "none is written there" in caplog.text
+        assert (
+            "another process is writing" in caplog.text and "none is written there" in caplog.text
+        )
         for write in (
             lambda: export_file(finished),
             lambda: export_file(finished, camera="street/0002.png"),
@@ -137,7 +139,7 @@ def test_no_picture_of_a_folder_that_the_user_names_is_overwritten(finished, tmp
         folder = tmp_path / name
         folder.mkdir()
         (folder / f"{name}.png").write_bytes(b"a photo of mine")
-        with pytest.raises(UserError, match="the file exists"):
+        with pytest.raises(UserError, match="the output file already exists"):
             draw(folder)
         assert content(folder) == {f"{name}.png": b"a photo of mine"}
     for _ in range(2):  # The run's own are drawn anew.

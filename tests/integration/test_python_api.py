@@ -112,7 +112,7 @@ def test_a_stopped_run_goes_on_with_the_bits_of_the_command(scene, reference, tm
     assert bits(finished.folder, EVALUATED) == bits(reference)
     with pytest.raises(cg.UserError, match="the run is finished"):
         cg.resume(stopped.folder, quiet=True)
-    with pytest.raises(cg.UserError, match="a resumed run keeps its settings"):
+    with pytest.raises(cg.UserError, match="settings and the scene cannot be changed"):
         cg.resume(stopped.folder, quiet=True, seed=4)
 
 
@@ -162,7 +162,7 @@ def test_a_failed_run_raises_with_its_folder_and_cause(scene, tmp_path, monkeypa
         ({"operator": {"name": "cagrad", "d": 1}}, "cagrad has no option"),
         (
             {"steps": 3, "seconds": 3},
-            "a run has one length: in steps, in views or in seconds, or views",
+            "a run has a length in steps, in views or in seconds, or in views",
         ),
     ],
 )
@@ -223,7 +223,7 @@ def test_two_threads_do_not_write_into_one_folder(scene, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     with (
         locked(stopped.folder, "training"),
-        pytest.raises(cg.UserError, match="writes into this folder"),
+        pytest.raises(cg.UserError, match="is writing to this folder"),
     ):
         cg.resume(stopped.folder, quiet=True)
 

@@ -34,7 +34,7 @@ def settings(scenes, name, out):
 
 
 def test_a_run_is_refused_with_the_cause_and_writes_nothing(scenes, tmp_path):
-    with pytest.raises(UserError, match="the scene contradicts itself") as error:
+    with pytest.raises(UserError, match="do not match its poses and points") as error:
         app.run(settings(scenes, "wrong", tmp_path / "run"), verbosity=-1)
     assert "principal point" in error.value.found
     assert not (tmp_path / "run").exists()
@@ -86,6 +86,6 @@ def test_check_ends_with_2_and_the_cause_where_the_scene_is_refused(scenes):
     command = [sys.executable, "-m", "crossgrad_core", "check", str(scenes / "wrong")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "the scene contradicts itself" in done.stderr
+    assert "do not match its poses and points" in done.stderr
     assert "principal point" in done.stderr
     assert "Traceback" not in done.stderr

@@ -31,5 +31,5 @@ def test_a_folder_that_holds_something_else_stays_as_it_is(tmp_path, capsys):
     out.mkdir()
     (out / "config.yaml").write_text("steps: 3")
     assert ended("sweep", grid, "--out", out) == 2
-    assert "something else than a sweep" in capsys.readouterr().err
+    assert "do not belong to a sweep" in capsys.readouterr().err
     assert [each.name for each in out.iterdir()] == ["config.yaml"]

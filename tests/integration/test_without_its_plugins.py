@@ -79,7 +79,9 @@ def test_settings_that_were_changed_are_still_refused(run, capsys):
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("own-losses", "other-losses"))
     assert ended("eval", run) == 2
-    assert "config.yaml was changed since this run began" in capsys.readouterr().err
+    assert (
+        "settings in config.yaml have changed since the run was started" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,7 +103,7 @@ def test_changed_render_and_length_settings_are_refused_without_the_plugins(
     before = (run / "per_view.csv").read_text()
     assert ended("eval", run) == 2
     told = capsys.readouterr().err
-    assert "config.yaml was changed since this run began" in told
+    assert "settings in config.yaml have changed since the run was started" in told
     assert f"settings {named}; step" in told
     assert (run / "per_view.csv").read_text() == before
 

@@ -186,7 +186,7 @@ class AnchorBackbone(AnchorOptions):
         drawn = gaussians.opacities >= ALPHA_THRESHOLD
         if not bool(drawn.any()):
             raise UserError(
-                "anchors have no point to start from",
+                "no Gaussian is opaque enough to become an anchor",
                 where="--init",
                 expected=f"Gaussians with opacities of at least {ALPHA_THRESHOLD:.4f}",
                 found=f"{len(drawn)} Gaussians, all of them fainter",

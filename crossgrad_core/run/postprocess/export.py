@@ -82,16 +82,18 @@ def exported(
             exporter = build(Exporter, str(file_format), {})
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
             raise UserError(
-                "the file is named as one of another format",
-                where=f"--out {out}",
+                "the name of the output file ends like a file of another format",
+                where="rename it, or choose another --format (`crossgrad plugins list` shows all "
+                "formats)",
                 expected=f"a name that ends in .{exporter.suffix}",
                 todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
             )
         if camera is not None and setup.backbone.plain:
             raise UserError(
-                f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+                f"--camera has no effect: backbone {setup.selection.names['backbone']} "
+                "exports the same file for every view",
                 where="--camera",
-                todo="leave it out: the file is the same for every view",
+                todo="leave --camera out",
             )
         words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
         words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]

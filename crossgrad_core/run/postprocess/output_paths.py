@@ -44,7 +44,10 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
             yield
     except RunInUseError as error:
         raise UserError(
-            error.what, where=error.where, found=error.found, todo="name another place with --out"
+            error.what,
+            where=error.where,
+            found=error.found,
+            todo="choose another output path with --out",
         ) from error
 
 

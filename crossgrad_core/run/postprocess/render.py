@@ -101,9 +101,10 @@ def render_path(
     """
     if frames is not None and path != ZOOM:
         raise UserError(
-            "--frames is the number of frames of a zoom path; a camera path has its own",
+            "--frames applies only to a zoom path; a camera path from a file defines its "
+            "own frames",
             where=f"--path {path}",
-            todo=f"leave out --frames, or draw --path {ZOOM}",
+            todo=f"leave out --frames, or use --path {ZOOM}",
         )
     with writing(folder, out, "rendering"):
         check_folder(out or folder)

@@ -94,18 +94,20 @@ def check_out(out: Path | None) -> None:
             return
     if not out.is_dir():
         raise UserError(
-            "the output folder is a file", where=out, todo="choose another --out, or remove it"
+            "the output path is a file, not a folder",
+            where=out,
+            todo="choose another --out, or remove the file",
         )
     there = sorted(p.name for p in out.iterdir() if p.name != LOCK and not is_leftover(p))
     if there:
         writer = writer_of(out)
         raise UserError(
-            "the output folder is not empty, and results are never overwritten",
+            "the output folder is not empty; crossgrad never overwrites results",
             where=out,
             expected="a new or empty folder",
             found=", ".join(there[:4]) + (f" of {writer}" if writer else ""),
             todo="choose another --out"
-            + (", or continue that run with --resume" if CONFIG in there else ""),
+            + (", or resume that run with --resume" if CONFIG in there else ""),
         )
 
 

@@ -105,10 +105,10 @@ def writer_of(folder: Path) -> str | None:
 
 def _in_use(folder: Path, holder: Holder | None) -> RunInUseError:
     return RunInUseError(
-        "another process writes into this folder",
+        "another process is writing to this folder",
         where=folder,
         found=_named(holder),
-        todo="wait until it ends, or stop it",
+        todo="wait until the process ends, or stop it",
     )
 
 

@@ -100,11 +100,11 @@ class MetricsCsv:
         lines = _lines(path)
         if not lines or tuple(lines[0]) != table.columns:
             raise UserError(
-                "cannot continue the table of another run",
+                "metrics.csv cannot be continued: its columns belong to another run",
                 where=path,
                 expected=",".join(table.columns),
                 found=",".join(lines[0]) if lines else "an empty file",
-                todo="resume with the scene and split of that run",
+                todo="resume with the scene and the split that the run was started with",
             )
         # A row that a crash cut short has fewer cells; the resumed run writes it again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
@@ -142,7 +142,7 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
     path = folder / FILE
     if not path.is_file():
         raise UserError(
-            f"no {FILE}",
+            f"the folder does not contain {FILE}",
             where=folder,
             expected="the folder of a crossgrad run",
             todo="name the folder that `crossgrad run` printed",
@@ -172,7 +172,7 @@ def _is_step(number: float | None) -> bool:
 
 
 def _unreadable(path: Path, found: str) -> UserError:
-    return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
+    return UserError(f"{FILE} cannot be read", where=path, found=found, todo=_TODO)
 
 
 def _append(path: Path, content: bytes) -> None:
@@ -250,5 +250,9 @@ def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
 
 def _unreadable_view(path: Path, found: str, expected: str = "") -> UserError:
     return UserError(
-        f"unreadable {PER_VIEW}", where=path, expected=expected, found=found, todo=_RESTORE_VIEWS
+        f"{PER_VIEW} cannot be read",
+        where=path,
+        expected=expected,
+        found=found,
+        todo=_RESTORE_VIEWS,
     )

@@ -190,7 +190,7 @@ def read_panel(path: Path) -> "dict[str, Image]":
 
 def _unreadable(path: Path, found: str) -> UserError:
     return UserError(
-        "unreadable panel",
+        "a panel image cannot be read",
         where=path,
         found=found,
         todo=_TODO,

@@ -166,7 +166,8 @@ def refuse_changed(folder: Path, packages: Packages | None) -> None:
             where=folder / FILE,
             expected=listed(changed),
             found=listed(changed.values()),
-            todo="install those versions again, or add --accept-plugins to go on with these",
+            todo="install the same versions again, or add --accept-plugins to resume with the "
+            "installed versions",
         )
 
 

@@ -65,9 +65,9 @@ class RunResults:
         if isinstance(marks, dict) and isinstance(marks.get("views"), dict):
             return marks
         raise UserError(
-            "unreadable scene.json",
+            "scene.json cannot be read",
             where=self.folder / SCENE,
-            expected="the views of the scene, with what their photos are known by",
+            expected="the views of the scene, with the fingerprints of their photos",
             todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
         )
 

@@ -82,7 +82,7 @@ def check_scene(
     if heaviest <= tolerated and accept:
         return (f"{ACCEPTED}{text}",)
     raise UserError(
-        "the scene is not the one that the run was trained on",
+        "the scene has changed since the run was trained",
         where=folder / FILE,
         found=text,
         todo=_WAYS_OUT[heaviest if heaviest > tolerated else None],

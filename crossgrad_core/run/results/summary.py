@@ -80,10 +80,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / FILE
     if not path.is_file():
         raise UserError(
-            f"no {FILE}",
+            f"the folder does not contain {FILE}",
             where=folder,
             expected="the folder of a crossgrad run",
-            todo="name the folder of a run that has ended",
+            todo="name the folder of a finished run",
         )
     try:
         content, found = read_json(path), "something else than an object"
@@ -92,7 +92,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if isinstance(content, dict):
         return content
     raise UserError(
-        f"unreadable {FILE}",
+        f"{FILE} cannot be read",
         where=path,
         found=found,
         todo="restore the file, or repeat the run: crossgrad run --config config.yaml",

@@ -99,7 +99,7 @@ def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
             "the video could not be written",
             where=frames[0].parent,
             found=said.strip()[-300:],
-            todo="the frames are there",
+            todo="the frames are in the folder",
         )
 
 

@@ -172,11 +172,11 @@ def _read_full(folder: PhotoFolder, names: Sequence[str]) -> _Found:
     paths = _pair(folder, names)
     if not paths:
         raise UserError(
-            "no posed image has a photo",
+            "no photo was found for any image of the model",
             where=folder.path,
-            expected=f"photos named as in the model, such as {names[0]}",
+            expected=f"photos with the names of the model, such as {names[0]}",
             found=name_some(folder.names) or "no photo",
-            todo="put the photos below the image folder under the names that the model gives them",
+            todo="put the photos below the image folder, with the names that the model uses",
         )
     return _read_found(folder, paths)
 
@@ -228,9 +228,9 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
     if orientation is not None and is_scaled((height, width), posed):
         return height, width, orientation
     raise UserError(
-        "a photo does not have the shape of its camera",
+        "the aspect ratio of a photo differs from the aspect ratio of its camera",
         where=path,
-        expected=f"{calibration.width} x {calibration.height} pixels, or in that proportion",
+        expected=f"{calibration.width} x {calibration.height} pixels, or the same aspect ratio",
         found=f"{width} x {height} pixels",
         todo="use the photos that the poses were estimated from",
     )

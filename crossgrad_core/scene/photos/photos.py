@@ -144,7 +144,7 @@ class PhotoSource:
                 where=self.path,
                 expected=f"{self.width} x {self.height} pixels",
                 found=f"{width} x {height} pixels",
-                todo="put the former photo back, or start a new run",
+                todo="restore the old photo, or start a new run",
             )
 
     def _decode_mask(self) -> Pixels | None:

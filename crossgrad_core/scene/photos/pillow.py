@@ -60,7 +60,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
     except UnidentifiedImageError as error:
         found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
         raise UserError(
-            "the file is not a photo", where=path, found=found, todo="replace or remove it"
+            "the file is not a photo", where=path, found=found, todo="replace or remove the file"
         ) from error
     except Exception as error:
         # For damaged files, decoders raise any exception: KeyError, struct.error ...
@@ -68,7 +68,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
             what,
             where=path,
             found=str(error) or type(error).__name__,
-            todo="copy or download it again, or remove it",
+            todo="copy or download the file again, or remove it",
         ) from error
 
 
@@ -132,7 +132,7 @@ def rows_of(image: "Image", top: int, end: int) -> bytes:
 
 def _check_pixels(image: "Image", path: Path) -> None:
     if 0 in image.size:
-        raise UserError("the photo has no pixels", where=path, todo="replace or remove it")
+        raise UserError("the photo has no pixels", where=path, todo="replace or remove the photo")
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
@@ -165,7 +165,7 @@ def admit(head: bytes, path: Path) -> bool:
         return False
     if not _registered():
         raise UserError(
-            "photos in HEIC need a package that is not installed",
+            "photos in HEIC format need a package that is not installed",
             where=path,
             expected="the package pillow-heif",
             todo="pip install 'crossgrad[heic]', or convert the photos to JPEG",

@@ -253,10 +253,10 @@ def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
     if isfinite(verdict.correlation):
         found.append(f"colours of points and photos correlate by {verdict.correlation:.2f}")
     return UserError(
-        "the scene contradicts itself",
+        "the photos of the scene do not match its poses and points",
         where=path,
-        expected="photos that show the points where their poses put them",
+        expected="photos that show the SfM points at the positions that the poses predict",
         found=f"{cause.what} ({', '.join(found)})" if found else cause.what,
-        todo=f"{cause.todo}; or go on with the scene as it is: --accept-scene, or "
-        "data.accept_scene: true in a file of settings",
+        todo=f"{cause.todo}; or train on the scene unchanged with --accept-scene, or with "
+        "data.accept_scene: true in a settings file",
     )

@@ -71,8 +71,9 @@ def revived(state: PluginState) -> PluginState:
         values = json.loads(json.dumps(dict(state.values), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ContractError(
-            f"the state's values do not survive JSON ({error}): keep plain numbers, strings, "
-            "lists and dictionaries with string keys there, and tensors in `tensors`"
+            f"the state cannot be stored as JSON ({error}): keep plain numbers, strings, "
+            "lists and dictionaries with string keys in `values`, and tensors in "
+            "`tensors`"
         ) from error
     wrong = unsavable(state, "cpu")
     require(not wrong, f"a checkpoint cannot hold the state: {wrong}")

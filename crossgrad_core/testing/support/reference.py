@@ -287,7 +287,7 @@ def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
             for view, behind in zip(views, backgrounds, strict=True)
         ]
     if len(together) != len(alone):
-        raise ContractError(f"render_views gives {len(together)} renders of {len(alone)} views")
+        raise ContractError(f"render_views returned {len(together)} renders for {len(alone)} views")
     for number, (one, other) in enumerate(zip(together, alone, strict=True), 1):
         error = float((one.image - other.image).abs().max())
         require(

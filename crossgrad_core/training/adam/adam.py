@@ -194,5 +194,5 @@ def _check(
         if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):
             found = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
             raise ValueError(
-                f"gradient of `{name}` must have the shape and type of the tensor; {found}"
+                f"the gradient of `{name}` must have the shape and type of the tensor; {found}"
             )

@@ -135,14 +135,14 @@ def _refuse_idle(given: Options) -> None:
     chosen = [name for name, value in modes.items() if value is not None]
     if len(chosen) > 1:
         raise UserError(
-            f"{' and '.join(chosen)} do not go together",
-            todo="leave all but one of them out; each is a run of its own",
+            f"{' and '.join(chosen)} cannot be combined",
+            todo="use only one of them; each option starts a different kind of run",
         )
     mode = chosen[0] if chosen else ""
     idle = [name for name, value in others.items() if value is not None and mode not in _USED[name]]
     if idle:
         raise UserError(
-            f"{' and '.join(idle)} does nothing with {mode or 'the fixed cases'}",
+            f"{' and '.join(idle)} has no effect with {mode or 'the fixed cases'}",
             todo="leave it out",
         )
 
@@ -154,10 +154,10 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     chosen = [each for each in cases(large=elements) if (case or "") in each.name]
     if not chosen:
         raise UserError(
-            "no case has this in its name",
+            "no case name contains this text",
             where=f"--case {case}",
             expected=f"a part of {', '.join(each.name for each in cases(large=elements))}",
-            todo="leave it out to run all of them",
+            todo="leave --case out to run all cases",
         )
     return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
 

@@ -43,7 +43,7 @@ def _rows(views: int) -> Case:
 def _result(operator: Operator, case: Case, views: Views | None = None) -> Tensor:
     gradient, _, _ = timed(operator, case, views or sample_views(case.views))
     if gradient is None:
-        raise RuntimeError("no gradient where all views have one")
+        raise RuntimeError("a view has no gradient, but all views must have one")
     return gradient.double()
 
 

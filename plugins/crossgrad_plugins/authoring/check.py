@@ -72,13 +72,14 @@ def entries_of(package: str) -> list[Entry]:
     known = sorted({entry.distribution for entry in offered})
     if _is_installed(package):
         raise UserError(
-            f"package {package!r} offers no plugins",
+            f"package {package!r} contains no plugins",
             expected=f"entry points in a group such as {GROUPS['operators']}",
             found=sentences(*(f"{each.name}: {each.reason}" for each in _strays_of(package))),
-            todo="name them in its pyproject.toml (docs/plugins.md) and install it again",
+            todo="declare the plugins in pyproject.toml (docs/plugins.md) and install the "
+            "package again",
         )
     raise UserError(
-        f"there is no installed package {package!r}",
+        f"no package named {package!r} is installed",
         expected=f"a package such as {', '.join(known)}",
         todo=sentences(did_you_mean(package, known), "install it into this environment with pip"),
     )

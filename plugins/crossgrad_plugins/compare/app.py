@@ -295,11 +295,11 @@ def _check_numbers(options: Options) -> None:
         value = getattr(options, name)
         if value is not None and not isfinite(value):
             raise UserError(
-                f"the {name} is no number that a figure can have",
+                f"the {name} is not a finite number",
                 where=f"--{name}",
                 expected="a finite number",
                 found=str(value),
-                todo="give one, or leave it out",
+                todo="give a finite number, or leave the option out",
             )
 
 

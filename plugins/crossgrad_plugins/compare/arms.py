@@ -119,7 +119,7 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
         old = max(fitting, key=len, default=None)
         if old is None or text == f"{old}:":
             raise UserError(
-                "no arm has this name",
+                "--name renames an arm that does not exist",
                 where="--name",
                 expected=f"OLD:NEW with one of {'; '.join(new)}",
                 found=text,
@@ -128,10 +128,10 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
         new[old] = text[len(old) + 1 :]
     if len(set(new.values())) < len(new):
         raise UserError(
-            "two arms would have one name",
+            "two arms would have the same name",
             where="--name",
             found="; ".join(new.values()),
-            todo="give each arm a name of its own",
+            todo="give each arm a different name",
         )
     return tuple(Arm(new[arm.name], arm.runs, arm.failed, arm.settings) for arm in arms)
 

@@ -219,7 +219,7 @@ def compared(found: RunRecord, options: Options) -> Comparison:
             "no run has finished",
             expected="at least one run with summary.json",
             found="; ".join(f"{name} {why}" for name, why in found.left_out.items()),
-            todo="let a run come to its end, or resume it: crossgrad run --resume RUN",
+            todo="wait until a run has finished, or resume it: crossgrad run --resume RUN",
         )
     notes = check_scenes(found.runs)
     quantities, about_figures = quantities_of(found.runs, options.metric, options.margin)
@@ -243,7 +243,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
     names = [arm.name for arm in arms]
     if baseline is not None and baseline not in names:
         raise UserError(
-            "no arm has this name",
+            "--baseline names an arm that does not exist",
             where="--baseline",
             expected=f"one of {'; '.join(names)}",
             found=baseline,

@@ -170,7 +170,9 @@ class CountsMarkedPixels(Densifier, ABC):
     ) -> None:
         """Add the counts of a view to the sums, in place."""
         if view.screen.count is None:
-            raise RuntimeError("the rasterizer was asked for a count and gave none")
+            raise RuntimeError(
+                "the rasterizer returned no pixel counts, although they were requested"
+            )
         column = self._column(context, view.view)
         counts = view.screen.count(erroneous(view, self.error_threshold))
         marked, shown = (torch.zeros_like(sums[MARKED][:, 0]) for _ in range(2))

@@ -97,9 +97,9 @@ def diagnose(
     """
     if scene is not None and run is not None:
         raise UserError(
-            "either a scene is diagnosed or a run",
+            "both a scene and a run were named; only one of them can be diagnosed",
             where="SCENE, --run",
-            todo="leave SCENE out: the run knows its scene",
+            todo="leave SCENE out: the run stores the path of its scene",
         )
     _check_free(out)
     check_folder(out or run or Path("runs"))
@@ -130,9 +130,9 @@ def _failed(why: str) -> int:
 def _check_free(out: Path | None) -> None:
     if out is not None and (out / PROBES).exists():
         raise UserError(
-            "the folder holds a report already",
+            "the output folder already contains a report",
             where=out,
-            todo="choose another --out, or remove it",
+            todo="choose another --out, or remove the report",
         )
     if out is not None:
         check_new(*(out / name for name in FILES))

@@ -123,4 +123,4 @@ def _refuse_idle(idle: list[str], run: Path | None) -> None:
     """Refuse options that have no effect on the diagnosed scene or run."""
     if idle:
         why = "without --run" if run is None else "with --run: a run is probed once, as it is"
-        raise UserError(f"{' and '.join(idle)} does nothing {why}", todo="leave it out")
+        raise UserError(f"{' and '.join(idle)} has no effect {why}", todo="leave it out")

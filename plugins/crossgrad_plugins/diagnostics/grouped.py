@@ -32,7 +32,7 @@ class Groups:
     def __post_init__(self) -> None:
         if min(self.sizes) < SMALLEST_GROUP:
             raise UserError(
-                "a variance needs two views of each group",
+                "the variance cannot be estimated: each group needs two views",
                 where="diagnostics",
                 found=f"{self.sizes[0]} near and {self.sizes[1]} far views",
                 todo="probe more views, or choose another grouping",

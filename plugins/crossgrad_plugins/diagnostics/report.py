@@ -173,7 +173,7 @@ def read_probes(path: Path) -> list[Row]:
             raise UserError(
                 "the table of probes cannot be read",
                 where=path,
-                expected=f"{len(header)} cells, one of them a step",
+                expected=f"{len(header)} cells, including a step",
                 found=",".join(line),
                 todo=todo,
             )

@@ -194,7 +194,11 @@ class Watch:
             UserError: There was no probe.
         """
         if self.last is None:
-            raise UserError("the model was never probed", where=scene.name, todo="train longer")
+            raise UserError(
+                "the model was never probed, because training was too short",
+                where=scene.name,
+                todo="train for more steps",
+            )
         return Report(
             scene=scene.name,
             title=f"{scene.name}: {which}",

@@ -211,11 +211,11 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
     names = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or any(name not in columns for name in names):
         raise UserError(
-            "PLY file with an unusual number of spherical harmonics",
+            "the PLY file has an unusual number of spherical-harmonics coefficients",
             where=path,
             expected="0, 9, 24 or 45 properties f_rest_0, f_rest_1 ...",
             found=f"{count}",
-            todo="export the file again with whole bands of spherical harmonics",
+            todo="export the file again with complete bands of spherical harmonics",
         )
     return names
 
@@ -223,7 +223,7 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
 def _require_gaussians(count: int, path: Path) -> None:
     if count == 0:
         raise UserError(
-            "PLY file without Gaussians",
+            "the PLY file contains no Gaussians",
             where=path,
             expected="at least one vertex",
             found="0 vertices",
@@ -237,10 +237,10 @@ def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
     wrong = (lengths < shortest) | (lengths > longest)
     if wrong.any():
         raise UserError(
-            "PLY file with a rotation of length zero or of no length that float32 can square",
+            "the PLY file contains a rotation whose length is zero, too small or too large",
             where=path,
             expected=f"quaternions rot_0 ... rot_3 of length {shortest:g} to {longest:g}",
-            found=f"{int(wrong.sum()):,} of {len(quats):,} out of this range",
+            found=f"{int(wrong.sum()):,} of {len(quats):,} outside this range",
             todo="remove these Gaussians, or export the file again",
         )
 
@@ -258,7 +258,7 @@ def _require_properties(names: Collection[str], path: Path) -> None:
         else "export the Gaussians, not the sparse points or a mesh"
     )
     raise UserError(
-        "compressed PLY file" if packed else "PLY file without Gaussians",
+        "the PLY file is compressed" if packed else "the PLY file does not contain Gaussians",
         where=path,
         expected="the properties of a standard 3DGS PLY file",
         found=f"no {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}",  # noqa: PLR2004
@@ -273,7 +273,7 @@ def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float
     valid = (numbers >= -_LARGEST) & (numbers <= top)
     if not valid.all():
         raise UserError(
-            "PLY file with numbers that are not finite",
+            "the PLY file contains numbers that are not finite",
             where=path,
             found=f"{np.sum(~valid):,} of {len(column):,} values of {name}",
             todo="remove these Gaussians, or export the file again",
@@ -295,7 +295,7 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
     offset = np.array([float(word) for word in match.groups()] if match else [np.nan] * 3)
     if not (np.abs(offset) <= _LARGEST).all():
         raise UserError(
-            "PLY file with an unreadable offset",
+            "the coordinate offset in the PLY file cannot be read",
             where=path,
             expected="three numbers",
             found=text,
@@ -308,11 +308,11 @@ def _check_coordinates(comments: Sequence[str], path: Path) -> None:
     found = _tagged(comments, COORDINATES_TAG)
     if found is not None:
         raise UserError(
-            "PLY file in other coordinates than the scene's",
+            "the PLY file uses other coordinates than the scene",
             where=path,
-            expected="the coordinates of the scene's input",
+            expected="the coordinates of the scene's input files",
             found=found,
-            todo="export it again with --coordinates input",
+            todo="export the file again with --coordinates input",
         )
 
 
@@ -323,9 +323,9 @@ def _render_mode(comments: Sequence[str], path: Path) -> RenderMode:
     if text == "mip":
         return "mip"
     raise UserError(
-        "PLY file for another renderer",
+        "the PLY file was made for another renderer",
         where=path,
         expected=f"{_MODE_TAG} default or mip",
         found=text,
-        todo=f"remove the comment if its Gaussians are meant to be drawn as in {_MODE_TAG} default",
+        todo=f"remove the comment if the Gaussians should be rendered as with {_MODE_TAG} default",
     )

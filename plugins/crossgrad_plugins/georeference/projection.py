@@ -59,9 +59,9 @@ class Projection:
             from pyproj.exceptions import CRSError, ProjError
         except ImportError as error:
             raise UserError(
-                "coordinates of an EPSG code need pyproj",
+                "coordinates of an EPSG code need the package pyproj",
                 where=where,
-                found="it is not installed",
+                found="pyproj is not installed",
                 todo='pip install "crossgrad[geo]"',
             ) from error
         try:
@@ -123,21 +123,21 @@ class Projection:
 
     def _unusable(self, where: str, found: str) -> UserError:
         return UserError(
-            f"Gaussians cannot be written in {self.code}",
+            f"Gaussians cannot be exported in {self.code}",
             where=where,
             expected="a right-handed system with the same unit on all axes",
             found=found,
-            todo="take UTM (--coordinates utm), or enu",
+            todo="use UTM (--coordinates utm) or enu",
         )
 
 
 def _unknown(where: str, found: str) -> UserError:
     return UserError(
-        "PROJ cannot compute these coordinates",
+        "PROJ cannot convert to these coordinates",
         where=where,
         found=found,
-        todo="check the code, or take one of WGS 84 or ETRS89 without a height system, such as "
-        "epsg:32633 or epsg:25833",
+        todo="check the code, or use a code of WGS 84 or ETRS89 without a height system, "
+        "such as epsg:32633 or epsg:25833",
     )
 
 

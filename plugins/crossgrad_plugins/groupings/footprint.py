@@ -52,10 +52,10 @@ class Footprint(Grouping):
         blind = np.isnan(own)
         if blind.all():
             raise UserError(
-                "grouping footprint needs SfM points that the photos show",
+                "grouping footprint needs SfM points that are visible in photos",
                 where=scene.name,
-                found="no SfM point in any training image",
-                todo="choose grouping radial, which needs camera positions only",
+                found="no SfM point is visible in a training photo",
+                todo="choose grouping radial, which needs only camera positions",
             )
         known, places = own[~blind], scene.centers[~blind]
 

@@ -107,11 +107,11 @@ class Triangulated(Initializer):
         kept = _best(pairs, met)
         if len(kept) < _FEWEST:
             raise UserError(
-                "no points could be triangulated",
+                "no points could be triangulated from the photos",
                 where=scene.name,
-                expected=f"at least {_FEWEST} points that two photos show",
+                expected=f"at least {_FEWEST} points, each visible in two photos",
                 found=f"{len(kept)} in {len(pairs)} pairs of photos",
-                todo="check that poses and photos belong together, or start from the points of a "
+                todo="check that the poses belong to the photos, or start from the points of a "
                 "file (--points FILE) or from random points (--init random)",
             )
         unknown = np.full(len(kept), np.nan)

@@ -127,9 +127,10 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
             if file.is_file():
                 return file, package
     raise UserError(
-        f"there are no linear heads of LPIPS for {net.name}",
+        f"no file with the linear heads of LPIPS for {net.name} is installed",
         where=setting,
-        expected=f"a package that brings them ({', '.join(name for name, _ in _PACKAGES)})",
+        expected="a package that contains the heads "
+        f"({', '.join((name for name, _ in _PACKAGES))})",
         todo=f"pip install torchmetrics, or name the file: --set {setting}.heads={net.heads}",
     )
 
@@ -137,7 +138,7 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
 def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
     """Return the tensors of a file by name; nothing in the file is executed."""
     if not path.is_file():
-        raise UserError("there is no file of weights", where=path, todo=todo)
+        raise UserError("the file of weights does not exist", where=path, todo=todo)
     try:
         if path.suffix == _SAFETENSORS:
             from safetensors.torch import load_file
@@ -177,7 +178,7 @@ def _check(
         else:
             continue
         raise UserError(
-            "the file holds the weights of another network",
+            "the file contains the weights of another network",
             where=f"{path}: {name}",
             expected=f"shape {list(shape)}",
             found=told,

@@ -165,8 +165,8 @@ def show(made: Plan, way: str, *, as_json: bool) -> None:
 def _check_free(file: Path) -> None:
     if file.exists():
         raise UserError(
-            "the file is there already",
+            "the output file already exists",
             where=f"--write {file}",
-            todo="choose another name, or remove it",
+            todo="choose another name, or remove the file",
         )
     check_file(file)

@@ -219,15 +219,15 @@ def _check_lens(name: str) -> None:
             where="--lens",
             expected=", ".join(known),
             found=name,
-            todo="cut them into perspective photos, and prepare those",
+            todo="cut them into perspective photos, and prepare these photos",
         )
     if name not in known:
         raise UserError(
-            "there is no such camera model",
+            "the camera model is unknown",
             where="--lens",
             expected=", ".join(known),
             found=name,
-            todo="leave it out for SIMPLE_RADIAL",
+            todo="leave the option out to use SIMPLE_RADIAL",
         )
 
 

@@ -101,9 +101,9 @@ def prepare(given: Options) -> None:
 def _check_choice(name: str, value: str) -> None:
     if value not in _CHOICES[name]:
         raise UserError(
-            f"there is no such choice of {name}",
+            f"the value of {name} is unknown",
             where=f"--{name}",
             expected=" or ".join(_CHOICES[name]),
             found=value,
-            todo="leave it out to have it chosen",
+            todo="leave the option out to let crossgrad choose",
         )

@@ -256,9 +256,9 @@ def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
 def _nothing(layout: Layout, plan: Plan) -> UserError:
     pairs = len(json.loads(layout.links.read_bytes()))
     return UserError(
-        "no camera could be found: no photos fit together",
+        "no camera pose could be estimated: no photos match well enough",
         where=plan.photos,
-        expected="photos that overlap by more than half, taken from different places",
+        expected="photos that overlap by more than half, taken from different positions",
         found=f"{len(plan.used)} photos; {pairs} pairs of them match ({layout.links})",
-        todo="add photos between those that there are, or choose another --lens or --matching",
+        todo="add photos between the existing photos, or choose another --lens or --matching",
     )

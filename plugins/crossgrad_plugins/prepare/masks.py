@@ -57,7 +57,7 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
     """
     if wanted is not None and not wanted.is_dir():
         raise UserError(
-            "the mask folder is not there",
+            "the mask folder does not exist",
             where=wanted,
             todo="check the path, or leave --masks out",
         )
@@ -173,11 +173,11 @@ def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) 
         return
     names = ", ".join(dict.fromkeys(mask_names(photos[0])))
     raise UserError(
-        "no photo has a mask in the mask folder",
+        "the mask folder contains no mask for any photo",
         where=wanted,
         expected=f"one of {names} for the photo {photos[0]}",
         found=name_some(PhotoFolder(wanted).names) or "no image",
-        todo="name the masks after their photos, folders included, or leave --masks out",
+        todo="name the masks after their photos, including their folders, or leave --masks out",
     )
 
 

@@ -138,7 +138,7 @@ def check_gps(plan: Plan) -> None:
     """
     if plan.settings.matching == "spatial" and len(plan.located) < 2:  # noqa: PLR2004 - a pair
         raise UserError(
-            "the photos have no GPS to tell neighbours by",
+            "--matching spatial needs GPS positions, and the photos have none",
             where="--matching spatial",
             found=f"{len(plan.located)} of {len(plan.used)} photos with GPS",
             todo="leave --matching out, or use --matching retrieval",

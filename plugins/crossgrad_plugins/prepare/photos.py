@@ -130,7 +130,9 @@ def has_photos(root: Path) -> bool:
 def _check_folder(root: Path) -> None:
     if not root.is_dir():
         raise UserError(
-            "there is no such folder of photos" if not root.exists() else "photos are in a folder",
+            "the photo folder does not exist"
+            if not root.exists()
+            else "the path of the photos must be a folder",
             where=root,
             expected="a folder with photos",
             found="a file" if root.exists() else "",
@@ -144,7 +146,7 @@ def _check_text(folder: Path) -> None:
         str(folder).encode()
     except UnicodeEncodeError as error:
         raise UserError(
-            "the folder has a name that is no text",
+            "the name of the folder is not valid text",
             where=folder,
             expected="a path in UTF-8",
             todo="rename it",
@@ -220,7 +222,7 @@ def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
         if image.mode == "F" or (image.format == "TIFF" and image.mode in _MODES_OF_TIFF):
             # COLMAP would write such photos in a format that no program reads.
             raise UserError(
-                "its values are none of a photo",
+                "the pixel values of the photo have a type that photos do not use",
                 where=path,
                 expected="8 or 16 bits",
                 found=f"{image.format}, {_VALUES[image.mode]}",
@@ -280,12 +282,12 @@ def _too_large(path: Path, header: PhotoHeader) -> UserError:
     usual, most = megapixels(pillow.MOST_PIXELS), megapixels(_REDUCIBLE * pillow.MOST_PIXELS)
     pixels = megapixels(header.width * header.height)
     return UserError(
-        "the photo is too large to be decoded at once",
+        "the photo is too large to be decoded",
         where=path,
-        expected=f"at most {usual}, or {most} as a JPEG file that is not progressive",
+        expected=f"at most {usual}, or {most} for a JPEG file that is not progressive",
         found=f"{header.width} x {header.height} pixels, {pixels}",
-        todo="save it smaller, such as at half its width and height, or take it out of the folder "
-        "(--max-size makes photos smaller only once they are decoded)",
+        todo="save it at a smaller size, such as half its width and height, or remove it "
+        "from the folder (--max-size applies only after decoding)",
     )
 
 
@@ -313,9 +315,9 @@ def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> 
     elif used:
         todo = "add photos that overlap with it, taken from other places"
     return UserError(
-        "there are no photos in the folder" if nothing else "too few photos can be used",
+        "the folder contains no photos" if nothing else "too few photos can be used",
         where=root,
         expected=f"at least 2 photos ({', '.join(sorted(end[1:] for end in _READ))})",
-        found=f"{len(used)} that can be used" + (f"; {first}" if first else ""),
+        found=f"{len(used)} usable photos" + (f"; {first}" if first else ""),
         todo=todo,
     )

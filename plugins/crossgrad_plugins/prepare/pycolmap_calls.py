@@ -83,9 +83,9 @@ def waited(
                         progress.tell(f"{what}: {told}")
         except (RuntimeError, ValueError, IndexError) as error:
             raise UserError(
-                f"pycolmap failed: {what}",
+                f"pycolmap failed in the stage {what}",
                 found=str(error),
-                todo="run the same command again; it goes on from the last complete stage",
+                todo="run the same command again; it continues after the last complete stage",
             ) from error
         except BaseException:
             token.cancel()

@@ -180,11 +180,12 @@ class Kind:
             return inside.file(found[0].name, found[0])
         several = f"several {self.form}s" if found else f"no {self.form}"
         raise UserError(
-            f"the scene has {several} of {self.program}",
+            f"the scene contains {several} of {self.program}, and it is not clear which "
+            "one to read",
             where=inside.scene,
             expected=self.expected,
             found=", ".join(path.name for path in found) or "none",
-            todo="name it, with --set reader.file=NAME, or export it",
+            todo="name the file, with --set reader.file=NAME, or export it",
         )
 
 

@@ -76,7 +76,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
     return UserError(
         f"photos of {kind} cannot be undistorted",
         where=where,
-        expected="a perspective camera, with Brown's distortion or a fisheye's",
+        expected="a perspective camera with Brown's distortion or a fisheye distortion",
         found=kind,
         todo=todo,
     )
@@ -85,7 +85,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
 def refuse_term(term: str, value: float, where: object) -> UserError:
     """Return the error for a lens term that COLMAP's models do not contain."""
     return UserError(
-        f"the lens has a term that cannot be undistorted: {term}",
+        f"the lens model has a term that crossgrad cannot undistort: {term}",
         where=where,
         expected=f"{term} = 0",
         found=f"{value:g}",

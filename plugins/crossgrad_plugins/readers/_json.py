@@ -55,7 +55,7 @@ class Fields:
         """
         here = repr(self.value[key])[:_LONGEST] if key in self.value else "no such field"
         raise UserError(
-            "a field of the scene cannot be read",
+            "a field of the scene file cannot be read",
             where=self.where(key),
             expected=expected,
             found=here if found is None else found,
@@ -133,7 +133,7 @@ class Fields:
         place = f"{self.place}{'.' if self.place else ''}{name}"
         if not isinstance(value, dict):
             raise UserError(
-                "a field of the scene cannot be read",
+                "a field of the scene file cannot be read",
                 where=f"{self.file}: {place}",
                 expected="an object",
                 found=repr(value)[:_LONGEST],
@@ -152,9 +152,9 @@ def read_json(path: Path) -> object:
         return json_in(path, LARGEST)
     except FileNotFoundError as error:
         raise UserError(
-            "a file of this format is missing",
+            "a file that this scene format needs is missing",
             where=path,
-            todo="name another scene, or the --reader that it is for (`auto` finds out by itself)",
+            todo="name another scene, or the --reader of its format (`auto` detects the format)",
         ) from error
     except ValueError as error:
         raise _unreadable(path, str(error)) from error

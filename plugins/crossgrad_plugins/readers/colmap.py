@@ -69,7 +69,8 @@ class ColmapReader(Reader):
         """
         if self.crs is not None and self.gps is not None:
             raise UserError(
-                "the coordinate system of the poses leaves nothing for GPS to tell",
+                "reader.crs and reader.gps cannot be combined: the poses already have a "
+                "coordinate system",
                 where="reader.crs, reader.gps",
                 todo="leave one of them out",
             )
@@ -160,11 +161,11 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
     if image.camera in model.cameras:
         return image.camera
     raise UserError(
-        f"image {image.name} has no camera",
+        f"the camera of image {image.name} is missing in the model",
         where=folder,
         expected=f"one of {sorted(model.cameras)[:10]}",
         found=f"camera id {image.camera}",
-        todo="cameras and images must be of one model: export it again",
+        todo="use cameras and images of the same model: export it again",
     )
 
 
@@ -185,9 +186,10 @@ def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
     largest = np.abs(image.quaternion).max()
     if not (_SHORTEST < largest < 1 / _SHORTEST) or not np.isfinite(image.translation).all():
         raise UserError(
-            "a pose is not finite",
+            "a pose contains numbers that are not finite",
             where=f"{folder}: image {image.name}",
-            found=f"quaternion {image.quaternion.tolist()}, shift {image.translation.tolist()}",
+            found=f"quaternion {image.quaternion.tolist()}, translation "
+            f"{image.translation.tolist()}",
             todo="remove the image from the model, or estimate the poses again",
         )
     pose = np.eye(4)

@@ -51,11 +51,11 @@ class MatrixCityReader(Reader):
         files = _accepts.pose_files(path)
         if not files:
             raise UserError(
-                "the scene has no block of MatrixCity",
+                "the folder contains no MatrixCity block",
                 where=path,
                 expected=f"{_accepts.TRANSFORMS_FILE} with the poses and {_PHOTOS}/ with the "
                 "photos of a block",
-                todo="name the folder of a block, or one that holds blocks",
+                todo="name the folder of a block, or a folder that contains blocks",
             )
         frames = {name: _read(inside, name) for name in files}
         images, views = raw_views([frame for block in frames.values() for frame in block])

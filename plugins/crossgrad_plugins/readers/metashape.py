@@ -121,7 +121,7 @@ def _chunk(file: Path) -> Element:
 
 def _missing(file: Path, what: str) -> UserError:
     return UserError(
-        "the XML of Metashape cannot be read",
+        "the XML file of Metashape cannot be read",
         where=file,
         expected=f"an element {what}",
         found="none",

@@ -111,20 +111,20 @@ def _split(
     for key in filter(None, (_TRAIN, held_out)):
         if not lists[key] & set(posed):
             raise UserError(
-                "no name in a split list is the photo of a frame",
+                "no name in a split list matches the photo of a frame",
                 where=whole.where(key),
-                expected=f"names as the frames' file_path has them, such as {min(posed)}",
+                expected=f"names as in the frames' file_path, such as {min(posed)}",
                 found=name_some(whole.texts(key)) or "no name",
-                todo="mend the list, or use --split every",
+                todo="correct the list, or use --split every",
             )
     test = lists[held_out] if held_out else frozenset[str]()
     both = sorted(lists[_TRAIN] & test)
     if both:
         raise UserError(
-            "views are listed for training and for testing",
+            "a view is listed for both training and testing",
             where=f"{whole.where(_TRAIN)} and {held_out}",
             found=name_some(both),
-            todo="leave each name in one of both lists, or use --split every",
+            todo="remove each name from one of the two lists, or use --split every",
         )
     return lists[_TRAIN], test
 

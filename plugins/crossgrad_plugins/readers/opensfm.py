@@ -84,10 +84,10 @@ class OpenSfmReader(Reader):
         there = [name for name in names if (inside.scene / name).is_file()]
         if not there:
             raise UserError(
-                "the scene has no reconstruction of OpenSfM",
+                "the scene folder contains no OpenSfM reconstruction",
                 where=inside.scene,
                 expected=" or ".join(names),
-                todo="name the folder that OpenSfM or OpenDroneMap worked in",
+                todo="name the project folder of OpenSfM or OpenDroneMap",
             )
         return inside.file(there[0], "reader.file")
 

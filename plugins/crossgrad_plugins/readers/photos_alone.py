@@ -34,7 +34,7 @@ class PhotosAloneReader(Reader):
         photos = path.resolve()
         if not photos.name and self.scene is None:
             raise UserError(
-                "the prepared scene has no place beside the photos",
+                "the folder for the prepared scene cannot be created next to the photos",
                 where=photos,
                 todo="name its folder with --set reader.scene=FOLDER",
             )

@@ -136,7 +136,7 @@ def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
 
 def _wrong(file: Path, expected: str, found: str) -> UserError:
     return UserError(
-        "the CSV of RealityCapture cannot be read",
+        "the CSV file of RealityCapture cannot be read",
         where=file,
         expected=expected,
         found=found,

@@ -26,7 +26,7 @@ class Octaves(CoarseToFine):
     @model_validator(mode="after")
     def _in_order(self) -> Self:
         if self.half_until < self.quarter_until:
-            raise ValueError("half_until must not be less than quarter_until")
+            raise ValueError("half_until must be at least quarter_until")
         return self
 
     @override

@@ -64,7 +64,7 @@ def _anchor_groups(context: SampleContext) -> Mapping[str, Sequence[int]]:
         raise UserError(
             "sampler anchors-30 needs training views labelled near and far",
             where="sampler, grouping",
-            expected="labels near and far, and any label for the views between",
+            expected="labels near and far; other views may have any other label",
             found=", ".join(groups) if groups else "no grouping",
             todo="choose --grouping anchors or --grouping terciles",
         )

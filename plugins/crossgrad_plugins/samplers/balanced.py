@@ -124,7 +124,7 @@ class RandomSplit(Sampler):
         views = training_views(context)
         if len(views) < len(HALVES):
             raise UserError(
-                "sampler random-split needs two training views",
+                "sampler random-split needs at least two training views",
                 where="sampler",
                 found=str(len(views)),
                 todo="choose --sampler epoch",

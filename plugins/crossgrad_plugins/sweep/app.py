@@ -164,7 +164,9 @@ class Sweep:
         check_file(path)
         if path.exists():
             raise UserError(
-                "the file is there already", where=path, todo="choose another name, or remove it"
+                "the output file already exists",
+                where=path,
+                todo="choose another name, or remove the file",
             )
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         content, notes = best_grid(self.plan.grid, self.plan.cells, found, path.parent)
@@ -257,10 +259,10 @@ def _grid(request: Request) -> Grid:
         grid = with_scenes(grid, request.scenes)
     if len(set(request.seeds)) < len(request.seeds):
         raise UserError(
-            "a seed stands there twice",
+            "a seed is listed twice",
             where="--seed",
             found=listed(map(str, request.seeds)),
-            todo="name each of them once",
+            todo="list each seed once",
         )
     return grid.model_copy(update={"seeds": tuple(request.seeds)}) if request.seeds else grid
 
@@ -268,10 +270,10 @@ def _grid(request: Request) -> Grid:
 def _refuse_a_second(out: Path) -> None:
     if writer := writer_of(out):
         raise UserError(
-            "another sweep is under way in this folder",
+            "another sweep is running in this folder",
             where=out,
             found=writer,
-            todo="wait until it ends, stop it, or choose another --out; --list shows how far it is",
+            todo="wait until it ends, stop it, or choose another --out; --list shows its progress",
         )
 
 
@@ -283,9 +285,9 @@ def _refuse_what_is_no_sweep(layout: Layout) -> None:
     there = {e.name for e in out.iterdir() if e.name != LOCK and not is_leftover(e)}
     if there and not there & {"settings", "output", "workers", layout.plan.name}:
         raise UserError(
-            "the folder holds something else than a sweep",
+            "the folder contains files that do not belong to a sweep",
             where=out,
-            expected="a new or empty folder, or one that a sweep has begun",
+            expected="a new or empty folder, or the folder of a sweep",
             found=listed(sorted(there)[:4]),
             todo="choose another --out",
         )

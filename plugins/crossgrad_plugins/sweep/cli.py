@@ -88,9 +88,7 @@ def sweep(given: Options) -> None:
     }  # fmt: skip
     asked = [name for name, is_given in looks.items() if is_given]
     if len(asked) > 1:
-        raise UserError(
-            f"{' and '.join(asked)} do not go together", todo="leave all but one of them out"
-        )
+        raise UserError(f"{' and '.join(asked)} cannot be combined", todo="use only one of them")
     read_only = bool(asked)
     announce(quiet=read_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
@@ -98,10 +96,10 @@ def sweep(given: Options) -> None:
 
     if given.engine not in ENGINES:
         raise UserError(
-            f"there is no engine named {given.engine!r}",
+            f"the engine {given.engine!r} is unknown",
             where="--engine",
             expected=", ".join(ENGINES),
-            todo="leave it out to run on this machine",
+            todo="leave --engine out to run on this machine",
         )
     found = Sweep(
         Request(

@@ -94,10 +94,10 @@ def _busy(before: list[int], after: list[int]) -> float:
 
 def _too_many(where: str, expected: str, found: str) -> UserError:
     return UserError(
-        "this machine has not enough cores or memory for that",
+        "this machine does not have enough cores or memory",
         where=where,
         expected=expected,
         found=found,
-        todo="name less; runs that share a core or swap memory take longer than one after another, "
-        "and their seconds mean nothing",
+        todo="lower the number; runs that share a core or swap memory take longer than "
+        "runs one after another, and their times cannot be compared",
     )

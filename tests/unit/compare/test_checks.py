@@ -66,7 +66,7 @@ def test_a_damaged_scene_file_is_refused_or_left_out(tmp_path, content):
     RunFolder().write(tmp_path / "1")
     other = RunFolder(views_per_step=2).write(tmp_path / "2")
     (other / "scene.json").write_text(content)
-    with pytest.raises(UserError, match=r"unreadable scene.json(.|\n)*--skip-broken"):
+    with pytest.raises(UserError, match=r"scene.json cannot be read(.|\n)*--skip-broken"):
         read_runs([tmp_path], skip_broken=False)
     found = read_runs([tmp_path], skip_broken=True)
     assert len(found.runs) == 1 and list(found.left_out) == ["2"]
@@ -86,7 +86,7 @@ def test_a_finished_run_without_its_metrics_is_refused(tmp_path, rows):
     folder = RunFolder().write(tmp_path / "1")
     lines = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     (folder / "metrics.csv").write_text("".join(lines[:1])[: None if rows else 20])
-    with pytest.raises(UserError, match=r"does not go to the end of the run"):
+    with pytest.raises(UserError, match=r"ends before the last step"):
         read_runs([tmp_path], skip_broken=False)
 
 
@@ -114,7 +114,7 @@ def test_runs_without_held_out_photos_are_refused_for_that(tmp_path):
     summary = json.loads(path.read_text())
     summary["overall"] = {"views": 0, "psnr": None, "ssim": None}
     path.write_text(json.dumps(summary))
-    with pytest.raises(UserError, match="none of them held a photo out"):
+    with pytest.raises(UserError, match="no run held out a photo"):
         compared(read_runs([tmp_path], skip_broken=False), Options())
 
 
@@ -200,7 +200,10 @@ def test_runs_with_different_regimes_are_compared_overall_only(tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "match"),
-    [({"metric": "lpips"}, "no run has this figure"), ({"baseline": "x"}, "no arm has this name")],
+    [
+        ({"metric": "lpips"}, "no run has this metric"),
+        ({"baseline": "x"}, "names an arm that does not exist"),
+    ],
 )
 def test_names_that_are_not_there_are_refused(tmp_path, options, match):
     with pytest.raises(UserError, match=match) as error:
@@ -209,7 +212,7 @@ def test_names_that_are_not_there_are_refused(tmp_path, options, match):
 
 
 def test_errors_about_metrics_give_advice_that_works(tmp_path):
-    with pytest.raises(UserError, match="no run has this figure") as lacking:
+    with pytest.raises(UserError, match="no run has this metric") as lacking:
         comparison(tmp_path / "1", RunFolder(), metric="lpips")
     other = RunFolder(views_per_step=2, definitions={"psnr": "of means"})
     with pytest.raises(UserError, match="define psnr differently") as unlike:

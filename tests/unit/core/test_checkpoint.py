@@ -145,14 +145,14 @@ def test_latest_skips_what_is_incomplete(tmp_path: Path):
 def test_a_checkpoint_that_lost_a_file_is_not_passed_over(tmp_path: Path, name: str):
     save(tmp_path, make_checkpoint(100))
     (save(tmp_path, make_checkpoint(200)) / name).unlink()
-    with pytest.raises(UserError, match="damaged checkpoint") as told:
+    with pytest.raises(UserError, match="the checkpoint is damaged") as told:
         load_latest(tmp_path)
     assert told.value.found == f"no {name}" and "goes on from step-000100" in told.value.todo
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "checkpoints"])
 def test_no_checkpoint_is_explained(tmp_path: Path, name: str):
-    with pytest.raises(UserError, match="no checkpoint to continue from"):
+    with pytest.raises(UserError, match="no checkpoint to resume from"):
         latest(tmp_path / name)
 
 
@@ -335,7 +335,7 @@ DAMAGES = {
     "unknown kind": (change_state(tensors=["plugin/a/b/c"]), "plugin/a/b/c"),
     "endless JSON": (
         lambda folder: (folder / "state.json").write_text("[" * 100_000),
-        "within each other",
+        "nested too deeply",
     ),
     "no digest": (replace_in_state('"state_sha256"', '"sha"'), "SHA-256 differs"),
     "another number": (replace_in_state('"views": 1400', '"views": 1401'), "SHA-256 differs"),
@@ -351,7 +351,7 @@ def test_damage_is_found_and_the_earlier_checkpoint_named(tmp_path: Path, name: 
     damage(newer)
     with pytest.raises(UserError, match=message) as told:
         load(newer)
-    assert f"remove it; the run then goes on from {older.name}" in str(told.value)
+    assert f"remove it; the run then continues from {older.name}" in str(told.value)
 
 
 def test_another_format_version_is_refused(tmp_path: Path):
@@ -362,7 +362,7 @@ def test_another_format_version_is_refused(tmp_path: Path):
 
 
 def test_a_missing_checkpoint_is_explained(tmp_path: Path):
-    with pytest.raises(UserError, match="no such checkpoint"):
+    with pytest.raises(UserError, match="the checkpoint does not exist"):
         load(tmp_path / "step-000001")
 
 

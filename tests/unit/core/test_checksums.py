@@ -38,7 +38,7 @@ def test_a_file_that_changed_or_is_gone_is_named(folder):
     assert changed_files(folder) == ["a.txt", "b/ż.txt"]
     with pytest.raises(UserError, match=r"a\.txt is not what was written") as told:
         check_unchanged(folder, ["c.txt", "a.txt"], "restore it")
-    assert told.value.todo == f"restore it; remove {SUMS} to take the file as it is"
+    assert told.value.todo == f"restore it; or remove {SUMS} to accept the file as it is"
     (folder / SUMS).unlink()
     check_unchanged(folder, ["a.txt"], "")
 

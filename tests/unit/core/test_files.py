@@ -48,8 +48,8 @@ def test_an_error_in_the_block_keeps_the_old_file(tmp_path: Path):
     [
         (errno.ENOSPC, "not enough disk space"),
         (errno.EDQUOT, "not enough disk space"),
-        (errno.EACCES, "cannot write here"),
-        (errno.EROFS, "cannot write here"),
+        (errno.EACCES, "cannot write to this path"),
+        (errno.EROFS, "cannot write to this path"),
         (errno.EISDIR, "something else is in the way"),
         (errno.ENOTDIR, "something else is in the way"),
         (errno.EEXIST, "something else is in the way"),

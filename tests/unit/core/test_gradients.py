@@ -376,7 +376,7 @@ def test_an_accumulated_sum_is_gone_once_it_was_divided():
     gradients = accumulation(make_views(2))
     mean = gradients.total(2)
     assert gradients.total(2) is mean
-    with pytest.raises(RuntimeError, match="overwritten by their mean"):
+    with pytest.raises(RuntimeError, match="their mean has overwritten it"):
         gradients.total()
     with pytest.raises(RuntimeError, match="one view more than the 2"):
         gradients.add(make_views(1)[0])

@@ -46,7 +46,7 @@ def test_an_unknown_key_deep_inside_suggests_keys_from_there():
 
 
 def test_a_model_without_options_says_so():
-    assert explained(Empty, {"a": 1}).expected == "no options; it has none"
+    assert explained(Empty, {"a": 1}).expected == "no options: it has none"
 
 
 def test_words_of_a_validator_are_kept():

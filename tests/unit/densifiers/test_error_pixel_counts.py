@@ -282,5 +282,5 @@ def test_screens_without_a_count_are_the_rasterizer_s_fault():
     ctx = context()
     record = replace(recorded(ctx, 0), screen=Screen(torch.ones(40, dtype=torch.int32)))
     method = MultiViewDensityControl(count="running", share=1.0)
-    with pytest.raises(RuntimeError, match="gave none"):
+    with pytest.raises(RuntimeError, match="returned no pixel counts"):
         method.counted(replace(ctx, views=(record,)), PluginState())

@@ -119,7 +119,7 @@ def test_a_growth_request_excludes_rows_that_may_not_grow():
 def test_a_densifier_that_can_only_stand_alone_is_refused_in_the_gate(name):
     with pytest.raises(UserError) as refused:
         build("densifiers", "multiview-gate", {"of": name})
-    assert "can only stand alone" in str(refused.value)
+    assert "cannot be used inside another densifier" in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -169,5 +169,5 @@ class Heedless(AdaptiveDensityControl):
 def test_a_densifier_that_does_not_look_at_the_gate_is_found_out():
     run = DensifierRun.of(MultiViewGate(of=Heedless(), importance=1e9))
     run.take_step(599)
-    with pytest.raises(UserError, match="grows what it may not"):
+    with pytest.raises(UserError, match="grew Gaussians that the gate"):
         run.take_step(600)

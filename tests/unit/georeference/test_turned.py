@@ -182,7 +182,7 @@ def test_left_handed_axes_are_refused():
 
 @pytest.mark.parametrize("code", ["+init=/etc/hostname:1", "file.wkt", "epsg:", "epsg:٣٢٦٣٣", ""])
 def test_only_codes_of_coordinate_systems_are_passed_to_proj(code):
-    with pytest.raises(UserError, match="PROJ cannot compute"):
+    with pytest.raises(UserError, match="PROJ cannot convert"):
         Projection.of(code, "here")
 
 

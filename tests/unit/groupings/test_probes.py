@@ -38,7 +38,7 @@ def test_views_of_nothing_at_all_are_a_user_error():
     view = posed_view((0, 0, 0))
     scene = posed_scene([view], [(0, -5, 0)])
     assert np.isnan(footprint_of(scene, view))
-    with pytest.raises(UserError, match="no SfM point in any training image"):
+    with pytest.raises(UserError, match="no SfM point is visible in a training photo"):
         Footprint().fit(scene, RNG)
 
 

@@ -192,7 +192,7 @@ def test_rows_are_printed_so_that_they_are_read_again_exactly():
     ],
 )
 def test_rows_that_are_no_matrix_are_refused(text):
-    with pytest.raises(UserError, match="no matrix"):
+    with pytest.raises(UserError, match="not a matrix"):
         read_rows(text, torch.float32)
 
 

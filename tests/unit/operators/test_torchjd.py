@@ -160,8 +160,8 @@ def test_adapter_passes_options_and_leaves_the_global_generator_alone(ask):
     [
         ({"weighting": "PCGard"}, "no weighting named"),
         ({"weighting": "GradVac"}, "could not be resumed"),
-        ({"weighting": "MGDA", "options": {"speed": 3}}, "cannot be made"),
-        ({"weighting": "ConstantWeighting"}, "cannot be made"),
+        ({"weighting": "MGDA", "options": {"speed": 3}}, "cannot be created"),
+        ({"weighting": "ConstantWeighting"}, "cannot be created"),
     ],
 )
 def test_adapter_refuses(options, reason, ask):

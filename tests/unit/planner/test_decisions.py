@@ -361,7 +361,7 @@ def test_projection_needs_conflict_beyond_chance_and_pairs(conflict_low, rho_low
 
 
 def test_a_probe_that_fails_decides_nothing():
-    probe = Probe(problem="a probe needs two training views of each group")
+    probe = Probe(problem="a probe needs at least two training views in each group")
     evidence = evidence_of("city_hybrid", probe)
     for part in (grouping.pairs, grouping.operator):
         found = part(evidence)

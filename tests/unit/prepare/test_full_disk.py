@@ -156,7 +156,7 @@ def test_a_ready_scene_that_is_cut_short_says_what_to_do(model, layout, tmp_path
         file.touch()
     check_ours(layout, tmp_path)
     cut(layout.model)
-    with pytest.raises(UserError, match="cut short") as caught:
+    with pytest.raises(UserError, match="incomplete") as caught:
         check_ours(layout, tmp_path)
     assert f"remove {layout.report}" in str(caught.value)
 

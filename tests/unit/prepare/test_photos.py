@@ -207,7 +207,7 @@ def test_a_mask_folder_that_fits_no_photo_is_refused(files, tmp_path):
     (tmp_path / "sky").mkdir()
     for name in files:
         save(tmp_path / "sky" / name, format="PNG")
-    with pytest.raises(UserError, match="no photo has a mask") as caught:
+    with pytest.raises(UserError, match="no mask for any photo") as caught:
         found(tmp_path / "photos", masks=str(tmp_path / "sky"))
     assert "a/1.jpg.png, a/1.png, a/1_mask.png, a/1.jpg" in caught.value.expected
     assert caught.value.found == ("other.png" if files else "no image")
@@ -244,7 +244,7 @@ def test_masks_of_the_photo_as_it_is_shown_are_turned_as_it_is_stored(turn, part
     ("size", "turn"), [((80, 120), 1), ((80, 120), 3), ((120, 90), 6), ((50, 50), 8)]
 )
 def test_masks_that_do_not_fit_are_one_error_at_once(size, turn, tmp_path):
-    with pytest.raises(UserError, match="shape of its photo") as caught:
+    with pytest.raises(UserError, match="aspect ratio of its photo") as caught:
         mask_of(tmp_path, (120, 80), Image.new("L", size), turn)
     assert caught.value.where.endswith("masks/1.png")
 
@@ -314,7 +314,7 @@ def test_photos_whose_names_are_not_text_are_left_out_with_a_reason(tmp_path):
 def test_folders_whose_names_are_no_text_are_one_error(what, tmp_path):
     bad = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     bad.mkdir()
-    with pytest.raises(UserError, match="a name that is no text"):
+    with pytest.raises(UserError, match="not valid text"):
         found(bad) if what == "photos" else found(tmp_path, masks=str(bad))
 
 
@@ -341,10 +341,12 @@ def test_a_photo_that_is_too_large_is_one_error_that_names_it(
     monkeypatch.setattr(
         photos, "_read", lambda root, name, *more: decoded.append(name) or read(root, name, *more)
     )
-    with pytest.raises(UserError, match="too large to be decoded at once") as caught:
+    with pytest.raises(UserError, match="too large to be decoded") as caught:
         found(tmp_path)
     assert caught.value.where == str(tmp_path / name)
-    assert "90 x 70 pixels" in caught.value.found and "save it smaller" in caught.value.todo
+    assert (
+        "90 x 70 pixels" in caught.value.found and "save it at a smaller size" in caught.value.todo
+    )
     assert name not in decoded
 
 

@@ -154,7 +154,7 @@ def test_unusable_photos_are_listed_with_the_reason(report):
     why = {each.name: each.why for each in report.plan.left_out}
     assert set(why) == {"kite/cut.jpg", "phone.HEIC", "kite/icon.png", "mast/z.jpg"}
     assert "the same file as mast/" in why["mast/z.jpg"]
-    assert "cut short" in why["kite/cut.jpg"]
+    assert "incomplete" in why["kite/cut.jpg"]
     assert "save as JPEG" in why["phone.HEIC"]
     assert "too small" in why["kite/icon.png"]
     (lost,) = report.lost
@@ -229,7 +229,7 @@ def test_redoing_the_last_stages_gives_the_same_scene(report, photos, scene):
 
 def test_another_plan_is_refused(report, photos, scene):
     before = content(scene)
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         prepared(photos, scene, Settings(max_size=200))
     assert "max_size was None, now 200" in caught.value.found
     assert content(scene) == before
@@ -269,7 +269,7 @@ def test_other_photos_are_refused_with_the_way_out(copied, photos, tmp_path):
     with changed.open("ab") as file:
         file.write(b"more")
     before = content(copied)
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         prepared(moved, copied, Settings())
     assert f"1 photo gone: kite/{gone.name}; 1 photo changed: " in caught.value.found
     assert content(copied) == before
@@ -306,7 +306,7 @@ def test_a_ready_scene_is_read_without_its_intermediate_files_and_photos(
 def test_new_photos_of_a_ready_scene_are_not_left_out_silently(copied, photos, tmp_path):
     place = shutil.copytree(photos, tmp_path / "photos")
     Image.effect_noise((400, 298), 20).save(place / "kite" / "new.png")
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
     assert caught.value.found == "1 photo new: kite/new.png"
 
@@ -376,13 +376,13 @@ def test_a_run_of_photos_says_what_to_do(photos, capsys):
 @pytest.mark.parametrize(
     ("photos_at", "scene_at", "what"),
     [
-        ("gone", "scene", "there is no such folder"),
-        ("file", "scene", "photos are in a folder"),
-        ("empty", "scene", "no photos in the folder"),
+        ("gone", "scene", "the photo folder does not exist"),
+        ("file", "scene", "must be a folder"),
+        ("empty", "scene", "contains no photos"),
         ("one", "scene", "too few photos"),
-        ("one", "other", "something else than a scene"),
-        ("one", "one/scene", "among the photos"),
-        ("one", "file", "cannot make this folder"),
+        ("one", "other", "do not belong to a scene"),
+        ("one", "one/scene", "inside the photo folder"),
+        ("one", "file", "the folder cannot be created"),
     ],
 )
 def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_at, scene_at, what):
@@ -443,7 +443,7 @@ def test_photos_at_the_root_folder_need_an_output_folder(capsys):
 def test_without_photos_there_is_nothing_to_prepare(given, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert ended("run", *given) == 2
-    assert "there are no photos to prepare" in capsys.readouterr().err
+    assert "--prepare needs a folder of photos" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -456,7 +456,7 @@ def test_photos_that_do_not_fit_together_are_one_error(tmp_path, capfd):
         Image.fromarray(noise).save(tmp_path / "my photos" / f"{number}.png")
     assert ended("prepare", tmp_path / "my photos", tmp_path / "scene") == 2
     told = capfd.readouterr().err
-    assert "no photos fit together" in told
+    assert "no photos match well enough" in told
     assert "3 photos; 0 pairs of them match" in told
     assert "sfm.cc" not in told
 
@@ -470,10 +470,10 @@ def test_unknown_choices_are_refused(option, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        (("--lens", "monocle"), "no such camera model"),
+        (("--lens", "monocle"), "camera model is unknown"),
         (("--lens", "equirectangular"), "cut them into perspective photos"),
         (("--matching", "spatial"), "no GPS"),
-        (("--masks", "gone"), "mask folder is not there"),
+        (("--masks", "gone"), "mask folder does not exist"),
         ((), "no features"),
     ],
 )

@@ -45,7 +45,7 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
         pytest.skip("it is as it was, or not there")
     wrong = replace(some, **{field: change(tensor)})
     if field == "means":  # They count the Gaussians, so that the first other one is named.
-        with pytest.raises(UserError, match="these Gaussians cannot be drawn"):
+        with pytest.raises(UserError, match="cannot be rendered"):
             drawn(wrong)
         return
     with pytest.raises(UserError) as refused:

@@ -21,7 +21,7 @@ def forms(tmp_path):
 def test_two_readers_for_one_folder_are_an_error_that_names_the_option(forms):
     path = forms["nerfstudio"]
     shutil.copytree(forms["colmap"] / "sparse", path / "colmap" / "sparse")
-    with pytest.raises(UserError, match="several ways") as caught:
+    with pytest.raises(UserError, match="files of several formats") as caught:
         read_scene(RunConfig(scene=path), path)
     assert caught.value.found == "files of the readers colmap, nerfstudio"
     assert "--reader colmap" in caught.value.todo

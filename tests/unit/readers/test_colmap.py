@@ -249,7 +249,7 @@ class TestPhotos:
         (path / "images").mkdir()
         shutil.copytree(path / "moved", path / "images" / "cam1")
         (path / "moved").rename(path / "images" / "cam0")
-        refuses(path, "no posed image has a photo", "0000.png", "cam0/0000.png")
+        refuses(path, "no photo was found for any image of the model", "0000.png", "cam0/0000.png")
 
     def test_a_scene_without_photo_folder_is_refused(self, make):
         path = make()
@@ -269,7 +269,7 @@ class TestPhotos:
         path = make("jpeg")
         photo = path / "images" / "0005.jpg"
         photo.write_bytes(photo.read_bytes()[: int(photo.stat().st_size * share)])
-        refuses(path, "cut short", photo)
+        refuses(path, "incomplete", photo)
 
     def test_a_photo_damaged_within_is_named_when_it_is_decoded(self, make):
         path = make()
@@ -319,7 +319,7 @@ class TestPhotos:
     def test_a_photo_of_another_shape_is_refused(self, make):
         path = make()
         Image.new("RGB", (40, 32)).save(path / "images" / "0002.png")
-        refuses(path, "does not have the shape of its camera", "0002.png", "48 x 32", "40 x 32")
+        refuses(path, "aspect ratio of its camera", "0002.png", "48 x 32", "40 x 32")
 
     def test_exif_rotation_counts_only_where_the_camera_says_so(self, make):
         path = make("jpeg")
@@ -380,11 +380,11 @@ class TestPhotos:
 
     def test_masks_that_fit_nothing_are_refused(self, make):
         path = make()
-        refuses(path, "mask folder is not there", "mine", masks=Path("mine"))
+        refuses(path, "mask folder does not exist", "mine", masks=Path("mine"))
         (path / "mine").mkdir()
-        refuses(path, "no photo has a mask", "0000.png.png", masks=path / "mine")
+        refuses(path, "no mask for any photo", "0000.png.png", masks=path / "mine")
         Image.new("L", (48, 48)).save(path / "mine" / "0002.png")
-        refuses(path, "a mask does not have the shape", "48 x 48", masks=path / "mine")
+        refuses(path, "the aspect ratio of a mask", "48 x 48", masks=path / "mine")
 
     def test_photos_beyond_the_memory_are_announced(self, tmp_path):
         path = write_tiny_scene(tmp_path, views=2)
@@ -428,14 +428,14 @@ class TestModels:
 
     def test_a_path_into_a_scene_is_refused(self, make):
         path = make()
-        refuses(model(path), "leads into a scene", f"try {path}")
-        refuses(path / "sparse", "leads into a scene", f"try {path}")
+        refuses(model(path), "a folder inside a scene", f"try {path}")
+        refuses(path / "sparse", "a folder inside a scene", f"try {path}")
 
     def test_paths_that_are_no_scene(self, make):
         path = make()
-        refuses(path.parent / "plane", "not there", f"did you mean {path}?")
-        refuses(path.parent / "zzz" / "q", "not there", "check the path")
-        refuses(path / "images" / "0000.png", "a scene is a folder, not a file")
+        refuses(path.parent / "plane", "does not exist", f"did you mean {path}?")
+        refuses(path.parent / "zzz" / "q", "does not exist", "check the path")
+        refuses(path / "images" / "0000.png", "the scene must be a folder, not a file")
 
     def test_a_folder_that_may_not_be_listed(self, make, monkeypatch):
         path = make()
@@ -464,20 +464,20 @@ class TestModels:
         path = make()
         content = (model(path) / file).read_bytes()
         (model(path) / file).write_bytes(content[:size])
-        refuses(path, "cut short", file)
+        refuses(path, "incomplete", file)
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
     def test_files_of_random_bytes_are_refused(self, make, file):
         path = make()
         (model(path) / file).write_bytes(np.random.default_rng(0).bytes(3000))
-        refuses(path, "cut short", file)
+        refuses(path, "incomplete", file)
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
     def test_files_with_data_after_the_last_record_are_refused(self, make, file):
         path = make()
         with (model(path) / file).open("ab") as end:
             end.write(b"\0" * 9)
-        refuses(path, "goes on behind its last record", file)
+        refuses(path, "continues after its last record", file)
 
     @pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
     @pytest.mark.parametrize("text", ["hello world\nfoo bar\n", "1 PINHOLE 48"])
@@ -494,7 +494,7 @@ class TestModels:
     def test_an_image_without_camera_is_refused(self, make):
         path = make()
         patch(model(path) / "cameras.bin", 8, struct.pack("<I", 7))
-        refuses(path, "has no camera", "[7]", "camera id 1")
+        refuses(path, "is missing in the model", "[7]", "camera id 1")
 
     def test_a_spherical_camera_is_refused(self, make):
         path = make()
@@ -506,8 +506,8 @@ class TestModels:
         ("params", "words"),
         [
             ((np.nan, 57.0, 24.0, 16.0), "not a finite number"),
-            ((-3.0, 57.0, 24.0, 16.0), "focal length is not positive"),
-            ((57.0, 0.0, 24.0, 16.0), "focal length is not positive"),
+            ((-3.0, 57.0, 24.0, 16.0), "focal length of a camera is not positive"),
+            ((57.0, 0.0, 24.0, 16.0), "focal length of a camera is not positive"),
         ],
     )
     def test_impossible_cameras_are_refused(self, make, params, words):
@@ -519,13 +519,13 @@ class TestModels:
     def test_poses_that_are_not_finite_are_refused(self, make, pose):
         path = make()
         patch(model(path) / "images.bin", 12, struct.pack(f"<{len(pose)}d", *pose))
-        refuses(path, "a pose is not finite", "0000.png")
+        refuses(path, "a pose contains numbers that are not finite", "0000.png")
 
     def test_two_poses_of_one_name_are_refused(self, make):
         path = make()
         content = (model(path) / "images.bin").read_bytes()
         (model(path) / "images.bin").write_bytes(content.replace(b"0001.png", b"0002.png"))
-        refuses(path, "several poses belong to one image name", "0002.png")
+        refuses(path, "several images of the model have the same name", "0002.png")
 
     @pytest.mark.parametrize("name", [b"../a.png", b"/etc/a.p"])
     def test_names_outside_the_image_folder_are_refused(self, make, name):
@@ -543,7 +543,7 @@ class TestModels:
     def test_a_model_without_images_is_refused(self, make):
         path = make()
         (model(path) / "images.bin").write_bytes(struct.pack("<Q", 0))
-        refuses(path, "no posed image", "registered")
+        refuses(path, "no image with a pose", "registered")
 
     @pytest.mark.parametrize("missing", [False, True])
     def test_a_scene_may_have_no_points(self, make, missing):

@@ -68,7 +68,7 @@ def test_the_coordinates_of_the_chunk_can_be_chosen(path):
 
 def test_points_of_the_other_frame_are_refused_with_the_option(path):
     edit(path, r"<translation>.*?<", "<translation>9e3 0.0 0.0<")
-    with pytest.raises(metashape.UserError, match="lie in no photo") as caught:
+    with pytest.raises(metashape.UserError, match="no photo shows the SfM points") as caught:
         read(path)
     assert "--set reader.frame=chunk" in caught.value.todo
 

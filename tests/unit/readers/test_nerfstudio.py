@@ -190,7 +190,7 @@ def test_lists_may_leave_out_suffixes_as_frames_may(tmp_path):
         ),
         (
             {"train": ["images/a.png"], "test": ["images/a"]},
-            "for training and for testing",
+            "for both training and testing",
             "transforms.json: train_filenames and test_filenames",
         ),
     ],
@@ -213,7 +213,7 @@ def test_photos_of_all_training_views_that_are_missing_are_no_fault_of_a_list_of
     with pytest.raises(UserError, match="no listed view can be trained on") as caught:
         read(path, split="auto")
     assert caught.value.where == str(path)
-    assert "add the photos" in caught.value.todo
+    assert "add the missing photos" in caught.value.todo
 
 
 def test_an_applied_transform_is_undone(tmp_path):

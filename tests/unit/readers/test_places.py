@@ -182,7 +182,7 @@ def test_below_the_sea_and_in_the_west_and_south(tmp_path, plain):
 def test_photos_as_the_camera_wrote_them_tell_in_place_of_their_copies(with_gps, plain):
     scene = read(plain, gps=str(with_gps / "images"))
     assert_in_place(scene, 1e-4)
-    with pytest.raises(UserError, match="is not there"):
+    with pytest.raises(UserError, match="does not exist"):
         read(plain, gps=str(plain / "nowhere"))
     for path in (plain / "images", plain / "sparse"):
         found = read(plain, gps=str(path))
@@ -241,7 +241,8 @@ def test_a_list_comes_before_the_photos_and_a_bad_one_is_left_out_with_a_note(sc
     found = read(scene)
     assert "GPS of the photos" in found.georeference.note
     assert any(
-        "geo.txt tells no places: the list of places cannot be read" in n for n in found.notes
+        "geo.txt tells no places: the list of photo positions cannot be read" in n
+        for n in found.notes
     )
     with pytest.raises(UserError, match="line 2") as caught:
         read(scene, gps=str(scene / "geo.txt"))
@@ -255,7 +256,7 @@ def test_a_list_comes_before_the_photos_and_a_bad_one_is_left_out_with_a_note(sc
 )
 def test_a_list_in_no_known_system_is_refused_when_named(scene, system):
     (scene / "mine.txt").write_text(geo_list(scene, system, in_degrees))
-    with pytest.raises(UserError, match="PROJ cannot compute"):
+    with pytest.raises(UserError, match="PROJ cannot convert"):
         read(scene, gps=str(scene / "mine.txt"))
 
 
@@ -333,7 +334,7 @@ def test_a_database_that_makes_long_texts_of_short_ones_is_refused(tmp_path):
         "CREATE TABLE pose_priors (image_id, position, coordinate_system)",
         "INSERT INTO images VALUES (1)",
     )
-    with pytest.raises(UserError, match="database of COLMAP cannot be read") as caught:
+    with pytest.raises(UserError, match="COLMAP database cannot be read") as caught:
         of_priors(path, ["a.jpg"])
     assert "too big" in caught.value.found
 
@@ -410,9 +411,9 @@ def test_poses_in_a_coordinate_system_are_placed_by_its_code(scene, code, conver
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"crs": "epsg:4978"}, "is not where its coordinate system is"),
-        ({"crs": "epsg:1"}, "PROJ cannot compute"),
-        ({"crs": "epsg:4978", "gps": "."}, "leaves nothing for GPS to tell"),
+        ({"crs": "epsg:4978"}, "outside the area of their coordinate system"),
+        ({"crs": "epsg:1"}, "PROJ cannot convert"),
+        ({"crs": "epsg:4978", "gps": "."}, "cannot be combined"),
     ],
 )
 def test_a_coordinate_system_that_cannot_be_is_refused(plain, options, what):

@@ -304,7 +304,7 @@ def test_a_size_may_be_left_out(options, text):
 
 
 def test_sizes_out_of_order_are_refused():
-    with pytest.raises(UserError, match="half_until must not be less"):
+    with pytest.raises(UserError, match="half_until must be at least"):
         build("resolutions", "octaves", {"quarter_until": 0.5, "half_until": 0.3})
 
 

@@ -151,5 +151,5 @@ def test_another_file_is_no_panel(tmp_path: Path, content: bytes | None):
     Image.new("RGB", (200, 10)).save(path)
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(UserError, match="unreadable panel"):
+    with pytest.raises(UserError, match="a panel image cannot be read"):
         read_panel(path)

@@ -310,7 +310,7 @@ def test_an_average_of_other_primitives_is_refused():
     setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
     state.commit({NAME: PluginState({"count": 2}, {}, {"means": torch.zeros(1, 3)})})
-    with pytest.raises(UserError, match="does not fit the run"):
+    with pytest.raises(UserError, match="does not match the run"):
         from_checkpoint(setup, to_checkpoint(state))
 
 

@@ -210,7 +210,7 @@ def test_photos_that_cannot_be_decoded_are_named_and_left_out(tmp_path, damaged)
 
 def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(contradictions, model):
     wrong = contradictions.KINDS["OpenGL axes"](model, np.random.default_rng(0)).model.scene()
-    with pytest.raises(UserError, match="the scene contradicts itself") as error:
+    with pytest.raises(UserError, match="do not match its poses and points") as error:
         checked(wrong, Path("scene"), cache_mib=1280)
     assert "OpenGL axes" in error.value.found
     assert "--accept-scene" in error.value.todo

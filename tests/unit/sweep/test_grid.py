@@ -92,12 +92,12 @@ WRONG = {
     "parameters: {rate: [1, 2]}": "must be `values: [...]`",
     "parameters: {rate: {values: []}}": "parameters.rate.values: should not be empty, not []",
     "parameters: {rate: {values: sum}}": "parameters.rate.values: should be a list, not 'sum'",
-    "name: ../esc": "name: is the name of a folder below runs/sweeps",
+    "name: ../esc": "name: must be the name of a folder below runs/sweeps",
     "name: ..": "name: is the name of a folder",
     "name: ''": "name: is the name of a folder",
     "parameters: {rate: {values: [1], value: 2}}": "exactly one of",
-    "base: {out: x}": "base.out: is not for a grid to set",
-    "base: {threads: 2}": "say --threads",
+    "base: {out: x}": "base.out: cannot be set by a grid",
+    "base: {threads: 2}": "use --threads",
     "parameters: {stop_after: {value: 3}}": "parameters.stop_after",
     "arms: [{name: a, settings: {seed: 1}}]": "list it in seeds",
     "base: {scene: x}": "list it in scenes",
@@ -107,7 +107,7 @@ WRONG = {
     "seeds: [-1]": "seeds.0",
     "scenes: [x/a, y/a]": "two are named 'a'",
     "scenes: [town]\narms: [{name: a, by_scene: {towm: {}}}]": "did you mean 'town'?",
-    "seeds: [1]\nparameters: {seed: {values: [1]}}": "must be said once",
+    "seeds: [1]\nparameters: {seed: {values: [1]}}": "may be given only once",
 }
 
 
@@ -150,9 +150,9 @@ def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
         (("--set", "seed=7"), "say --seed"),
         (("--set", "scene=there"), "say --scene"),
         (("--set", "stop_after=2"), "to their ends"),
-        (("--set", " threads =2"), "say --threads"),
+        (("--set", " threads =2"), "use --threads"),
         (("--set", "out=there"), "--set out"),
-        (("--seed", "3", "--seed", "3"), "a seed stands there twice"),
+        (("--seed", "3", "--seed", "3"), "a seed is listed twice"),
         (("--list", "--best", "best.yaml"), "--list and --best do not go together"),
         (("--dry-run", "--list"), "--dry-run and --list do not go together"),
     ],
@@ -192,5 +192,5 @@ def test_a_few_lines_that_stand_for_too_many_runs_are_refused(tmp_path):
 def test_two_configurations_of_one_name_are_refused(tmp_path, text):
     path = tmp_path / "grid.yaml"
     path.write_text(text)
-    with pytest.raises(UserError, match="two configurations are called"):
+    with pytest.raises(UserError, match="two configurations have the name"):
         read_grid(path)

@@ -141,7 +141,7 @@ def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
 def test_another_table_in_its_place_is_kept(tmp_path):
     layout = Layout(tmp_path)
     layout.plan.write_text("arm,scene\nmine,city\n")
-    with pytest.raises(UserError, match="none that a sweep wrote"):
+    with pytest.raises(UserError, match="not written by a sweep"):
         write_plan(layout, JOBS[:2])
     assert layout.plan.read_text() == "arm,scene\nmine,city\n"
 

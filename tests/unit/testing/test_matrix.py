@@ -64,7 +64,7 @@ def test_a_component_that_everything_refuses_fails(monkeypatch):
 
 
 def test_an_unknown_combination_is_refused(mine):
-    with pytest.raises(UserError, match="this is no combination"):
+    with pytest.raises(UserError, match="does not name a combination"):
         report.train_one("mine", "sampler=epoch operator=no-such-operator")
 
 

@@ -182,7 +182,7 @@ def test_a_class_that_inherits_has_no_axes_unless_it_says_so():
     assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
     assert axes_of(with_backbone(Round())) is None
     first_state(with_backbone(Round()))
-    with pytest.raises(UserError, match="are none of Gaussians") as caught:
+    with pytest.raises(UserError, match="do not have the shapes of Gaussians") as caught:
         first_state(with_backbone(RoundWithAxes()))
     assert "(40, 1)" in caught.value.found
 
@@ -259,5 +259,5 @@ def test_a_setting_that_a_checkpoint_does_not_know_counts_as_unchanged():
     with pytest.raises(UserError, match=r"grouping\.name"):
         check_settings(given, checkpoint)
     stored["seed"] = 5
-    with pytest.raises(UserError, match=r"config\.yaml was changed"):
+    with pytest.raises(UserError, match=r"settings in config\.yaml have changed"):
         check_settings(config, checkpoint)

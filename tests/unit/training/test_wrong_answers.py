@@ -73,7 +73,7 @@ def of_slot(slot, name, method, answer):
 )
 def test_an_answer_without_its_state_names_the_method(word, slot, name, method, answer):
     error = refused(setup_of({word: of_slot(slot, name, method, answer)}))
-    assert f"Wrong.{method} gave a wrong answer" in error.what
+    assert f"Wrong.{method} returned a value of a wrong type" in error.what
     assert __name__ in error.where
     assert error.expected.startswith("a pair: ")
 
@@ -81,14 +81,14 @@ def test_an_answer_without_its_state_names_the_method(word, slot, name, method, 
 @pytest.mark.parametrize("answer", [None, (1, 2)])
 def test_decode_must_return_gaussians(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "decode", answer)}))
-    assert "Wrong.decode gave a wrong answer" in error.what
+    assert "Wrong.decode returned a value of a wrong type" in error.what
     assert error.expected == "Gaussians"
 
 
 @pytest.mark.parametrize("answer", [None, 3, (1, 2)])
 def test_what_a_backbone_creates_are_tensors(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
-    assert "Wrong.create gave a wrong answer" in error.what
+    assert "Wrong.create returned a value of a wrong type" in error.what
 
 
 @pytest.mark.parametrize("answer", [{}, {"moans": torch.zeros(3, 3)}, {"means": None}])
@@ -125,7 +125,7 @@ def test_more_points_must_return_points(answer):
     error = refused(
         setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
     )
-    assert "Wrong.more_points gave a wrong answer" in error.what
+    assert "Wrong.more_points returned a value of a wrong type" in error.what
     assert error.expected == "MorePoints"
 
 
@@ -146,14 +146,16 @@ def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, 
         return wrong if kind is base else original(kind, choice)
 
     monkeypatch.setattr(selecting, "chosen", built)
-    with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
+    with pytest.raises(UserError, match=r"Wrong\.fitted_to returned a value of a wrong type"):
         assemble(RunConfig(steps=10), sample_scene(), "none")
 
 
 @pytest.mark.parametrize("scales", ["a", (None,), ()])
 def test_scales_are_numbers(scales):
     wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
-    assert refused(setup_of({"resolution": wrong})).what.startswith("the resolution does not give")
+    assert refused(setup_of({"resolution": wrong})).what.startswith(
+        "the resolution returned a wrong scale"
+    )
 
 
 @pytest.mark.parametrize("shape", [(2,), (6, 3), (5, 2), ()])
@@ -285,7 +287,7 @@ def test_an_edit_that_does_not_fit_says_how(edit, found):
     setup = setup_of(stranger=Answers(DensifyResult(edit)))
     state = first_state(setup)
     assert state.primitives(setup) == 40
-    with pytest.raises(UserError, match="does not fit the primitives") as caught:
+    with pytest.raises(UserError, match="does not match the Gaussians") as caught:
         take_step(setup, state)
     assert found in caught.value.found
 
@@ -331,7 +333,7 @@ def with_means(means):
 )
 def test_aggregated_gradients_fit_the_parameters(plugin, found):
     error = refused(setup_of(wrapping=plugin))
-    assert error.what == "the aggregated gradients do not fit the parameters"
+    assert error.what == "the aggregated gradients do not match the parameters"
     assert "operator sum" in error.where
     assert found in error.found
 
@@ -355,7 +357,7 @@ def labelled(labels):
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
 def test_labels_are_one_text_for_each_view(labels):
     error = refused(setup_of({"sampler": labelled(labels)}))
-    assert error.what == "the sampler does not label each view that it draws"
+    assert error.what == "the sampler returned a wrong number of labels"
     assert "sampler epoch" in error.where
 
 
@@ -422,7 +424,7 @@ def test_a_state_without_a_row_for_each_primitive_names_its_plugin(rows):
     edit = Edit(source=torch.arange(40))
     plugin = Answers(DensifyResult(edit, states={"stranger": held}))
     error = refused(setup_of(stranger=plugin))
-    assert error.what == "the state of plugin stranger does not fit the primitives"
+    assert error.what == "the state of plugin stranger does not match the Gaussians"
     assert error.found == f"shape {list(rows.shape)}"
 
 

@@ -55,7 +55,9 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
     gaussians = record.gaussians
     origin, slot = gaussians.origin, gaussians.slot
     if origin is None or slot is None:
-        raise RuntimeError("the backbone does not say which offset a Gaussian comes from")
+        raise RuntimeError(
+            "the backbone returned Gaussians without the offsets that they come from"
+        )
     views = totals[VIEWS]
     views += 1.0 if gaussians.decoded is None else gaussians.decoded
     totals[OPACITY].index_add_(0, origin, gaussians.opacities.clamp(min=0.0))

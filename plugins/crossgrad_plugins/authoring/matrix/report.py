@@ -119,11 +119,11 @@ def train_one(package: str, combination: str) -> None:
     known = all(len(pair) == 2 and pair[1] in members.names.get(pair[0], ()) for pair in pairs)  # noqa: PLR2004
     if not known or slots[: len(SLOTS)] != SLOTS or not set(slots[len(SLOTS) :]) <= {*FURTHER}:
         raise UserError(
-            "this is no combination",
+            "the text does not name a combination of components",
             where="--only",
             expected=f"{' '.join(f'{slot}=NAME' for slot in SLOTS)}, as the report shows it",
             found=combination,
-            todo="copy one from the report of the matrix",
+            todo="copy a combination from the report of the matrix",
         )
     try_out(config_of(tuple(pair[1] for pair in pairs), slots), STEPS)
 

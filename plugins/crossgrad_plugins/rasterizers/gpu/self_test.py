@@ -128,6 +128,7 @@ def _refused(rasterizer: Rasterizer, what: str, found: str) -> UserError:
         where="--rasterizer, before the first step",
         expected="the image, loss and gradients of rasterizer torch",
         found=found,
-        todo="run the command once more, as first processes on a fresh machine are known to fail; "
-        "if it stays, install packages that fit torch's CUDA version, or use --rasterizer torch",
+        todo="run the command again, because the first process on a fresh machine can "
+        "fail; if it fails again, install packages that match torch's CUDA version, "
+        "or use --rasterizer torch",
     )

@@ -94,7 +94,7 @@ class _Lines:
             where=f"{self.path}, line {self._number}",
             expected=expected,
             found=line.decode("utf-8", errors="replace"),
-            todo="mend the line, or export the model again",
+            todo="correct the line, or export the model again",
         )
 
 

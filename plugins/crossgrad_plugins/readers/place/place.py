@@ -114,9 +114,9 @@ def _named(path: Path, names: list[str]) -> Measured:
         return of_headers({name: path / name for name in names}, f"GPS of the photos in {path}")
     if not is_file(path):
         raise UserError(
-            "what tells the places of photos is not there",
+            "the file or folder with the photo positions does not exist",
             where=f"reader.gps={path}",
-            expected="a folder with the photos as they were taken, or a list as geo.txt",
+            expected="a folder with the original photos, or a list such as geo.txt",
             todo="check the path",
         )
     from crossgrad_plugins.readers.place.files import of_list
@@ -181,11 +181,11 @@ def by_code(scene: Scene, code: str) -> Scene:
     origin = place_at(point) if np.isfinite(point).all() else None
     if origin is None:
         raise UserError(
-            "the scene is not where its coordinate system is",
+            "the cameras are outside the area of their coordinate system",
             where=where,
             expected="cameras on Earth",
-            found=f"their middle at {', '.join(f'{value:.6g}' for value in middle)}",
-            todo="check the code, and that the poses are in it",
+            found=f"the centre of the cameras at {', '.join(f'{value:.6g}' for value in middle)}",
+            todo="check the code, and check that the poses use this coordinate system",
         )
     frame = projection.near(origin.to_enu, np.zeros(3), where).inverse
     source = f"its coordinates in {code.upper()}"
