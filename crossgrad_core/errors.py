@@ -65,4 +65,4 @@ class RunFailedError(Exception):
 
     def __init__(self, folder: Path, error: str) -> None:
         self.folder = folder
-        super().__init__(f"{error}\nwhat there is is kept in {folder}")
+        super().__init__(f"{error}\nthe files that the run wrote are in {folder}")

@@ -105,7 +105,8 @@ BAD_INPUT = 2
 app = typer.Typer(
     name="crossgrad",
     cls=WithPlugins,
-    help="Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts.",
+    help="Train 3D Gaussian Splatting from photos of hybrid captures, with "
+    "exchangeable components.",
     epilog=f"Example: crossgrad run SCENE --sampler {GROUP_SAMPLER} --operator {EXAMPLE_OPERATOR}",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

@@ -242,7 +242,7 @@ def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Te
     rows = {name for block in blocks if block.per_primitive for name in block.tensors}
     for name, new in edit.values.items():
         if name not in rows:
-            return f"there is no tensor {name!r} with a row for each primitive"
+            return f"there is no tensor {name!r} with one row per Gaussian"
         if wrong := _no_values(new, after, parameters[name].shape[1:]):
             return f"values of {name}: {wrong}"
     return ""
@@ -255,11 +255,11 @@ def _no_set(edit: Edit, before: int) -> str:
         return f"source is {wrong}"
     after = before if source is None else len(source)
     if source is not None and after and not 0 <= int(source.min()) <= int(source.max()) < before:
-        return f"source leaves 0 to {before - 1}"
+        return f"source contains indices outside 0 to {before - 1}"
     if fresh is not None and (wrong := _no_list(fresh, torch.bool)):
         return f"fresh is {wrong}"
     if fresh is not None and len(fresh) != after:
-        return f"fresh has {len(fresh)} rows of {after}"
+        return f"fresh has {len(fresh)} rows, but there are {after} Gaussians"
     return ""
 
 
@@ -280,7 +280,7 @@ def _no_values(new: object, count: int, width: torch.Size) -> str:
             return f"rows are {wrong}"
         # On a GPU this check would wait for the device.
         if new.rows.is_cpu and ((new.rows < 0) | (new.rows >= count)).any():
-            return f"rows leave 0 to {count - 1}"
+            return f"rows contain indices outside 0 to {count - 1}"
         count = len(new.rows)
     shape = (count, *width)
     return "" if _fits(new.values, shape) else f"{list(new.values.shape)}, not {list(shape)}"

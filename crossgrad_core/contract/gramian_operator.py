@@ -67,7 +67,7 @@ class GramianOperator(MatrixOperator):
 
     sparse_rows: ClassVar[bool] = True
 
-    granularity: Granularity = Field("block", description="what one Gramian covers")
+    granularity: Granularity = Field("block", description="tensors that one Gramian covers")
 
     def reads_gramians(self) -> bool:
         """Return True if the result depends on the Gramians; if not, granularity has no effect."""

@@ -93,7 +93,7 @@ class Unplaced:
         why: What is missing.
     """
 
-    why: str = "neither its files nor its photos tell where on Earth it is"
+    why: str = "neither the scene files nor the photos contain a position on Earth"
 
     @property
     def note(self) -> str:

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from typing_extensions import override
 
-_FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1..2@0.5"
+_FORM: Final = "must be a number of at least 1, or A..B@SHARE[..C@SHARE], such as 1..2@0.5"
 
 
 @dataclass(frozen=True)

@@ -323,7 +323,11 @@ def _identity(distribution: "Distribution | None") -> tuple[str, str]:
 def _unknown(slot: str, name: str) -> UserError:
     names = list(entries(slot))
     elsewhere = [other for other in GROUPS if other != slot and name in entries(other)]
-    hint = f"{name} is a {singular(elsewhere[0])}" if elsewhere else did_you_mean(name, names)
+    hint = (
+        f"a component with the name {name} exists in the slot {singular(elsewhere[0])}"
+        if elsewhere
+        else did_you_mean(name, names)
+    )
     for stray in strays():
         if stray.name == name:
             hint = f"{stray.origin} offers {name}, but {stray.reason}"

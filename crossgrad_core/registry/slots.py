@@ -82,7 +82,7 @@ class Stray:
     def reason(self) -> str:
         """The reason why it is not read, and what to do."""
         right = f"write {self.meant}" if self.meant else f"the groups are {', '.join(_KNOWN)}"
-        return f"there is no entry-point group {self.group}: {right}"
+        return f"the entry-point group {self.group} does not exist: {right}"
 
 
 def strays() -> Iterator[Stray]:

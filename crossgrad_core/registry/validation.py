@@ -105,11 +105,11 @@ def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, obje
 
 def _expected(detail: ErrorDetails) -> str:
     if detail["type"] == "missing":
-        return "a value; there is no default"
+        return "a value, because there is no default"
     if detail["type"] in {"model_type", "dict_type"}:
-        return "an object with names and values"
+        return "a mapping of names to values"
     if detail["type"] == "too_short":
-        return f"at least {detail.get('ctx', {}).get('min_length')} of them"
+        return f"at least {detail.get('ctx', {}).get('min_length')} entries"
     text = detail["msg"]
     for prefix in _PREFIXES:
         text = text.removeprefix(prefix)

@@ -335,7 +335,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     setup = redecided(replace(setup, config=config, pixel_share=share), steps)
     schedule = schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, schedule=schedule)
-    idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
+    idle = [f"{name} has no effect: {why}" for name, why in without_resets(config, setup)]
     told = (
         note,
         *notes_on_length(setup),
@@ -368,8 +368,8 @@ def _held(folder: Path) -> Iterator[None]:
     with locked(folder, "training") as held:
         if not held:
             _LOG.warning(
-                "the file system of %s has no locks; nothing keeps a second process from writing "
-                "into it",
+                "the file system of %s does not support locks, so that nothing prevents a "
+                "second process from writing to it",
                 folder,
             )
         clear_half_written(folder)
@@ -477,7 +477,7 @@ def _print_dry_run(setup: Setup) -> None:
     for note in (*short_lines(setup.decisions), *setup.notes):
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
-    print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
+    print(f"# the run would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
 
 
 @contextmanager

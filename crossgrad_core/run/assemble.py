@@ -54,10 +54,14 @@ def idle_note(setup: Setup) -> tuple[str, ...]:
         return ()
     sampler = selection.names["sampler"]
     more = next((k for k in (2, 3) if selection.sampler.view_counts.admits(k)), None)
-    way_out = f"--views {more}" if more else f"a sampler other than {sampler} as it is set"
+    way_out = (
+        f"--views {more}" if more else f"another sampler than {sampler} with its present options"
+    )
     return (
-        f"operator {name} does nothing at K = {views}: a step has one gradient, which it leaves as "
-        f"it is; {way_out} gives it more",
+        (
+            f"operator {name} has no effect at K = {views}, because a step has only one "
+            f"gradient; {way_out} gives it more views"
+        ),
     )
 
 
@@ -123,7 +127,9 @@ def _answer(name: str, question: Callable[[], bool]) -> bool:
     try:
         return question()
     except Exception as error:
-        _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
+        _LOG.warning(
+            "reader %s cannot be used: %s", name, getattr(error, "what", in_one_line(error))
+        )
         return False
 
 
@@ -285,12 +291,12 @@ def reasons_against(
     reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
         reasons.append(
-            f"--backward joint makes one gradient of all views, but operator "
-            f"{selection.names['operator']} needs them apart"
+            "--backward joint computes only the sum of the views' gradients, but "
+            f"operator {selection.names['operator']} needs the gradient of each view"
         )
     views = selection.views_per_step
     if config.batch_rule == "sqrt" and views > MOST_VIEWS:
-        reasons.append(f"--batch-rule sqrt has a meaning for K <= {MOST_VIEWS}; K is {views}")
+        reasons.append(f"--batch-rule sqrt supports at most K = {MOST_VIEWS} views; K is {views}")
     return tuple(sorted(set(reasons)))
 
 
@@ -315,6 +321,14 @@ def _linear_note(setup: Setup) -> tuple[str, ...]:
         return ()
     if setup.watchers:
         return (
-            f"gradients of single views kept apart for {', '.join(setup.watchers)} (same bits)",
+            (
+                f"gradients of single views are stored for {', '.join(setup.watchers)} (the "
+                "result has the same bits)"
+            ),
         )
-    return (f"no separate gradients: operator {name} is linear, the backward passes accumulate",)
+    return (
+        (
+            f"gradients of single views are not stored: operator {name} is linear, so the "
+            "backward passes accumulate their sum"
+        ),
+    )

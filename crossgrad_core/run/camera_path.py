@@ -28,7 +28,7 @@ FRAMES: Final = 120
 FEWEST_SEEN: Final = 8
 #: With more views than this, the ends of a zoom path are chosen from an even sample of this size.
 MOST_VIEWS: Final = 500
-_TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
+_TODO: Final = "write the file with nerfstudio's viewer, or as described in docs/runs.md"
 #: Longer paths are refused as a mistake.
 MOST_FRAMES: Final = 100_000
 _Floats = NDArray[np.float64]
@@ -227,11 +227,11 @@ def checked_camera(camera: object) -> Camera:
         UserError: It is not a camera, or one of its numbers is not valid for a camera.
     """
     if not isinstance(camera, Camera):
-        raise _refused("a view's name or a camera", f"{type(camera).__name__}")
+        raise _refused("the name of a view, or a camera", f"{type(camera).__name__}")
     sides = {"width": camera.width, "height": camera.height}
     for name, side in sides.items():
         if not isinstance(side, Integral) or isinstance(side, bool) or side < 1:
-            raise _refused(f"a {name} of 1 pixel or more", repr(side))
+            raise _refused(f"a {name} of at least 1 pixel", repr(side))
     for name in ("fx", "fy", "cx", "cy"):
         value, focal = getattr(camera, name), name in {"fx", "fy"}
         known = isinstance(value, Real) and isfinite(value)
@@ -240,7 +240,7 @@ def checked_camera(camera: object) -> Camera:
             raise _refused(f"a finite {name}{above}, in pixels", repr(value))
     if not _is_pose(camera.world_to_camera):
         raise _refused(
-            "world_to_camera, a tensor [4, 4] of a rotation and a translation",
+            "world_to_camera as a [4, 4] tensor of a rotation and a translation",
             str(camera.world_to_camera).replace("\n", ""),
         )
     return camera

@@ -213,9 +213,9 @@ def read_state(folder: Path) -> dict[str, Any]:
     except FileNotFoundError as error:
         raise damaged(folder, f"no {STATE}") from error
     except ValueError as error:
-        raise damaged(folder, f"{STATE} is not JSON: {error}") from error
+        raise damaged(folder, f"{STATE} is not valid JSON: {error}") from error
     if not isinstance(state, dict) or "format" not in state:
-        raise damaged(folder, f"{STATE} is not the state of a checkpoint")
+        raise damaged(folder, f"{STATE} does not contain the state of a checkpoint")
     if state["format"] != FORMAT:
         raise UserError(
             "the checkpoint was written in another format version",
@@ -235,10 +235,10 @@ def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
         UserError: The digest differs, or a part is missing or of another type.
     """
     if state.get(_DIGEST) != digest(state):
-        raise damaged(folder, f"{STATE} is not what was written (its SHA-256 differs)")
+        raise damaged(folder, f"{STATE} has changed since it was written (its SHA-256 differs)")
     wrong = [name for name, holds in _PARTS.items() if not holds(state.get(name))]
     if wrong:
-        raise damaged(folder, f"{STATE} lacks a valid {', '.join(wrong)}")
+        raise damaged(folder, f"{STATE} has no valid value for {', '.join(wrong)}")
 
 
 def _is_count(value: object) -> bool:
@@ -487,7 +487,7 @@ def load(folder: Path) -> Checkpoint:
     if not (folder / TENSORS).is_file():
         raise damaged(folder, f"no {TENSORS}")
     if digest_of(folder / TENSORS) != state["sha256"]:
-        raise damaged(folder, f"{TENSORS} is not what was written (its SHA-256 differs)")
+        raise damaged(folder, f"{TENSORS} has changed since it was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
         # The library sorts by key; the order of parameters must survive too.

@@ -53,11 +53,12 @@ class Elsewhere:
         told = []
         if not self.alike:
             told.append(
-                "the points of this scene lie hardly nearer to the run's than if it were turned at "
-                "random: look at its renders; is it the same place, in the same coordinates?"
+                "the points of this capture match the scene of the run hardly better than "
+                "after a random rotation: check the renders, and check that both show the "
+                "same place in the same coordinates"
             )
         if self.trained:
-            told.append(f"left out: {self.trained} of its views that the run was trained on")
+            told.append(f"left out: {self.trained} views that the run was trained on")
         return told
 
 

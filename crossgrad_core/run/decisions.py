@@ -95,7 +95,7 @@ def with_decisions(
         return config, rows_of(config), repeats
     of_scene: tuple[Decision, ...] = ()
     if config.plan != "off":
-        _LOG.info("looking at what the scene needs")
+        _LOG.info("checking which components the scene needs")
         planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
         of_scene = tuple(planner(config, scene))
         config = applied(config, of_scene, PLANNER)

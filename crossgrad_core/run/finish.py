@@ -118,7 +118,7 @@ class RunLoop:
         """
         self._attempt("", lambda: self._train(length))
         if self.ending.status == "finished":
-            self._attempt("the model is left as it was trained", self._edit_finished)
+            self._attempt("the trained model was not changed", self._edit_finished)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
@@ -254,13 +254,13 @@ def exit_messages(course: RunLoop) -> list[str]:
     lines = []
     if not course.state.primitives(course.setup):
         name = course.setup.selection.names["densifier"]
-        lines.append(f"no primitive is left: look at densifier {name} and at the photos")
+        lines.append(f"no Gaussian is left: check densifier {name} and the photos")
     if ending.error is not None:
         lines += f"training failed: {ending.error}".splitlines()
     if course.session.gone:
         return lines
     if ending.traced:
-        lines.append(f"the traceback is in {one_line(folder / LOG)}")
+        lines.append(f"{one_line(folder / LOG)} contains the traceback")
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]
@@ -274,16 +274,18 @@ def overdone(rows: Sequence[Row]) -> list[str]:
         return []
     gap, step = best["psnr"] - last, best["step"]
     return [
-        f"the last evaluation is {gap:.2f} dB below that of step {step:.0f}, "
-        f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
-        "may be enough (--max-views N)"
+        (
+            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f}, which "
+            f"had {best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: "
+            "a shorter run may be sufficient (--max-views N)"
+        )
     ]
 
 
 def next_line(folder: Path) -> str:
     """Return the commands that show and deliver the results of a finished run."""
     run = one_line(quote(str(folder)))
-    return f"next: crossgrad render {run} (pictures), crossgrad export {run} (a file for viewers)"
+    return f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"
 
 
 def resume_line(folder: Path) -> str:
@@ -297,7 +299,7 @@ def _kept(course: RunLoop) -> list[str]:
     saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
         return []
-    there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"
+    there = f"the latest checkpoint is from step {saved}" if saved else "there is no checkpoint"
     return [f"the state of step {step} could not be saved; {there}"]
 
 
@@ -347,8 +349,9 @@ class Forecast:
         if ahead < WORTH_A_LINE:
             return
         left = setup.schedule.total - state.step
-        growth = ", growth included" if ahead > left * each else ""
+        growth = ", including growth" if ahead > left * each else ""
         setup.hook.crossgrad_log(
-            text=f"{left:,} more steps take {roughly(ahead)} (one takes {each * 1000:.0f} ms now"
-            f"{growth}); --seconds S sets a time instead, and Ctrl-C keeps what there is"
+            text=f"the remaining {left:,} steps take {roughly(ahead)} (one step takes "
+            f"{each * 1000:.0f} ms now{growth}); --seconds S sets a time limit instead, "
+            "and Ctrl-C stops the run and keeps the results so far"
         )

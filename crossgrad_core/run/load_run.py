@@ -86,7 +86,7 @@ _LOOSE: Final = frozenset(
 #: The component that another machine may lack.
 _DRAWN: Final = "rasterizer"
 #: Key that tells whether the length follows a clock.
-_TIMED: Final = "follows the clock"
+_TIMED: Final = "the length follows a time budget"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
@@ -150,7 +150,9 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     rows = state.primitives(setup)
     for name, held in state.states.items():
         if any(tensor.shape[:1] != (rows,) for tensor in held.per_primitive.values()):
-            raise _misfit(checkpoint, f"a row for each of {rows} primitives", f"state of {name}")
+            raise _misfit(
+                checkpoint, f"one row for each of {rows} Gaussians", f"the state of {name}"
+            )
     return state
 
 
@@ -228,7 +230,7 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
     trained = [name for block in setup.trained_blocks for name in block.tensors]
     whole = [name for name in trained if not parameters[name].is_floating_point()]
     if whole:
-        raise _misfit(checkpoint, "floating-point numbers to train", listed(whole))
+        raise _misfit(checkpoint, "floating-point numbers for the trained tensors", listed(whole))
     rows = {
         parameters[name].shape[:1]
         for block in setup.blocks
@@ -236,11 +238,11 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
         for name in block.tensors
     }
     if len(rows) > 1:
-        raise _misfit(checkpoint, "as many rows of one parameter as of another", str(sorted(rows)))
+        raise _misfit(checkpoint, "the same number of rows in every parameter", str(sorted(rows)))
     for moments in (checkpoint.exp_avg, checkpoint.exp_avg_sq):
         for name, tensor in moments.items():
             if name not in parameters or tensor.shape != parameters[name].shape:
-                raise _misfit(checkpoint, "moments in the shapes of the parameters", name)
+                raise _misfit(checkpoint, "moments with the shapes of the parameters", name)
 
 
 def _misfit(checkpoint: Checkpoint, expected: str, found: str) -> UserError:
@@ -306,7 +308,7 @@ def without_missing(config: RunConfig) -> RunConfig:
         lacking.append(f"rules {listed(gone)}")
         update["rules"] = {n: each for n, each in config.rules.items() if n not in gone}
     if lacking:
-        _LOG.warning("not installed here, and left out: %s", listed(lacking))
+        _LOG.warning("not installed here, so they are not used: %s", listed(lacking))
     return config.model_copy(update=update)
 
 
@@ -332,7 +334,7 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
 #: Note of a run that has to begin again.
-BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
+BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
 def set_up(

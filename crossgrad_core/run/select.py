@@ -123,7 +123,7 @@ def _clouds_in(folder: Path | None) -> str:
     """Describe the files in the scene's folder that may be point clouds."""
     files = sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
     names = [file.name for file in files if file.suffix.lower() in CLOUDS]
-    return f"point clouds that are not used: {listed(names)}" if names else "no point cloud"
+    return f"unused point clouds: {listed(names)}" if names else "no point cloud"
 
 
 def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -> None:
@@ -186,7 +186,9 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
         if not twice:
             metrics[name] = metric
         elif name in METRICS.split("+"):
-            notes.append(f"metric {name} is left out: metrics.csv has a column {listed(twice)}")
+            notes.append(
+                f"metric {name} is not computed: metrics.csv already has a column {listed(twice)}"
+            )
         else:
             raise UserError(
                 f"two columns of metrics.csv would have the same name: {listed(twice)}",
@@ -234,7 +236,7 @@ def _grouping_choice(
             where="grouping",
             todo="choose a grouping with --grouping, or leave its options out",
         )
-    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
+    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views without groups")
     return None
 
 
@@ -266,5 +268,5 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
         found, why = next(iter(both), usual), f"the operator needs {operator.views}"
     elif named and operator.needs_more_views(usual):
         found = next((k for k in both if not operator.needs_more_views(k)), usual)
-        why = "with fewer views the operator does nothing"
+        why = "with fewer views the operator has no effect"
     return ViewsPerStepSpec((found,)), why if found != usual else ""

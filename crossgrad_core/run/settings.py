@@ -43,7 +43,10 @@ LENGTHS: Final = tuple(
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
 #: Settings that contain settings.
 GROUPS_OF_SETTINGS: Final = ("data",)
-_FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
+_FILE: Final = (
+    "the configuration file",
+    "correct the file or the option; the config.yaml of a run is an example",
+)
 #: Options of the command line -> their setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}
 
@@ -133,7 +136,7 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
             error,
             RunConfig,
             subject="a run",
-            todo="docs/settings.md lists every setting, crossgrad run --help-all every option",
+            todo="docs/settings.md lists all settings, `crossgrad run --help-all` all options",
         ) from error
 
 

@@ -49,7 +49,7 @@ def bimodality(values: NDArray[np.float64]) -> Bimodality:
     """
     size = len(values)
     if size < _SMALLEST:
-        reason = f"{size} values; the coefficient needs {_SMALLEST}"
+        reason = f"{size} values, but the coefficient needs at least {_SMALLEST}"
         return Bimodality(float("nan"), float("nan"), size, reason)
     deviations = values - values.mean()
     spread = float(np.abs(deviations).max())

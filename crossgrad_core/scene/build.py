@@ -60,7 +60,10 @@ def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root:
     if len(blank) == len(split.train):
         raise _all_blank(blank, root)
     train = tuple(name for name in split.train if name not in set(blank))
-    what = f"{count(len(blank), 'training photo')} left out, masked as a whole: {name_some(blank)}"
+    what = (
+        f"{count(len(blank), 'training photo')} left out, because all of their pixels "
+        f"are masked: {name_some(blank)}"
+    )
     return replace(split, train=train, notes=(*split.notes, f"masks: {what}"))
 
 
@@ -126,9 +129,14 @@ def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
             expected="a file with positions and colours",
             todo=f"use --init {option} to start from its Gaussians",
         )
-    check_seen(cloud, raw.views, path, "cut the cloud to what the photos show; or leave it out")
+    check_seen(
+        cloud,
+        raw.views,
+        path,
+        "crop the point cloud to the area that the photos show, or leave it out",
+    )
     views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in raw.views)
-    note = f"points: {len(cloud.positions):,} from {path.name}, in place of those of the scene"
+    note = f"points: {len(cloud.positions):,} from {path.name}, instead of the scene's points"
     return replace(
         raw,
         views=views,
@@ -290,8 +298,11 @@ def _note_stray(names: Sequence[str], frame: Frame) -> list[str]:
     if not stray:
         return []
     return [
-        f"cameras: {count(len(stray), 'training camera')} far away from all others: "
-        f"{name_some(stray)}; the local frame is made without them, and their poses may be wrong"
+        (
+            f"cameras: {count(len(stray), 'training camera')} far away from all other "
+            f"cameras: {name_some(stray)}; the local frame is computed without them, and "
+            "their poses may be wrong"
+        )
     ]
 
 
@@ -312,10 +323,10 @@ def _note_unmeasured(
     held_out = Counter(regimes) - Counter(regimes[i] for i in train)
     lacking = sorted(set(regimes) - set(held_out))
     if held_out and lacking:
-        way = "--split stratified holds photos of every regime out"
+        way = "--split stratified holds out photos of every regime"
         if options.split == "stratified":
-            way = "there are too few photos of it"
+            way = "this regime has too few photos"
         yield (
-            f"split: no photo of {' and '.join(lacking)} is held out, so no figure tells how good "
-            f"it gets; {way}"
+            f"split: no photo of {' and '.join(lacking)} is held out, so no metric shows "
+            f"its quality; {way}"
         )

@@ -27,7 +27,7 @@ _ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _WHITE = 255
-_AGAIN = "repair the camera, or export the model again"
+_AGAIN = "correct the camera, or export the model again"
 
 
 @dataclass(frozen=True)

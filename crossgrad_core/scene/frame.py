@@ -82,14 +82,14 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
     if depth > _SMALLEST:
         return Frame(
             Similarity(origin, 1 / depth),
-            f"local frame: 1 unit = {depth:.6g} input units, the median distance to the SfM "
-            "points, because the training cameras stand in one place",
+            f"local frame: 1 unit = {depth:.6g} input units, the median distance to the "
+            "SfM points, because all training cameras have the same position",
             stray,
         )
     return Frame(
         Similarity(origin, 1.0),
-        "local frame: 1 unit = 1 input unit, because the training cameras stand in one place and "
-        "there are no SfM points",
+        "local frame: 1 unit = 1 input unit, because all training cameras have the "
+        "same position and there are no SfM points",
         stray,
     )
 

@@ -200,8 +200,8 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
     rows, side = _one_per_cube(points.xyz, most)
     chosen = np.zeros(count, dtype=np.bool_)
     chosen[rows] = True
-    how = f"from each cube with a side of {side:.3g} input units" if side else "of so many"
-    kept = f"{len(rows):,} of {count:,} kept, one {how}"
+    how = f"one in each cube with a side of {side:.3g} input units" if side else "evenly spaced"
+    kept = f"{len(rows):,} of {count:,} kept, {how}"
     return points.selected(chosen), [f"points: {kept} (--set data.max_points=N keeps more)"]
 
 

@@ -35,14 +35,20 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Mistakes in poses that put all points behind the cameras or outside the photos.
 _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
-    ("cameras have the other axes (OpenGL: y up, z backward)", lambda pose: _FLIP @ pose),
-    ("poses are inverse (camera to world, or world to camera)", _inverse),
     (
-        "poses are inverse (camera to world, or world to camera)",
+        "the camera axes follow another convention (OpenGL: y up, z backward)",
+        lambda pose: _FLIP @ pose,
+    ),
+    ("the poses are inverted (camera to world, or world to camera)", _inverse),
+    (
+        "the poses are inverted (camera to world, or world to camera)",
         lambda pose: _FLIP @ _inverse(_FLIP @ pose),
     ),
     (
-        "poses are inverse, and cameras have the other axes (OpenGL: y up, z backward)",
+        (
+            "the poses are inverted, and the camera axes follow another convention "
+            "(OpenGL: y up, z backward)"
+        ),
         lambda pose: _inverse(_FLIP @ pose),
     ),
 )

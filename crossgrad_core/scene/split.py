@@ -65,7 +65,9 @@ def split_views(
         UserError: The lists contradict each other, match no view or leave no training view.
     """
     if options.split == "none":
-        return Split(tuple(sorted(names)), (), (f"split: all {len(names)} views are trained on",))
+        return Split(
+            tuple(sorted(names)), (), (f"split: all {len(names)} views are training views",)
+        )
     if options.split == "auto":
         for listed, how in ((_read_lists(root, names), "by lists"), (given, "as given")):
             if listed is not None:
@@ -92,14 +94,14 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
 def _split_every(names: Sequence[str], every: int) -> Split:
     """Hold out each n-th view by name of each folder."""
     folders = {name: str(PurePosixPath(name).parent) for name in names}
-    how = " of each folder" if len(set(folders.values())) > 1 else ""
+    how = " in each folder" if len(set(folders.values())) > 1 else ""
     return _split_each(folders, every, how)
 
 
 def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
     """Hold out each n-th view by name of each regime; `regimes` covers all views."""
     return replace(
-        _split_each({name: regimes.get(name, "") for name in names}, every, " of each regime"),
+        _split_each({name: regimes.get(name, "") for name in names}, every, " in each regime"),
         regimes=regimes,
     )
 
@@ -142,17 +144,22 @@ def _split_by_lists(
         )
     train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
     if not train:
-        raise _matches_nothing("no listed view can be trained on", places[0], names, listed[0])
+        raise _matches_nothing(
+            "no listed view can be used for training", places[0], names, listed[0]
+        )
     if listed[1] and not test:
         raise _matches_nothing("no listed view can be held out", places[1], names, listed[1])
     notes = [f"split: {len(train)} train, {len(test)} test ({how})"]
     absent = sorted((listed[0] | listed[1]) - set(names))
     if absent:
-        notes.append(f"split: {len(absent)} listed names have no posed photo: {name_some(absent)}")
+        notes.append(
+            f"split: {len(absent)} listed names have no photo with a pose: {name_some(absent)}"
+        )
     unlisted = sorted(set(names) - listed[0] - listed[1])
     if unlisted:
         notes.append(
-            f"split: {count(len(unlisted), 'view')} in no list left out: {name_some(unlisted)}"
+            f"split: {count(len(unlisted), 'view')} left out, because no list contains "
+            f"them: {name_some(unlisted)}"
         )
     return Split(train, test, tuple(notes))
 

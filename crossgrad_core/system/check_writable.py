@@ -88,7 +88,7 @@ def check_new(*paths: Path) -> None:
     for path in paths:
         with disk_errors(path):
             if path.exists():
-                todo = "choose another place, or remove it"
+                todo = "choose another path, or remove it"
                 raise UserError("the output file already exists", where=path, todo=todo)
 
 

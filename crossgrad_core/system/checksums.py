@@ -145,7 +145,7 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
 def warn_if_changed(path: Path) -> None:
     """Warn about a file that differs from SHA256SUMS in its folder; another program may edit it."""
     if changed_files(path.parent, [path.name]):
-        _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
+        _LOG.warning("%s has changed since its run wrote it: its SHA-256 differs", path)
 
 
 def _is(path: Path, digest: str) -> bool:

@@ -93,7 +93,7 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
         if error.errno in _FORBIDDEN:
             raise read_only(path) from error
         if error.errno in _IN_THE_WAY:
-            what, found = "something else is in the way", error.strerror or ""
+            what, found = "another file or folder already has this name", error.strerror or ""
             raise UserError(
                 what, where=path, found=found, todo="move it to another path"
             ) from error

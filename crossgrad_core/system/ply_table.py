@@ -121,7 +121,7 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
 
 def _require_file(path: Path) -> None:
     if not is_file(path):
-        other = "a pipe or device in place of a file" if os.path.exists(path) else "nothing"
+        other = "a pipe or device instead of a file" if os.path.exists(path) else "nothing"
         raise UserError(
             "the PLY file does not exist",
             where=path,
@@ -151,7 +151,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
     comments = [line.removeprefix("comment").strip() for line in lines if _keyword(line, "comment")]
     formats = [line.split()[1:2] for line in lines if _keyword(line, "format")]
     if len(formats) != 1 or not formats[0] or formats[0][0] not in _FORMATS:
-        raise _malformed(path, f"a header whose format is none of {', '.join(_FORMATS)}")
+        raise _malformed(path, f"a header whose format is not one of {', '.join(_FORMATS)}")
     return Header(_FORMATS[formats[0][0]], _elements(lines, path), tuple(comments))
 
 
@@ -184,7 +184,7 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
         if not raw.endswith(b"\n"):
             break
         lines.append(line)
-    raise _malformed(path, "a header that does not end")
+    raise _malformed(path, "a header without an end")
 
 
 def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
@@ -195,7 +195,7 @@ def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
         raise _malformed(path, f"the property {' '.join(words)!r}")
     kind, name = words
     if name in draft.fields:
-        raise _malformed(path, f"two properties called {name!r}")
+        raise _malformed(path, f"two properties named {name!r}")
     draft.fields[name] = _TYPES[kind]
 
 
@@ -254,7 +254,9 @@ def _read_ascii(
     try:
         table = _parsed(lines).reshape(vertex.count, len(names))
     except ValueError as error:
-        raise _malformed(path, f"a vertex line that is not {len(names)} numbers") from error
+        raise _malformed(
+            path, f"a vertex line that does not contain {len(names)} numbers"
+        ) from error
     return {name: table[:, i] for i, name in enumerate(names)}
 
 

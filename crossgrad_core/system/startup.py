@@ -21,7 +21,7 @@ KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
 #: Seconds between lines about compiling: if stderr is not a terminal, and if it is one.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
-_EXPLANATION = "compiling for this machine, before the first start only (about a minute)"
+_EXPLANATION = "compiling for this machine, only before the first start (about a minute)"
 
 
 def announce(*, quiet: bool = False) -> None:

@@ -57,9 +57,9 @@ class _Loader(yaml.SafeLoader):
         self._depth += 1
         self._values += 1
         if self._depth > DEEPEST:
-            raise _error(f"more than {DEEPEST} lists or mappings within each other", mark)
+            raise _error(f"lists or mappings are nested more than {DEEPEST} levels deep", mark)
         if self._values > MOST_VALUES:
-            raise _error(f"more than {MOST_VALUES:,} values", mark)
+            raise _error(f"the file contains more than {MOST_VALUES:,} values", mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -168,9 +168,12 @@ class _Values:
         """Return the value of a node."""
         self._count += 1
         if self._count > MOST_VALUES:
-            raise _error(f"more than {MOST_VALUES:,} values, counting aliases", node.start_mark)
+            raise _error(
+                f"the file contains more than {MOST_VALUES:,} values, including aliases",
+                node.start_mark,
+            )
         if depth > DEEPEST:
-            raise _error(f"more than {DEEPEST} values within each other", node.start_mark)
+            raise _error(f"values are nested more than {DEEPEST} levels deep", node.start_mark)
         name = node.tag.removeprefix(_TAG)
         match node:
             case MappingNode() if name == "map":
@@ -179,13 +182,13 @@ class _Values:
                 return [self.of(item, depth + 1) for item in node.value]
             case ScalarNode() if name in _SCALARS:
                 return _scalar(node, name)
-        raise _error(f"the tag {node.tag} has no meaning here", node.start_mark)
+        raise _error(f"the tag {node.tag} is not supported", node.start_mark)
 
     def _items(self, node: MappingNode, depth: int) -> Iterator[tuple[str, object]]:
         seen: set[str] = set()
         for key, value in node.value:
             if not isinstance(key, ScalarNode):
-                raise _error("a key that is not a word", key.start_mark)
+                raise _error("a key is not a string", key.start_mark)
             name = _scalar(key, "str")
             if name in seen:
                 raise _error(f"the key {name!r} occurs twice", key.start_mark)
@@ -227,7 +230,7 @@ def _scalar(node: ScalarNode, name: str) -> object:
     pattern, build = _SCALARS[name]
     try:
         if not pattern.match(node.value):
-            raise _error(f"{node.value!r} is not of the type {name}", node.start_mark)
+            raise _error(f"{node.value!r} is not a valid {name}", node.start_mark)
         return build(node.value)
     except ValueError as error:
         raise _error(str(error), node.start_mark) from error

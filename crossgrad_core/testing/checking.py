@@ -45,7 +45,11 @@ def checks_of(slot: str) -> tuple[AnyCheck, ...]:
 def check_entry(entry: registry.Entry) -> list[Result]:
     """Load a plugin and run every check of its slot; stop early if it cannot be loaded."""
     taken = _taken(entry)
-    names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
+    names = (
+        [Result("its name is not used by another plugin", failure=taken, where=entry.origin)]
+        if taken
+        else []
+    )
     if taken and entry.slot == COMMANDS:
         return names  # The command can never be called.
     try:
@@ -62,7 +66,10 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         try:
             loaded()
         except (Exception, SystemExit) as error:
-            return [*names, _failed("it can be made with default options", error, package, where)]
+            return [
+                *names,
+                _failed("it can be created with default options", error, package, where),
+            ]
     return [*names, *(_result(check, loaded, package, where) for check in checks_of(entry.slot))]
 
 
@@ -91,7 +98,7 @@ def _failed(check: str, error: BaseException, package: str, where: str) -> Resul
     """Return a failure at the innermost line of the package, or else at `where`."""
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
-        return Result(check, str(error) or "an assertion without a text failed", where=where)
+        return Result(check, str(error) or "an assertion without a message failed", where=where)
     return Result(check, in_one_line(error), where=where)
 
 

@@ -38,7 +38,7 @@ def help_can_be_shown(command: Command) -> None:
     printed = StringIO()
     with redirect_stdout(printed):
         as_group_member(command, "command").main(["--help"], "command", standalone_mode=False)
-    require("Usage" in printed.getvalue(), "--help prints no usage")
+    require("Usage" in printed.getvalue(), "--help prints no usage line")
 
 
 def importing_it_is_quick(command: Command) -> None:

@@ -58,12 +58,12 @@ def answers_alike(make: Make[Initializer]) -> None:
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
         told = one.messages(scene) == other.messages(scene)
-    require(told, "remarks() differ from one call to the next")
-    require((first is None) == (second is None), "points are added the one time only")
+    require(told, "remarks() returns different notes in two calls")
+    require((first is None) == (second is None), "points are added in only one of two calls")
     if first is not None and second is not None:
         for each in fields(first):
             same = np.array_equal(getattr(first, each.name), getattr(second, each.name))
-            require(same, f"{each.name} differ from one call to the next")
+            require(same, f"{each.name} differ between two calls")
 
 
 INITIALIZER_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)

@@ -124,7 +124,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     Returns:
         The number of steps, a note with the evidence, and the run's `pixel_share`.
     """
-    _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
+    _LOG.info("timing a few steps to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
     state, pace, share = first_state(unwatched(setup)), setup.schedule.pace, setup.pixel_share
     state.step = _FULL_SIZE
@@ -149,10 +149,10 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         fits = fitting(share)
     total = min(fits, most_steps(setup))
     if total < fits:
-        note += f", of which {fits} fit into that time; the bound on views allows {total}"
+        note += f", of which {fits} fit into that time; the limit on views allows {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
-    return total, f"{text}the length follows the clock as the run goes", share
+    return total, f"{text}the number of steps is adapted during the run", share
 
 
 def most_steps(setup: Setup) -> int:
@@ -319,7 +319,9 @@ def _length_note(setup: Setup) -> tuple[str, ...]:
     planned, total = setup.config.steps, setup.schedule.total
     if planned is None or planned == total:
         return ()
-    return (f"the length followed the clock: {total} steps instead of {planned}",)
+    return (
+        (f"the number of steps was adapted to the time budget: {total} steps instead of {planned}"),
+    )
 
 
 def _told(before: Setup, after: Setup) -> Setup:
@@ -328,7 +330,10 @@ def _told(before: Setup, after: Setup) -> Setup:
     if was and not now:
         schedule = after.schedule
         start, end = map(schedule.step_of, (schedule.densify_from, schedule.densify_until))
-        text = f"density control after all: in {schedule.total} steps it lasts from step "
+        text = (
+            f"density control is used after all: in a run of {schedule.total} steps it "
+            "acts from step "
+        )
         before.hook.crossgrad_log(text=f"{text}{start} to step {min(end, schedule.total)}")
     elif now and not was:
         before.hook.crossgrad_log(text=now[0])

@@ -32,8 +32,11 @@ from crossgrad_core.training.views import photo_camera
 
 #: Messages at the first and at the second signal; the third signal ends the process.
 _WORDS = (
-    "stopping: what there is gets saved and evaluated first (once more: only saved)",
-    "stopping: what there is gets saved first (once more: ends at once)",
+    (
+        "stopping: the current state is saved and evaluated first (press again to "
+        "skip the evaluation)"
+    ),
+    "stopping: the current state is saved first (press again to end at once)",
 )
 
 
@@ -314,7 +317,8 @@ def _rewind(
     if rewound_before:
         raise TrainingFailedError(f"{error}, for the second time") from error
     setup.hook.crossgrad_log(
-        text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
+        text=f"{error}: training returned to step {state.step}, the last finite state, "
+        "with new random numbers"
     )
     sink.rewind(setup, state.step)
 
@@ -323,8 +327,8 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
     if held_back > 0 and setup.numbers.growth == "unbounded":
         setup.hook.crossgrad_log(
-            text=f"step {record.step}: growth held back by {held_back} primitives "
-            "(--max-gaussians or the memory guard)"
+            text=f"step {record.step}: {held_back} Gaussians were not added (--max-gaussians "
+            "or the memory guard)"
         )
 
 

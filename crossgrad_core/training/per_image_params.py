@@ -28,7 +28,7 @@ from crossgrad_core.wording import listed
 PHOTO_VALUES: Final = "exposure.json"
 #: Version of the format; increased when an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
-_TODO = "name the exposure.json of a run, or leave --exposure-from out"
+_TODO = "give the exposure.json of a run, or leave --exposure-from out"
 
 
 def write_values(
@@ -137,7 +137,7 @@ def started(setup: Setup) -> PluginState | None:
         return None
     starts = {name: each.first() for name, each in parameters.items()}
     for name, start in starts.items():
-        _check(setup, f"starts parameter {name} with", start)
+        _check(setup, f"initializes parameter {name} with", start)
     tensors = {}
     for name, each in (known_starts(setup) or starts).items():
         start = each.detach().to(setup.device).clone(memory_format=torch.contiguous_format)

@@ -67,6 +67,8 @@ def growth_note(setup: Setup) -> tuple[str, ...]:
         return ()
     start, end, unit = schedule.densify_from, schedule.densify_until, schedule.counting.unit
     return (
-        f"no density control: in {schedule.total} steps it would begin after {start} {unit} and "
-        f"end before {end}; --set densify_from=N forces it",
+        (
+            f"no density control: in a run of {schedule.total} steps it would begin after "
+            f"{start} {unit} and end before {end}; --set densify_from=N forces it"
+        ),
     )

@@ -326,7 +326,9 @@ class Setup:
         answers: list[Mapping[str, int]] = hook(blocks=self.trained_blocks)
         found = {name: every for answer in answers for name, every in answer.items()}
         if wrong := {n: e for n, e in found.items() if n not in trained or int(e) != e or e < 1}:
-            raise wrong_answer(hook, "tensors that learn, each with a number from 1 on", str(wrong))
+            raise wrong_answer(
+                hook, "trained tensors, each with a number of at least 1", str(wrong)
+            )
         return found
 
     def resting(self, step: int) -> frozenset[str]:

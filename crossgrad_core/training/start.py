@@ -219,7 +219,7 @@ def _misfit(begun: Scene, known: int) -> str:
     sizes, opacities = sizes[known:], opacities[known:]
     # NaN leaves the size or the opacity to the backbone.
     if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
-        return "a size that is no number above 0"
+        return "a size that is not a number above 0"
     inside = (opacities > 0.0) & (opacities < 1.0) | np.isnan(opacities)
     return "" if inside.all() else "an opacity that is not between 0 and 1"
 
@@ -273,13 +273,18 @@ def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
         if not isinstance(most, int) or not most or present <= most:
             return ()
         return (
-            f"start: {present:,} primitives, more than --max-gaussians {most:,}: a PLY is taken "
-            "as it is, and none is added",
+            (
+                f"start: {present:,} Gaussians, more than --max-gaussians {most:,}: a PLY is "
+                "used unchanged, and no Gaussians are added"
+            ),
         )
     start, crowd = kept.values["start"], kept.values["of"]
     return (
-        f"start: {start:,} primitives instead of {crowd:,}, from points drawn at random: "
-        f"--max-gaussians is less than all points would make",
+        (
+            f"start: {start:,} Gaussians instead of {crowd:,}, from randomly drawn "
+            "points: --max-gaussians is smaller than the number of Gaussians from all "
+            "points"
+        ),
     )
 
 

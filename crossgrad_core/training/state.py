@@ -263,7 +263,7 @@ def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -
     for kind in ("values", "tensors", "per_primitive"):
         have = getattr(known, kind)
         for name, value in getattr(new, kind).items():
-            wrong = "" if isinstance(name, str) else "the key is no text"
+            wrong = "" if isinstance(name, str) else "the key is not a string"
             if name not in have:
                 wrong = wrong or (no_json(value) if kind == "values" else _odd(value, device))
             if wrong:
@@ -484,8 +484,10 @@ def check_start(state: TrainState) -> None:
 
 def _way_out(step: int) -> str:
     if step == 0:
-        return "look at the Gaussians of --init, or at what changes the first parameters"
-    return f"remove checkpoints/step-{step:06d} to go on from an earlier one, where there is one"
+        return "check the Gaussians of --init, and plugins that change the first parameters"
+    return (
+        f"remove checkpoints/step-{step:06d} to resume from an earlier checkpoint, if there is one"
+    )
 
 
 def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:

@@ -218,7 +218,7 @@ def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatc
     flat = " ".join(out.split())
     assert (code, err) == (1, "")
     assert "operator halving FAIL 1 of" in flat
-    assert "its name is free: 2 installed packages offer a" in flat
+    assert "its name is not used by another plugin: 2 installed packages offer a" in flat
     assert "operator absolute FAIL" in flat
     assert "scales with the gradients" in flat
     assert "compare lengths with each other" in flat

@@ -115,8 +115,8 @@ def test_quiet_shows_warnings_only(announced, capsys):
     announced(quiet=True)
     STAGES.info("loading kernels")
     LOG.info("compiling %s", "one")
-    LOG.warning("kernels cannot be kept")
-    assert capsys.readouterr().err == "note: kernels cannot be kept\n"
+    LOG.warning("kernels cannot be saved")
+    assert capsys.readouterr().err == "note: kernels cannot be saved\n"
 
 
 def test_an_error_is_printed_after_the_last_stage(announced, capsys, tmp_path):

@@ -55,7 +55,7 @@ def test_a_run_without_a_checkpoint_begins_again_and_says_so(whole, killed):
                for name in theirs.parameters)  # fmt: skip
     assert ours.generators == theirs.generators
     assert measured(killed) == measured(whole)
-    words = "no checkpoint yet: the run begins again from its configuration"
+    words = "no checkpoint yet: the run starts again from its configuration"
     assert words in (killed / "log.txt").read_text()
     assert words in json.loads((killed / "summary.json").read_text())["notes"]
     assert {path.name for path in killed.iterdir()} == {path.name for path in whole.iterdir()}

@@ -155,7 +155,7 @@ def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
     np.testing.assert_allclose(positions, setup.scene.points, atol=1e-7)
     with pytest.raises(UserError, match="not georeferenced") as caught:
         export_scene(setup, state, tmp_path / "c.ply", coordinates="enu")
-    assert "neither its files nor its photos" in caught.value.found
+    assert "neither the scene files nor the photos" in caught.value.found
     assert not (tmp_path / "c.ply").exists()
 
 

@@ -81,7 +81,7 @@ def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, c
         assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
     evaluate.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
     printed = capsys.readouterr().out
-    assert "drawn on black" in printed and "left out: 7 of its views" in printed
+    assert "rendered on black" in printed and "left out: 7 of its views" in printed
     assert sorted(trained.rglob("*")) == before
 
 
@@ -191,6 +191,6 @@ def test_captures_of_one_place_are_distinguished_from_captures_of_another_place(
 def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
     monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
     evaluate.evaluate(trained, on=scene)
-    assert "is it the same place" in capsys.readouterr().out
+    assert "both show the same place" in capsys.readouterr().out
     render.render(trained, split="test", out=None, on=scene)
-    assert "is it the same place" in capsys.readouterr().out
+    assert "both show the same place" in capsys.readouterr().out

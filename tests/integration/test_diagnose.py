@@ -107,7 +107,7 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert "model: a vanilla run of" in printed
-    assert "not georeferenced: neither its files nor its photos" in printed
+    assert "not georeferenced: neither the scene files nor the photos" in printed
     assert "Sarle's bimodality" in printed
     assert "no exposure needs a model" in printed
     rows = table(tmp_path / "out")

@@ -209,7 +209,7 @@ def test_values_for_an_exposure_without_any_are_refused(scene, tmp_path):
     (tmp_path / "values.json").write_text("{}")
     with pytest.raises(UserError, match="have no effect") as caught:
         run(scene, tmp_path / "run", exposure_from=str(tmp_path / "values.json"))
-    assert "no values of photos" in caught.value.found
+    assert "no per-photo values" in caught.value.found
 
 
 def finite(out):

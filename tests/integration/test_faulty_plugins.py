@@ -167,11 +167,11 @@ def test_views_may_be_numbers_of_numpy(scene, tmp_path, monkeypatch):
 def test_a_run_that_loses_all_primitives_says_so(scene, tmp_path, monkeypatch, capsys):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--densifier", "emptying") == 0
-    words = "no primitive is left: look at densifier emptying"
+    words = "no Gaussian is left: check densifier emptying"
     assert words in capsys.readouterr().err
     assert words in (tmp_path / "run" / "log.txt").read_text()
     assert run(scene, tmp_path / "usual") == 0
-    assert "no primitive" not in capsys.readouterr().err
+    assert "no Gaussian" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

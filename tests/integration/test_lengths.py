@@ -76,7 +76,7 @@ def test_a_run_that_ends_worse_than_an_earlier_step_reports_it(
     monkeypatch.setattr("crossgrad_core.run.finish.WORSE", margin)
     settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 4, "eval_every": 2}
     assert app.run(settings, verbosity=0) == 0
-    line = "dB below that of step"
+    line = "dB lower than at step"
     assert (line in capsys.readouterr().err) == told
     assert (line in (tmp_path / "run/log.txt").read_text()) == told
 
@@ -106,7 +106,7 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
     assert (stored["steps"], stored["seconds"], stored["max_views"]) == (4, None, None)
     assert (stored["planned_seconds"], stored["planned_views"]) == (60.0, 9)
     assert stored["revisions"] == []
-    assert "the bound on views allows 4" in (tmp_path / "run/log.txt").read_text()
+    assert "the limit on views allows 4" in (tmp_path / "run/log.txt").read_text()
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
     again = (tmp_path / "again/point_cloud.ply").read_bytes()
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
@@ -127,7 +127,7 @@ def test_a_run_in_seconds_notes_options_of_resets_that_it_has_none_for(scene, tm
 def test_seconds_end_a_run_that_has_views_left(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0
-    assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
+    assert "the limit on views" not in (tmp_path / "run/log.txt").read_text()
 
 
 def test_a_resumed_run_with_seconds_and_max_views_ends_at_max_views(scene, tmp_path):
@@ -167,7 +167,7 @@ def test_views_within_seconds_are_at_least_a_step():
 
 @pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "steps": 4}])
 def test_a_run_has_one_length(lengths):
-    with pytest.raises(UserError, match="one length"):
+    with pytest.raises(UserError, match="more than one length"):
         app.with_defaults(RunConfig(**lengths))
 
 

@@ -76,4 +76,4 @@ def test_where_there_are_no_locks_the_run_says_so(stopped, monkeypatch, caplog):
 
     monkeypatch.setattr(fcntl, "flock", unsupported)
     assert app.run({}, resume=stopped, verbosity=-1) == 0
-    assert "has no locks" in caplog.text
+    assert "does not support locks" in caplog.text

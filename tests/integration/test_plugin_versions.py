@@ -140,7 +140,9 @@ def test_a_run_without_a_readable_file_goes_on_with_a_note(stopped, capsys):
             (stopped / FILE).write_text(content)
         step = str(packages_before(stopped))
         assert ended("run", "--resume", stopped, "--stop-after", step, "-q") == 0
-        assert capsys.readouterr().err.count("whether its plugins are still the same") == 1
+        assert (
+            capsys.readouterr().err.count("whether the plugins of the run are still the same") == 1
+        )
         assert packages(stopped)["versioned-package"]["versions"] == ["1.0"]
 
 

@@ -188,7 +188,7 @@ def test_a_run_of_a_machine_with_cuda_is_used_on_one_without(finished, tmp_path,
         look(How(device="cpu", threads=1))
     assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
-    assert "rasterizer gsplat does not run on cpu: another one draws" in caplog.text
+    assert "rasterizer gsplat does not run on cpu: another rasterizer is used" in caplog.text
 
 
 def test_the_command_line_has_these_options():
@@ -227,7 +227,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     assert drawn == pytest.approx(ply["psnr"], abs=6e-3)
     assert abs(own - drawn) > 0.05
     assert f"{told['primitives']} Gaussians of" in printed
-    assert "drawn on black" in printed
+    assert "rendered on black" in printed
 
 
 def test_a_message_reports_what_a_background_costs_the_ply(scene, tmp_path, capsys):
@@ -236,7 +236,7 @@ def test_a_message_reports_what_a_background_costs_the_ply(scene, tmp_path, caps
         out = tmp_path / name
         assert app.run({**settings, "out": str(out), "background": name}, verbosity=0) == 0
         told = capsys.readouterr().err
-        assert ("point_cloud.ply: drawn on black, as viewers draw it, it has" in told) == (
+        assert ("point_cloud.ply: rendered on black, as viewers do, it has" in told) == (
             name == "white"
         )
         assert ("over its background white" in told) == (name == "white")

@@ -61,7 +61,7 @@ def test_a_run_leaves_everything_it_promises(scene, tmp_path, capsys, drawn):
     assert summary["overall"]["psnr"] > 5
     assert summary["overall"]["lpips"] is None and summary["null"]["lpips"]
     assert summary["seconds"]["train"] > 0
-    assert any("no separate gradients" in note for note in summary["notes"])
+    assert any("gradients of single views are not stored" in note for note in summary["notes"])
     assert str(out) in capsys.readouterr().out
     rows = quality(out)
     assert [row["step"] for row in rows] == ["6", "12"]
@@ -165,10 +165,12 @@ def test_statements_that_a_changed_length_makes_wrong_are_withdrawn(
     logged = (tmp_path / "timed" / "log.txt").read_text()
     assert summary["step"] == 60
     assert not any("no density control" in note for note in summary["notes"])
-    assert f"followed the clock: {summary['step']} steps instead of 28" in summary["notes"][-1]
+    assert (
+        f"adapted to the time budget: {summary['step']} steps instead of 28" in summary["notes"][-1]
+    )
     assert "no density control" in logged
     (line,) = told
-    assert line.startswith("density control after all") and line in logged
+    assert line.startswith("density control is used after all") and line in logged
 
 
 def test_a_stopped_run_has_the_length_that_was_written_for_its_step(scene, tmp_path):
@@ -268,11 +270,11 @@ def test_growth_stops_at_the_limit_and_says_so(scene, tmp_path):
     settings["rate_factor"] = 1.0  # With larger rates some become transparent and are pruned.
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
-    assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()
+    assert "were not added" in (tmp_path / "run" / "log.txt").read_text()
     # On a curve growth is held back at every edit, as it should be.
     run(scene, tmp_path / "curve", max_gaussians=230, growth="budget", **settings)
     assert quality(tmp_path / "curve")[-1]["primitives"] == "230"
-    assert "growth held back" not in (tmp_path / "curve" / "log.txt").read_text()
+    assert "were not added" not in (tmp_path / "curve" / "log.txt").read_text()
     summary = json.loads((tmp_path / "curve/summary.json").read_text())
     assert summary["peak_primitives"] == 230
 

@@ -45,7 +45,7 @@ def test_an_accepted_scene_is_trained_and_its_configuration_repeats_the_run(scen
     asked = settings(scenes, "wrong", run)
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["scene_check"]["verdict"] == "the scene disagrees"
+    assert summary["scene_check"]["verdict"] == "points, poses and photos do not match"
     assert any("principal point" in note for note in summary["notes"])
     repeated = {**read_config(run), "out": str(tmp_path / "again")}
     assert app.run(repeated, verbosity=-1) == 0
@@ -57,7 +57,7 @@ def test_a_stopped_run_of_an_accepted_scene_goes_on(scenes, tmp_path):
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
     assert app.run({}, resume=run, verbosity=-1) == 0
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["scene_check"]["verdict"] == "the scene disagrees"
+    assert summary["scene_check"]["verdict"] == "points, poses and photos do not match"
 
 
 def test_summary_json_has_the_figures_of_a_right_scene(scenes, tmp_path):

@@ -62,7 +62,10 @@ def test_a_run_can_be_evaluated_without_the_plugins_that_trained_it(run, capsys)
     before = (run / "per_view.csv").read_text()
     assert ended("eval", run) == 0
     told = capsys.readouterr().err
-    assert "not installed here, and left out: sampler own-samplers, operator own-operators" in told
+    assert (
+        "not installed here, so they are not used: sampler own-samplers, operator own-operators"
+        in told
+    )
     assert "metrics gains, observers listens" in told
     assert (run / "per_view.csv").read_text() == before
     assert ended("export", run, "--out", run.parent / "again.ply") == 0
@@ -91,7 +94,7 @@ def test_settings_that_were_changed_are_still_refused(run, capsys):
         ("max_alpha: 0.99", "max_alpha: 0.5", "rasterizer.max_alpha"),
         ("near: ", "near: 1", "rasterizer.near"),
         ("revisions: []", "revisions: [[1, 2]]", "revisions"),
-        ("planned_seconds: null", "planned_seconds: 5.0", "follows the clock"),
+        ("planned_seconds: null", "planned_seconds: 5.0", "follows a time budget"),
     ],
 )
 def test_changed_render_and_length_settings_are_refused_without_the_plugins(

@@ -43,7 +43,7 @@ def evaluate(
     """
     if ply is not None:
         result, gaussians, place = evaluated_file(folder, ply, how, on)
-        told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
+        told = f"{gaussians:,} Gaussians of {ply}, rendered on black as viewers do"
         print("\n".join([*metric_lines(result), told, *(place.messages() if place else ())]))  # noqa: T201
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
@@ -149,7 +149,11 @@ def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
         return False
     lost = _known(before) - _known(result.views)
     if lost:
-        _LOG.warning("%s stays as it is: %s not measured here", PER_VIEW, listed(sorted(lost)))
+        _LOG.warning(
+            "%s was not changed: it contains metrics that were not computed here (%s)",
+            PER_VIEW,
+            listed(sorted(lost)),
+        )
     return bool(lost)
 
 

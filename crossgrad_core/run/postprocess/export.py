@@ -37,7 +37,7 @@ def export(
     )
     for line in described(content, path):
         print(line)  # noqa: T201
-    print(f"{content.gaussians:,} Gaussians in {one_line(path)}")  # noqa: T201
+    print(f"{content.gaussians:,} Gaussians written to {one_line(path)}")  # noqa: T201
 
 
 def exported(

@@ -24,7 +24,9 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
             stack.enter_context(locked(folder, doing))
         except UserError as error:
             found = f" ({error.found})" if error.found else ""
-            _LOG.warning("%s%s: results are shown, and none is written there", error.what, found)
+            _LOG.warning(
+                "%s%s: results are only shown, and none is written there", error.what, found
+            )
             yield False
         else:
             clear_half_written(folder)

@@ -128,7 +128,14 @@ def render_path(
             for video in video_files(out) if own else ():
                 if video != made:  # A video of other frames.
                     video.unlink(missing_ok=True)
-        told = f"video {made}" if made else f"no video: too many or too large without {ENCODER}"
+        told = (
+            f"video {made}"
+            if made
+            else (
+                "no video was written: there are too many frames, or they are too large "
+                f"without {ENCODER}"
+            )
+        )
         print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
 
 

@@ -66,12 +66,12 @@ def draw_curve(
     figure = Figure(figsize=(7.5, 2.2 + 2.6 * len(charts)), dpi=150, layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(charts), 1, sharex=True, squeeze=False)[:, 0]
-    lines = _lines(rows, views or {}) if scored else [_Line("mean of the step's views", "")]
+    lines = _lines(rows, views or {}) if scored else [_Line("mean over the views of the step", "")]
     for ax, (metric, label) in zip(axes, charts, strict=True):
         _draw(ax, rows, metric, lines)
         ax.set_ylabel(label)
     axes[0].set_xlim(left=0.0)
-    axes[-1].set_xlabel("training seconds (compiling, loading and evaluating excluded)")
+    axes[-1].set_xlabel("training seconds (without compiling, loading and evaluating)")
     _add_view_axis(axes[0], rows)
     _add_legend(figure, axes[0])
     figure.suptitle(_literal(title), fontsize=11)

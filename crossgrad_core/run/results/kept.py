@@ -45,7 +45,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     if found is not None and found.startswith(text.encode()):
         return ()
     was = "was gone" if found is None else "was damaged"
-    return (f"{METRICS} {was}: it is restored as it was at step {step}",)
+    return (f"{METRICS} {was}: it is restored to its state at step {step}",)
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
     if not changed:
         return ()
     parts = (name if name == NOTES else _difference(name, was, now) for name in changed)
-    return (f"{CONFIG} was edited since its run wrote it: {listed(parts)}",)
+    return (f"{CONFIG} was edited after its run wrote it: {listed(parts)}",)
 
 
 def _difference(name: str, was: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -113,7 +113,7 @@ def _in_use(folder: Path, holder: Holder | None) -> RunInUseError:
 
 
 def _named(holder: Holder | None) -> str:
-    return "a process that holds the folder's lock" if holder is None else str(holder)
+    return "a process that holds the lock of the folder" if holder is None else str(holder)
 
 
 def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:

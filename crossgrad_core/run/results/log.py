@@ -92,7 +92,12 @@ def length_lines(pace: Pace) -> list[str]:
     planned = pace.planned
     if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
         return []
-    return [f"the length followed the clock: {pace.total} steps instead of {planned}"]
+    return [
+        (
+            f"the number of steps was adapted to the time budget: {pace.total} steps "
+            f"instead of {planned}"
+        )
+    ]
 
 
 def figures(pace: Pace) -> list[str]:

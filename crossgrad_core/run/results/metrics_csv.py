@@ -122,7 +122,7 @@ class MetricsCsv:
         """
         unknown = set(row) - set(self.columns)
         if unknown:
-            message = f"{FILE} has no columns {sorted(unknown)}"
+            message = f"{FILE} does not contain the columns {sorted(unknown)}"
             raise ValueError(message)
         line = csv_bytes([[as_cell(row.get(name)) for name in self.columns]])
         with disk_errors(self.path, len(line)):

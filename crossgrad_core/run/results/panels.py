@@ -79,7 +79,7 @@ FOLDER = "renders"
 _NARROWEST = 360
 _SMALLEST_FONT, _LARGEST_FONT, _FONTS_PER_WIDTH = 12, 26, 38
 _COLUMNS = ("photo", "render", "error")
-_TODO = "draw the panels again: crossgrad render RUN, or remove the file"
+_TODO = "render the panels again: crossgrad render RUN, or remove the file"
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def read_panel(path: Path) -> "dict[str, Image]":
         raise _unreadable(path, str(error)) from error
     layout = Layout.in_canvas(panel.size)
     if layout is None:
-        raise _unreadable(path, f"a picture of {panel.width} x {panel.height} px")
+        raise _unreadable(path, f"an image of {panel.width} x {panel.height} px")
     lower = layout.top + layout.height
     left = [layout.left(column) for column in range(len(_COLUMNS))]
     boxes = [(x, layout.top, x + layout.width, lower) for x in left]

@@ -86,7 +86,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
             todo="name the folder of a finished run",
         )
     try:
-        content, found = read_json(path), "something else than an object"
+        content, found = read_json(path), "a value that is not an object"
     except ValueError as error:
         content, found = None, str(error)
     if isinstance(content, dict):
@@ -133,7 +133,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
 
 def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     if result is None:
-        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation took place"}}
+        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation was made"}}
     return {
         "overall": result.overall.as_data(),
         "regimes": {name: means.as_data() for name, means in result.regimes.items()},

@@ -63,13 +63,20 @@ def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     if top > _DARK:
         return FULL_16_BIT, []
     white = next(white for white in WHITES if white >= top)
-    photos = f"photos: {count(len(deep), 'photo')} of 16 bits"
+    photos = f"photos: {count(len(deep), 'photo')} with 16 bits"
     bits = white.bit_length()
     if white > WHITES[0] and top >= _REACHED * white:
-        return white, [f"{photos} hold {bits}-bit values (up to {top}): scaled, {white} is white"]
+        return white, [
+            (
+                f"{photos} contain {bits}-bit values (up to {top}), which are scaled: {white} "
+                "is white"
+            )
+        ]
     return FULL_16_BIT, [
-        f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) and are dark; "
-        f"if they hold {bits}-bit values, save them scaled to 16 bits"
+        (
+            f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) "
+            f"and are dark; if they contain {bits}-bit values, save them scaled to 16 bits"
+        )
     ]
 
 
@@ -204,8 +211,8 @@ def _prefer_reduced(
         if len(paths) < len(full.paths):
             absent = [name for name in full.paths if name not in paths]
             notes.append(
-                f"photos: {folder.path.name}/ is not used, {count(len(absent), 'photo')} of it "
-                f"missing: {name_some(absent)}"
+                f"photos: {folder.path.name}/ is not used, because "
+                f"{count(len(absent), 'photo')} of it are missing: {name_some(absent)}"
             )
             continue
         found = _read_found(folder, paths)

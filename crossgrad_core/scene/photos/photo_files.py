@@ -224,7 +224,7 @@ def with_photo_names(raw: RawScene) -> RawScene:
     moved = {name: file for name, file in pairs.files.items() if not same_spelling(name, file)}
     told = (
         (moved, "found by the end of their path", "{0} is {1}"),
-        (pairs.ambiguous, "without a photo of their own, several could be meant", "{0} ({1})"),
+        (pairs.ambiguous, "without a photo: their name matches several photos", "{0} ({1})"),
     )
     notes = [
         f"photos: {count(len(which), 'posed image')} {what}: "

@@ -126,7 +126,7 @@ class PhotoStore:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             size = sum(len(part) for part in content)
             if not self._has_room(size):
-                self._close("its limit is reached or the disk is full")
+                self._close("its limit is reached, or the disk is full")
                 return
             with temporary.open("wb") as file:
                 file.writelines(content)
@@ -146,7 +146,7 @@ class PhotoStore:
     def _close(self, why: str) -> None:
         """Write no more photos in this run: photos are decoded again instead."""
         self._open = False
-        _LOG.info("no more photos are kept in %s: %s", self._folder, why)
+        _LOG.info("further photos are not stored in %s: %s", self._folder, why)
 
     def _has_room(self, size: int) -> bool:
         with self._lock:

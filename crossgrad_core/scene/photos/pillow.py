@@ -58,7 +58,7 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
     except (UserError, MemoryError):
         raise
     except UnidentifiedImageError as error:
-        found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
+        found = "an empty file" if path.stat().st_size == 0 else "an unknown image format"
         raise UserError(
             "the file is not a photo", where=path, found=found, todo="replace or remove the file"
         ) from error

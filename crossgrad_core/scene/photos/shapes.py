@@ -82,8 +82,11 @@ def too_large(path: Path, header: PhotoHeader) -> UserError:
     way = (
         "--max-size N, such as --max-size 4000, decodes it at a reduced size"
         if header.reducible
-        else "put smaller copies of all photos into <images>_2, _4 or _8 beside the image folder "
-        "and name their size with --max-size N; or save it as a JPEG file that is not progressive"
+        else (
+            "put smaller copies of all photos into <images>_2, _4 or _8 next to the "
+            "image folder and select their size with --max-size N; or save it as a JPEG "
+            "file that is not progressive"
+        )
     )
     return UserError(
         "the photo is too large to be decoded",

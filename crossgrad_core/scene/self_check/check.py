@@ -98,7 +98,7 @@ def _equal_poses(poses: Floats, names: Sequence[str]) -> Iterator[str]:
     equal = _repeated(rounded, names)
     if equal:
         photos = count(len(equal), "photo")
-        yield f"check: {photos} with the pose of another one: {name_some(equal)}"
+        yield f"check: {photos} have the same pose as another photo: {name_some(equal)}"
 
 
 def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
@@ -107,7 +107,7 @@ def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
     away = np.linalg.norm(points - np.median(centers, axis=0), axis=1)
     far = int((away > _INFINITE * np.median(away)).sum())
     if far:
-        yield f"check: {count(far, 'point')} practically at infinity"
+        yield f"check: {count(far, 'point')} extremely far away"
 
 
 def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
@@ -117,10 +117,10 @@ def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
     if known.any():
         low = known & (sharpness < _BLURRED * np.median(sharpness[known]))
         if low.any():
-            yield f"check: {_listed(low, names)} much less sharp than the others"
+            yield f"check: {_listed(low, names)} much less sharp than the other photos"
     off = np.abs(light - np.median(light)) > _STOPS
     if off.any() and off.mean() < 1.0 / _FEWEST_PHOTOS:
-        yield f"check: {_listed(off, names)} much darker or brighter than the others"
+        yield f"check: {_listed(off, names)} much darker or brighter than the other photos"
 
 
 def _almost_equal(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
@@ -132,7 +132,7 @@ def _almost_equal(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
     pairs = [(names[order[i]], names[order[i + 1]]) for i in np.flatnonzero(close)]
     if pairs:
         shown = name_some([f"{min(pair)} and {max(pair)}" for pair in sorted(pairs)])
-        yield f"check: photos that are almost equal: {shown}"
+        yield f"check: some photos are almost equal: {shown}"
 
 
 def _listed(which: NDArray[np.bool_], names: Sequence[str]) -> str:
@@ -166,7 +166,7 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
     """
     begun = perf_counter()
     pixels = pixels_of(scene)
-    _LOG.info("checking points, poses and photos against each other")
+    _LOG.info("checking whether points, poses and photos match")
     looked_at = _looked_at(scene, cache_mib)
     views = [view for view in looked_at if _is_decoded(pixels, view)]
     undecoded = [scene.views[view].name for view in looked_at if view not in {*views}]
@@ -222,26 +222,28 @@ def _figures(verdict: Verdict) -> dict[str, Json]:
 
 def _word(verdict: Verdict) -> str:
     if verdict.all_wrong is not None:
-        return "the scene disagrees"
+        return "points, poses and photos do not match"
     if verdict.some_wrong:
-        return "some photos disagree"
-    return "agrees" if isfinite(verdict.correlation) else "cannot be told"
+        return "some photos do not match"
+    return "agrees" if isfinite(verdict.correlation) else "not enough evidence"
 
 
 def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[str]:
     told = []
     if undecoded:
         told.append(
-            f"check: {count(len(undecoded), 'photo')} left out, because the files cannot be "
+            f"check: {count(len(undecoded), 'photo')} left out, because they cannot be "
             f"decoded: {name_some(undecoded)}"
         )
     if verdict.all_wrong is not None:
-        told.append(f"check: the scene contradicts itself, accepted: {verdict.all_wrong.what}")
+        told.append(
+            f"check: points, poses and photos do not match, accepted: {verdict.all_wrong.what}"
+        )
     for cause in verdict.some_wrong:
         names = [scene.views[view].name for view in cause.views]
         told.append(
-            f"check: {count(len(names), 'photo')} at odds with the points: {name_some(names)}; "
-            f"{cause.what}: {cause.todo}"
+            f"check: {count(len(names), 'photo')} do not match the points: "
+            f"{name_some(names)}; {cause.what}: {cause.todo}"
         )
     return told
 
@@ -249,9 +251,11 @@ def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[
 def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
     found = []
     if isfinite(verdict.in_frame):
-        found.append(f"{verdict.in_frame:.0%} of the observed points are in frame")
+        found.append(f"{verdict.in_frame:.0%} of the observed points are inside the photos")
     if isfinite(verdict.correlation):
-        found.append(f"colours of points and photos correlate by {verdict.correlation:.2f}")
+        found.append(
+            f"the colours of points and photos have a correlation of {verdict.correlation:.2f}"
+        )
     return UserError(
         "the photos of the scene do not match its poses and points",
         where=path,

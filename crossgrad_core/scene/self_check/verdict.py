@@ -102,12 +102,12 @@ _EXCHANGED: Final = (
     "give each photo the name that its pose has in the model",
 )
 _STRANGE: Final = (
-    "their poses are wrong, or they show something else than the points",
+    "their poses are wrong, or they do not show the points",
     "remove them from the model, or estimate their poses again",
 )
 _UNRELATED: Final = (
-    "poses, points and photos do not belong together, and no change that was tried repairs it",
-    "check that the model and the photos are of one reconstruction",
+    ("poses, points and photos do not match, and none of the tested corrections repairs them"),
+    "check that the model and the photos belong to the same reconstruction",
 )
 _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
@@ -124,9 +124,13 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         UserError: A photo cannot be decoded.
     """
     if len(scene.points) < FEWEST:
-        return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
+        return replace(
+            _UNKNOWN, notes=("the scene has no points that could be compared with the photos",)
+        )
     if not views:
-        return replace(_UNKNOWN, notes=("there are no photos to compare the points with",))
+        return replace(
+            _UNKNOWN, notes=("the scene has no photos that could be compared with the points",)
+        )
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
     # If some photos have tracks, photos without tracks are skipped: hidden points would mislead.
@@ -207,14 +211,19 @@ class _Group:
             int(self.told.sum()),
             float(np.median(correlation[known])) if known.any() else np.nan,
             float(np.nanmedian(self.agreement.share)) if self.evidence.tracked else np.nan,
-            notes=("the colours of the points say nothing; photos are compared with each other",)
+            notes=(
+                (
+                    "the colours of the points contain no information; photos are compared with "
+                    "each other"
+                ),
+            )
             if self.recolored
             else (),
         )
         if not self.told.any():
             if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
-            return replace(verdict, notes=("colours of points and photos cannot be compared",))
+            return replace(verdict, notes=("the colours of points and photos cannot be compared",))
         bad = self.bad
         if self.better < LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < LEAST:
             return self._as_a_whole(verdict)
@@ -269,7 +278,7 @@ class _Group:
             if other.better >= LEAST or not np.isfinite(other.agreement.correlation).any():
                 return other.verdict()
             return replace(verdict, all_wrong=unrelated)
-        note = "colours of points and photos are unlike, so that nothing can be said"
+        note = "the colours of points and photos differ too much for a decision"
         return replace(verdict, notes=(*verdict.notes, note))
 
     def suspects(self) -> tuple[Cause, ...]:

@@ -56,7 +56,9 @@ def options_are_described(make: Make[Component]) -> None:
 def options_can_be_set(make: Make[Component]) -> None:
     """No option is called `name`: that key chooses the component."""
     clear = "name" not in type(make()).model_fields
-    require(clear, "the option `name` cannot be set, as that key chooses the component: rename it")
+    require(
+        clear, "the option `name` cannot be set, because this key chooses the component: rename it"
+    )
 
 
 def hooks_exist(make: Make[Component]) -> None:

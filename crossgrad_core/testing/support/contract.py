@@ -57,7 +57,9 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
         ContractError: No number from `VIEW_COUNTS` is admitted.
     """
     found = tuple(count for count in VIEW_COUNTS if views.admits(count))
-    require(found, f"no number of views from 1 to {max(VIEW_COUNTS)} is admitted: {views}")
+    require(
+        found, f"the component supports no number of views from 1 to {max(VIEW_COUNTS)}: {views}"
+    )
     return found
 
 

@@ -269,7 +269,7 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
         tried += 1
         _require_same(changed, case)
     if not tried:
-        raise cannot_tell("it has one value of max_alpha, near and dilation and no other")
+        raise cannot_tell("the rasterizer supports only one value of max_alpha, near and dilation")
 
 
 def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:

@@ -106,11 +106,16 @@ def require_repeated(run: ShortRun, again: ShortRun) -> None:
             same = found[0] == found[1]
             require(
                 same,
-                f"step {step}: two runs with one seed have the {what} {listed(map(str, found))}",
+                f"step {step}: two runs with the same seed have the {what} "
+                f"{listed(map(str, found))}",
             )
-    require(run.after.keys() == again.after.keys(), "two runs with one seed have other tensors")
+    require(
+        run.after.keys() == again.after.keys(), "two runs with the same seed have other tensors"
+    )
     for name, tensor in run.after.items():
-        require(torch.equal(tensor, again.after[name]), f"two runs with one seed differ in {name}")
+        require(
+            torch.equal(tensor, again.after[name]), f"two runs with the same seed differ in {name}"
+        )
 
 
 def try_out(config: RunConfig, steps: int) -> None:

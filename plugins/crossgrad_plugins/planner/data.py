@@ -89,7 +89,7 @@ def masks(evidence: Evidence) -> Finding:
     part = "masks"
     if evidence.is_given("data.masks"):
         return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")
-    note = evidence.scene_note("masks: ") or evidence.scene_note("does not count")
+    note = evidence.scene_note("masks: ") or evidence.scene_note("alpha < 0.5")
     plain = Finding(
         part,
         "masked pixels do not count" if note else "none",

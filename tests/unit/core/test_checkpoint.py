@@ -325,7 +325,10 @@ DAMAGES = {
     "no tensors": (lambda folder: (folder / "tensors.safetensors").unlink(), "no tensors"),
     "no state": (lambda folder: (folder / "state.json").unlink(), "no state.json"),
     "half a state": (lambda folder: (folder / "state.json").write_text('{"format'), "not JSON"),
-    "other JSON": (lambda folder: (folder / "state.json").write_text("[1]"), "not the state"),
+    "other JSON": (
+        lambda folder: (folder / "state.json").write_text("[1]"),
+        "does not contain the state",
+    ),
     "missing tensor": (change_state(tensors=["parameters/gone"]), "gone"),
     "unknown plugins": (change_state(plugins=3), "valid plugins"),
     "no step": (change_state(step=None), "valid step"),

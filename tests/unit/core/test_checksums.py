@@ -72,4 +72,4 @@ def test_a_file_that_another_program_changed_is_taken_with_a_warning(folder, cap
     assert not caplog.text
     (folder / "a.txt").write_text("edited")
     warn_if_changed(folder / "a.txt")
-    assert "is not the file that its run wrote" in caplog.text
+    assert "has changed since its run wrote it" in caplog.text

@@ -51,7 +51,7 @@ def test_other_tools_read_the_same_words(settings):
 
 
 def test_an_alias_bomb_is_refused_at_once():
-    refused(BOMB, "counting aliases", "line")
+    refused(BOMB, "including aliases", "line")
 
 
 @pytest.mark.parametrize(
@@ -64,16 +64,16 @@ def test_an_alias_bomb_is_refused_at_once():
         ("a: 1\n" * 100_000, "KiB"),
         ("a: 1\nb: 2\na: 3", "'a' occurs twice"),
         ("x: {a: 1, 'a': 3}", "'a' occurs twice"),
-        ("? [a]\n: 1", "not a word"),
+        ("? [a]\n: 1", "not a string"),
         ("a: " + "9" * 5000, "digits"),
         ("a: .nan", "NaN"),
-        ("a: !!python/object/apply:os.system [ls]", "no meaning"),
+        ("a: !!python/object/apply:os.system [ls]", "not supported"),
         ("a: !!int abc", "not of the type int"),
         ("a: !!float abc", "not of the type float"),
         ("a: !!bool abc", "not of the type bool"),
-        ("a: !!int [1]", "no meaning"),
-        ("a: !!set {a}", "no meaning"),
-        ("a: !mine 3", "no meaning"),
+        ("a: !!int [1]", "not supported"),
+        ("a: !!set {a}", "not supported"),
+        ("a: !mine 3", "not supported"),
         ('a: "\\U00110000"', "does not exist"),
         ('a: "\\uD800"', "character"),
         ('a: "x\\0y"', "character"),

@@ -224,7 +224,7 @@ def break_header(raw: bytes) -> bytes:
     [
         (lambda raw: raw[:0], "not a PLY file"),
         (lambda raw: b"\x89PNG\r\n" + raw, "not a PLY file"),
-        (lambda raw: raw[:40], "does not end"),
+        (lambda raw: raw[:40], "without an end"),
         (lambda raw: raw[:-1], "is incomplete"),
         (lambda raw: raw.replace(b"vertex 4", b"vertex 4000000000"), "is incomplete"),
         (lambda raw: raw.replace(b"element vertex", b"element points"), "has no vertices"),
@@ -257,7 +257,7 @@ def test_a_pipe_is_not_waited_for_and_called_one(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.ply")
     with pytest.raises(UserError) as told:
         read_ply(tmp_path / "pipe.ply")
-    assert told.value.found == "a pipe or device in place of a file"
+    assert told.value.found == "a pipe or device instead of a file"
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,10 @@ def test_a_stopped_run_says_so(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     ("totals", "said"),
     [
-        ((21, 30, 25, 40, 31, 30), ["the length followed the clock: 30 steps instead of 20"]),
+        (
+            (21, 30, 25, 40, 31, 30),
+            ["the number of steps was adapted to the time budget: 30 steps instead of 20"],
+        ),
         ((40, 30, 20), []),
         ((21,), []),
     ],

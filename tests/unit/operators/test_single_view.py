@@ -54,7 +54,7 @@ def notes_of(operator, sampler=None, views=None):
         sampler=ComponentChoice.model_validate(sampler or {"name": "epoch"}),
     )  # fmt: skip
     notes = assemble(config, sample_scene(), "none").notes
-    return [note for note in notes if "does nothing" in note]
+    return [note for note in notes if "has no effect" in note]
 
 
 def views_of(operator, sampler=None):

@@ -353,7 +353,7 @@ class TestPhotos:
                 converted.putalpha(alpha)
             converted.save(path / "images" / f"{name}.png")
         scene = read(path)
-        assert "1 of 8 with transparency: alpha < 0.5 does not count" in notes(scene)
+        assert "1 of 8 with transparency: pixels with alpha < 0.5 are ignored" in notes(scene)
         assert "1 of 8 grey: three equal channels" in notes(scene)
         assert scene.views[1].photo.image().shape == (32, 48, 3)
         keep = scene.views[2].photo.mask()
@@ -373,7 +373,7 @@ class TestPhotos:
         assert not keep[:, :24].any()
         assert keep[:, 24:].all()
         assert scene.views[1].photo.mask() is None
-        assert "masks: 1 of 8 have one: white counts" in notes(scene)
+        assert "masks: 1 of 8 have one: white pixels are used" in notes(scene)
         (path / "masks").rename(path / "mine")
         assert read(path).views[2].photo.mask() is None
         assert read(path, masks=Path("mine")).views[2].photo.mask() is not None
@@ -579,7 +579,7 @@ class TestModels:
         scene = read(write_tiny_scene(tmp_path, views=1))
         assert (scene.train, scene.test) == ((0,), ())
         assert "none held out: too few views" in notes(scene)
-        assert "the training cameras stand in one place" in notes(scene)
+        assert "all training cameras have the same position" in notes(scene)
         assert np.median(np.linalg.norm(scene.points, axis=1)) == pytest.approx(1, rel=1e-6)
 
 

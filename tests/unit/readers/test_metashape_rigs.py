@@ -135,7 +135,7 @@ def test_slaves_without_an_offset_are_left_out_as_without_a_pose(path):
     file.write_text(re.sub(r"<(location|rotation)>[^<]*</\1>", "", file.read_text()))
     scene = read(path)
     assert [view.name for view in scene.views] == ["0000.png", "0001.png"]
-    assert any("without a pose" in note for note in scene.notes)
+    assert any("have no pose" in note for note in scene.notes)
 
 
 def test_an_offset_that_is_no_rotation_is_refused(path):

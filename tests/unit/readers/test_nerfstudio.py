@@ -210,7 +210,7 @@ def test_photos_of_all_training_views_that_are_missing_are_no_fault_of_a_list_of
     names = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
     path = write(tmp_path, **LENS, **names)
     (path / "images" / "a.png").unlink()
-    with pytest.raises(UserError, match="no listed view can be trained on") as caught:
+    with pytest.raises(UserError, match="no listed view can be used for training") as caught:
         read(path, split="auto")
     assert caught.value.where == str(path)
     assert "add the missing photos" in caught.value.todo

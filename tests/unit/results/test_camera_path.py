@@ -159,7 +159,7 @@ def test_a_whole_number_of_pixels_may_have_a_point(tmp_path, width):
 
 def test_a_file_in_place_of_the_frames_folder_is_refused(tmp_path):
     (tmp_path / "renders").touch()
-    with pytest.raises(UserError, match="something else is in the way"):
+    with pytest.raises(UserError, match="already has this name"):
         video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")
 
 

@@ -110,7 +110,7 @@ def test_log_holds_what_the_run_says(tmp_path: Path):
         "",
         "third",
         "evaluated at step 4: PSNR 20.00 dB, SSIM 0.5000, - s training",
-        "the length followed the clock: 60 steps instead of 40",
+        "the number of steps was adapted to the time budget: 60 steps instead of 40",
         "run stopped",
     ]
 

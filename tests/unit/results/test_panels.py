@@ -121,7 +121,7 @@ def test_something_else_in_place_of_the_folder_of_panels(tmp_path: Path, make_vi
     place = tmp_path / "renders"
     place.symlink_to(tmp_path / "nowhere") if link else place.touch()
     view = make_view("a/1.jpg", "a")
-    with pytest.raises(UserError, match="something else is in the way"):
+    with pytest.raises(UserError, match="already has this name"):
         PanelWriter.of(tmp_path, 7, [view], count=1).write(
             make_evaluated(view, torch.zeros(16, 24, 3, dtype=torch.uint8))
         )

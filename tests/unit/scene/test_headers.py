@@ -70,7 +70,9 @@ def test_a_jpeg_filled_up_with_zeros_is_cut_short(tmp_path):
         read_header(path)
 
 
-@pytest.mark.parametrize(("content", "found"), [(b"", "an empty file"), (b"hello", "no format")])
+@pytest.mark.parametrize(
+    ("content", "found"), [(b"", "an empty file"), (b"hello", "an unknown image format")]
+)
 def test_what_is_no_photo_is_refused(content, found, tmp_path):
     path = tmp_path / "a.jpg"
     path.write_bytes(content)

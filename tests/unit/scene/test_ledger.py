@@ -44,8 +44,8 @@ def test_a_plain_scene_has_no_unused_files(scene):
 @pytest.mark.parametrize(
     ("folder", "reason"),
     [
-        ("mask", "named like masks; use them with --set data.masks=FOLDER"),
-        ("alpha_masks", "named like masks"),
+        ("mask", "files whose names look like masks; use them with --set data.masks=FOLDER"),
+        ("alpha_masks", "look like masks"),
         ("depth", "depth and normal maps are not used"),
         ("images_2", "smaller copies of the photos"),
         ("input", "outside the photo folder images/"),
@@ -63,8 +63,8 @@ def test_folders_of_images_are_listed_with_the_reason(folder, reason, scene):
     [
         ("sparse/0/points3D.ply", "the scene has its own points; start from such a file with"),
         ("cloud.LAZ", "--points FILE"),
-        ("gps.csv", "not a table that the reader takes"),
-        ("raw/0001.CR2", "a camera's own format; save the photos as JPEG or PNG"),
+        ("gps.csv", "the reader does not read this table"),
+        ("raw/0001.CR2", "raw files of a camera; save the photos as JPEG or PNG"),
         ("depth/0001.npy", "depth and normal maps"),
         ("maps/0001.exr", "depth and normal maps"),
     ],

@@ -189,7 +189,7 @@ def test_photos_that_disagree_are_named_in_a_note_and_in_the_figures(tmp_path, c
     (note,) = (note for note in scene.notes if note.startswith("check:"))
     assert "0003.png, 0007.png" in note
     assert note in caplog.text
-    assert scene.check["verdict"] == "some photos disagree"
+    assert scene.check["verdict"] == "some photos do not match"
     assert scene.check["disagreeing"] == ["0003.png", "0007.png"]
 
 
@@ -216,7 +216,7 @@ def test_a_scene_that_disagrees_as_a_whole_is_refused_unless_it_is_accepted(cont
     assert "--accept-scene" in error.value.todo
     accepted = checked(wrong, Path("scene"), cache_mib=1280, accept=True)
     assert any("OpenGL axes" in note for note in accepted.notes)
-    assert accepted.check["verdict"] == "the scene disagrees"
+    assert accepted.check["verdict"] == "points, poses and photos do not match"
 
 
 def test_of_a_scene_larger_than_the_memory_evenly_spread_photos_are_looked_at(model):

@@ -153,5 +153,5 @@ def test_names_in_both_lists_are_refused(tmp_path):
 @pytest.mark.parametrize("text", ["", "5.jpg\n"])
 def test_lists_without_a_training_view_are_refused(text, tmp_path):
     (tmp_path / "train_list.txt").write_text(text)
-    with pytest.raises(UserError, match="no listed view can be trained on"):
+    with pytest.raises(UserError, match="no listed view can be used for training"):
         split(NAMES, tmp_path)

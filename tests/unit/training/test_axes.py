@@ -242,7 +242,7 @@ def test_a_step_moves_positions_along_the_axes(backbone):
 def test_steps_by_size_are_refused_where_nothing_has_axes(backbone):
     setup = setup_of(backbone)
     config = setup.config.model_copy(update={"position_lr": "per-axis"})
-    with pytest.raises(UserError, match="no Gaussians with axes"):
+    with pytest.raises(UserError, match="does not train Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)
 
 

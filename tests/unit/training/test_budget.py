@@ -234,7 +234,7 @@ def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
     assert run.schedule.total == run.schedule.lr_until
     assert run.notes == (
         "a note on the scene",
-        f"the length followed the clock: {run.schedule.total} steps instead of {planned}",
+        f"the number of steps was adapted to the time budget: {run.schedule.total} steps instead of {planned}",
     )
 
 
@@ -288,10 +288,16 @@ def test_notes_that_a_new_length_makes_wrong_are_withdrawn():
     assert len(growth_notes(run)) == 1
     longer = with_length(run, 100, 3000)
     assert growth_notes(longer) == []
-    assert longer.notes[-1] == "the length followed the clock: 3000 steps instead of 935"
+    assert (
+        longer.notes[-1]
+        == "the number of steps was adapted to the time budget: 3000 steps instead of 935"
+    )
     shorter = with_length(longer, 200, 900)
     assert growth_notes(shorter) == list(growth_note(shorter)) != []
-    assert shorter.notes[-1] == "the length followed the clock: 900 steps instead of 935"
+    assert (
+        shorter.notes[-1]
+        == "the number of steps was adapted to the time budget: 900 steps instead of 935"
+    )
     back = with_length(shorter, 300, 935)
     assert back.notes == run.notes
 
@@ -306,7 +312,10 @@ def test_a_note_reports_once_that_density_control_takes_place_after_all(length):
             run = length.revised(run, state)
     assert growth_notes(run) == []
     (text,) = run.hook.texts
-    assert text.startswith("density control after all: in ") and "from step 500 to step" in text
+    assert (
+        text.startswith("density control is used after all: in ")
+        and "from step 500 to step" in text
+    )
 
 
 def test_a_note_reports_that_a_shorter_length_leaves_density_control_out():

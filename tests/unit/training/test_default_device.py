@@ -65,7 +65,9 @@ def test_a_gpu_is_taken_if_a_rasterizer_works_which_is_tried_once(on_a_gpu, capl
     with caplog.at_level(logging.INFO, "crossgrad_core"):
         device, notes = device_of()
     assert device == "cuda"
-    assert notes == (f"device cuda: rasterizer gswarp works on {GPU} (or --device cpu)",)
+    assert notes == (
+        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid it)",
+    )
     assert tried.devices == ["cuda"]
     assert "trying rasterizer gswarp on the GPU" in caplog.text
 

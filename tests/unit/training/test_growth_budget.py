@@ -184,7 +184,7 @@ def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
     assert found[0] == pytest.approx(2 * bound / 3, abs=0.5 + about)
     assert found[-1] == bound == max(found)
     (told,) = start_notes(setup, first_state(setup))
-    assert f"{found[0]:,} primitives instead of {whole:,}" in told
+    assert f"{found[0]:,} Gaussians instead of {whole:,}" in told
     for enough in (whole, whole + 1, "auto", None):
         state = first_state(setup := setup_of(name, max_gaussians=enough))
         assert state.primitives(setup) == whole and start_notes(setup, state) == ()
@@ -193,7 +193,7 @@ def test_a_bound_below_the_points_is_kept_with_room_to_grow(name, growth):
 def test_a_start_that_is_taken_as_it_is_is_reported_where_it_is_above_the_bound():
     state = first_state(setup_of("adc"))
     (told,) = start_notes(setup_of("adc", max_gaussians=30), state)
-    assert "more than --max-gaussians 30: a PLY is taken as it is" in told
+    assert "more than --max-gaussians 30: a PLY is used unchanged" in told
 
 
 @pytest.mark.parametrize(

@@ -275,7 +275,7 @@ def test_pixels_are_those_of_the_photo_and_another_step_has_others():
 
 
 def test_a_response_that_is_a_mean_over_pixels_is_refused():
-    with pytest.raises(UserError, match="is a mean over all of them"):
+    with pytest.raises(UserError, match="is a mean over all pixels"):
         assembled(backbone={"name": "analytic"})
 
 

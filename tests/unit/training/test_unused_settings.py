@@ -208,7 +208,7 @@ def test_gaussians_of_a_file_are_not_bounded(tmp_path):
     with pytest.raises(UserError) as caught:
         refusal({**settings, "densifier": {"name": "none"}})
     assert caught.value.where == "max_gaussians"
-    assert "a PLY is taken as it is" in caught.value.found
+    assert "a PLY is used unchanged" in caught.value.found
 
 
 @pytest.mark.parametrize("slot", ["backbones", "samplers", "operators", "rasterizers"])
