@@ -116,7 +116,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
         return RunConfig.model_validate(update)
     except ValidationError as error:
         subject = f"planner {planner}" if planner else f"recipe {config.recipe.name}"
-        todo = "{left + 1} more decisions (-v shows all)"
+        todo = "repair the plugin, or choose another --recipe (--plan off turns the planner off)"
         raise as_user_error(error, RunConfig, subject=subject, todo=todo) from error
 
 

@@ -127,7 +127,7 @@ def test_a_name_offered_twice_is_marked_in_the_list(ran, third_party, monkeypatc
     monkeypatch.syspath_prepend(third_party)
     rows = [row for row in ran("plugins")[1].splitlines() if row.startswith("  halving ")]
     assert len(rows) == 2
-    assert all("offered twice" in row for row in rows)
+    assert all("two packages offer this name" in row for row in rows)
 
 
 def test_the_list_and_the_check_report_an_entry_point_in_an_unknown_group(
@@ -162,7 +162,7 @@ def test_a_package_for_another_version_is_marked_in_the_list(ran, tmp_path, monk
     dated = {"operators": {"dated": "made_up_cli:Halving"}}
     write_distribution(tmp_path, "dated-package", dated, requires="crossgrad<0.2")
     monkeypatch.syspath_prepend(tmp_path)
-    words = "refused where it is asked for: it requires crossgrad<0.2"
+    words = "cannot be chosen: it requires crossgrad<0.2"
     assert f"dated dated-package 1.0 {words}" in " ".join(ran("plugins", "list")[1].split())
 
 

@@ -109,7 +109,7 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     assert "model: a vanilla run of" in printed
     assert "not georeferenced: neither the scene files nor the photos" in printed
     assert "Sarle's bimodality" in printed
-    assert "no exposure needs a model" in printed
+    assert "the exposures need no model" in printed
     rows = table(tmp_path / "out")
     assert len({row["step"] for row in rows}) == 2
     assert {row["metric"] for row in rows} == {"plain", "adam"}
@@ -219,7 +219,7 @@ def test_a_training_that_fails_reports_its_probes_and_the_reason(
     printed = capfd.readouterr()
     assert "training failed: the gradient of block means" in printed.err
     assert "Traceback" not in printed.err
-    assert "which failed; probed before that" in printed.out
+    assert "which failed; the probes before the failure are shown" in printed.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert {row["step"] for row in table(tmp_path / "out")} == {"10", "20"}
 

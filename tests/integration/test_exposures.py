@@ -85,7 +85,7 @@ def test_auto_is_a_gain_if_photos_differ_and_none_suggests_the_gain(varied, tmp_
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
     assert same(tmp_path / "auto", tmp_path / "gain")
     assert read_run(tmp_path / "auto").config["exposure"]["name"] == "gain"
-    assert "stops standard deviation" in notes(tmp_path / "auto")
+    assert "gains with a standard deviation of" in notes(tmp_path / "auto")
     assert "--exposure gain" in notes(tmp_path / "none")
 
 
@@ -232,7 +232,7 @@ def check_extremes(scene, tmp_path, case, model, views):
     settings = {"exposure": {"name": model}, "views_per_step": views}
     assert run(folder, tmp_path / "run", steps=6, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "for want of usable tracks and EXIF" in notes(tmp_path / "run")
+    assert "because there are no usable tracks and no EXIF data" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_photos_without_tracks_start_at_their_regime(varied, tmp_path, model):
     settings = {"exposure": {"name": model}, "data": {"init": "random"}}
     assert run(folder, tmp_path / "run", steps=2, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "no SfM tracks tell" in notes(tmp_path / "run")
+    assert "no SfM tracks connect the photos" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize("model", [*with_long("channel"), "auto"])
@@ -294,7 +294,7 @@ def test_one_photo_has_no_other_to_differ_from(scene, tmp_path, model):
     if model == "auto":
         assert "exposure auto: none" in notes(tmp_path / "run")
     else:
-        assert "no other to differ from" in notes(tmp_path / "run")
+        assert "only one training photo" in notes(tmp_path / "run")
 
 
 def with_exif(path, stops):

@@ -83,8 +83,7 @@ def exported(
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
             raise UserError(
                 "the name of the output file ends like a file of another format",
-                where="rename it, or choose another --format (`crossgrad plugins list` shows all "
-                "formats)",
+                where=f"--out {out}",
                 expected=f"a name that ends in .{exporter.suffix}",
                 todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
             )

@@ -154,21 +154,21 @@ def note_kinds(
             "rotated as their EXIF orientation says",
         ),
         (sum(header.alpha for header in headers.values()), "photos", f"with transparency: {over}"),
-        (sum(header.grey for header in headers.values()), "photos", "grey: three equal channels"),
+        (
+            sum(header.grey for header in headers.values()),
+            "photos",
+            "grey: copied into three equal channels",
+        ),
         (
             sum(s.mask is not None for s in sources.values()),
             "masks",
-            "grey: copied into three equal channels",
+            "have one: white pixels are used",
         ),
     )
     bare = [name for name, source in sorted(sources.items()) if source.mask is None]
-    missing = "have one: white pixels are used"
+    missing = f"{len(bare)} of {total} have none, and all their pixels are used: {name_some(bare)}"
     return [
-        *(
-            (f"{len(bare)} of {total} have none, and all their pixels are used: {name_some(bare)}")
-            for number, topic, what in told
-            if number
-        ),
+        *(f"{topic}: {number} of {total} {what}" for number, topic, what in told if number),
         *([f"masks: {missing}"] if bare and len(bare) < total else []),
     ]
 

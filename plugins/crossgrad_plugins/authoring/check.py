@@ -45,9 +45,12 @@ def check_package(package: str) -> tuple[str, bool]:
         lines += [_reason(result) for result in failures]
     total = len(found) + len(lost)
     for stray in lost:
-        lines += [f"  {stray.name}  FAIL", _reason(Result("it is never read", stray.reason))]
+        lines += [
+            f"  {stray.name}  FAIL",
+            _reason(Result("the plugin is never read", stray.reason)),
+        ]
     failed += len(lost)
-    lines.append(f"{total - failed} of {total} plugins keep the contract of their slot")
+    lines.append(f"{total - failed} of {total} plugins fulfil the contract of their slot")
     return "\n".join(lines), failed == 0
 
 

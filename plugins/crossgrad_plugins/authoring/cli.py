@@ -23,7 +23,7 @@ from crossgrad_core.commands import (
 )
 
 app = typer.Typer(
-    help="List, explain, check and begin plugins.",
+    help="List, explain, check and create plugins.",
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -31,14 +31,14 @@ app = typer.Typer(
 
 SlotOption = Annotated[
     str | None,
-    typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(OFFERED)}."),
+    typer.Option("--slot", metavar="SLOT", help=f"List only this slot: {listed(OFFERED)}."),
 ]
 
 
 PackageArgument = Annotated[
     str,
     typer.Argument(
-        metavar="PACKAGE", help="An installed package: its name for pip, or its import name."
+        metavar="PACKAGE", help="An installed package: its name in pip, or its import name."
     ),
 ]
 
@@ -58,7 +58,7 @@ def list_plugins(slot: SlotOption = None) -> None:
         typer.echo("\n".join(_rows(offers(each))) or "  none installed")
     if lost := [f"  {each.name}  {each.origin}: {each.reason}" for each in strays()]:
         typer.echo("\n".join(["never read", *lost]))
-    typer.echo("\n`crossgrad plugins show NAME` explains one of them.")
+    typer.echo("\n`crossgrad plugins show NAME` explains a plugin.")
 
 
 @app.command("show", cls=GroupedCommand)
@@ -108,13 +108,15 @@ def matrix(
         bool,
         typer.Option(
             "--full/--pairwise",
-            help="All combinations, or as few as bring every component of the package together "
-            "with every other one.",
+            help="Test all combinations; the default is a smaller set that contains every "
+            "pair of a component of the package and any other component.",
         ),
     ] = False,
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="COMBINATION", help="A single one, as the report shows it."),
+        typer.Option(
+            "--only", metavar="COMBINATION", help="Test one combination, in the form of the report."
+        ),
     ] = None,
 ) -> None:
     """Train a package's components with all others for a few steps.
@@ -142,10 +144,11 @@ def new(
         str, typer.Argument(metavar="NAME", help="Name of the plugin and of its package.")
     ],
     slot: Annotated[
-        str, typer.Option("--slot", metavar="SLOT", help=f"What it fills: {listed(OFFERED)}.")
+        str, typer.Option("--slot", metavar="SLOT", help=f"Slot of the plugin: {listed(OFFERED)}.")
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Its folder. Default: NAME.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder of the package. Default: NAME."),
     ] = None,
 ) -> None:
     """Write a small package with one plugin, to begin with.
@@ -182,10 +185,10 @@ def _rows(found: tuple[Entry, ...]) -> list[str]:
     for entry in found:
         note = ""
         if names.count(entry.name) > 1:
-            note = "  offered twice: it is refused where it is asked for"
+            note = "  two packages offer this name: choosing it is an error"
         if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
-            note = "  never called: the core has a command of that name"
+            note = "  never called: the core has a command with this name"
         if required := unmet_requirement(entry.distribution):
-            note = f"  refused where it is asked for: it requires {required}"
+            note = f"  cannot be chosen: it requires {required}"
         rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
     return rows

@@ -47,7 +47,7 @@ from crossgrad_plugins.compare.tables import (
     standing_table,
 )
 
-_MEANING: Final = "that they are equally fast is not given, and bits may differ"
+_MEANING: Final = "their speed may differ, and so may their bits"
 _MOST_SHOWN: Final = 3
 
 

@@ -260,7 +260,9 @@ class Cells:
         """Name of a run -> why it is not used, although its arm has no other run in its place."""
         chosen = self._chosen()
         return {
-            run.name: f"has {run.length_text}, other runs of {arm} on {scene} {text_of(length)}"
+            run.name: (
+                f"has {run.length_text}, but other runs of {arm} on {scene} have {text_of(length)}"
+            )
             for arm, problems in self.runs.items()
             for (scene, _), by in problems.items()
             if (length := chosen.get((arm, scene))) is not None and length not in by

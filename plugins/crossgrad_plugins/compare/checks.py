@@ -29,7 +29,7 @@ _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
 #: A machine whose mean load exceeds its number of cores by this amount is busy.
 _BUSY: Final = 0.5
 #: Wall-clock seconds in notes; CPU seconds may still be compared.
-_CLOCK: Final = "seconds of the clock"
+_CLOCK: Final = "wall-clock seconds"
 _NEVER_RECORDED: Final = "no run recorded them"
 
 
@@ -51,12 +51,12 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     notes = []
     if unknown and len(runs) > 1:
         shown = ", ".join(unknown[:_MOST_SHOWN])
-        notes.append(
-            f"{len(unknown)} without scene.json, so that nobody can tell which photos they had: "
-            f"{shown}"
-        )
+        notes.append(f"{len(unknown)} without scene.json, so their photos are not known: {shown}")
     return notes + [
-        f"regimes are not compared on {scene}: its runs label the held-out views differently"
+        (
+            f"regimes of scene {scene} are not compared: its runs label the held-out "
+            "views differently"
+        )
         for scene in differing_regimes(runs)
     ]
 
@@ -103,9 +103,9 @@ def _check_sizes(scene: str, runs: Sequence[Run]) -> None:
             f"runs of scene {scene} were evaluated at different photo sizes or with "
             "different resize filters",
             where=f"{found[0].name}, {found[1].name}",
-            expected="one size: PSNR falls with the size of the photos",
+            expected="the same size for all runs: PSNR falls with the size of the photos",
             found=" against ".join(_sizes(run) for run in found),
-            todo="the same size for all runs: PSNR falls with the size of the photos",
+            todo="compare only runs with the same --max-size and images folder",
         )
 
 
@@ -115,7 +115,7 @@ def _check_trained(scene: str, runs: Sequence[Run]) -> None:
         first, second = found
         raise UserError(
             f"runs of scene {scene} were trained on different photos",
-            where="compare only runs with the same --max-size and images folder",
+            where=f"{first.name}, {second.name}",
             expected="the same split in scene.json",
             found=_difference(_trained(first), _trained(second)),
             todo="compare only runs with the same --split and --test-every",
@@ -159,7 +159,7 @@ def _sizes(run: Run) -> str:
 
 
 def _difference(first: frozenset[str], second: frozenset[str]) -> str:
-    sides = (("only in the first", first - second), ("only in the second", second - first))
+    sides = (("only in the first run", first - second), ("only in the second run", second - first))
     return "; ".join(
         f"{len(names)} {side}: {', '.join(sorted(names)[:_MOST_SHOWN])}"
         for side, names in sides
@@ -204,9 +204,9 @@ def quantities_of(
         if key == name:
             continue
         if len(_definitions(runs, key)) > 1:
-            notes.append(f"{key} is not compared: runs define it differently")
+            notes.append(f"{key} is not compared: the runs define it differently")
         elif lacking := [run.name for run in runs if key not in _overall(run)]:
-            notes.append(f"{key} is not compared: {lacking[0]} and others did not measure it"
+            notes.append(f"{key} is not compared: {lacking[0]} and other runs did not measure it"
                          if len(lacking) > 1 else
                          f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
         else:
@@ -334,7 +334,10 @@ def _busy(runs: Sequence[Run]) -> str:
             run.number("environment", "cpu_cores"),
         )
         if load is not None and cores is not None and load > cores + _BUSY:
-            return f"the machine was busy: a load of {load:.1f} on {cores:g} cores at {run.name}"
+            return (
+                f"the machine was busy during {run.name}: its load was {load:.1f} on "
+                f"{cores:g} cores"
+            )
     return ""
 
 
@@ -346,7 +349,7 @@ def _threads(runs: Sequence[Run]) -> str:
     for run in runs:
         threads = run.number("environment", "torch_threads")
         if threads is not None and threads > 1:
-            return f"they only compare with one thread, and {run.name} has {threads:g}"
+            return f"they can be compared only with one thread, and {run.name} used {threads:g}"
     return ""
 
 

@@ -259,7 +259,8 @@ def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
             held_out = run.number("overall", "views") != 0.0
             why = "not finite" if held_out else "no view is held out"
             notes.append(
-                f"{run.name} has no {quantity.label} at its end ({why}): its pair is left out, and "
-                "it never reaches a quality that it did not reach before"
+                f"{run.name} has no {quantity.label} at its end ({why}): its pair is left "
+                "out, and it counts as never reaching a quality that it had not reached "
+                "before"
             )
     return notes

@@ -121,7 +121,7 @@ def _folders(place: Path) -> Iterator[Path]:
 
 
 def _no_run(place: Path) -> UserError:
-    there = "a file" if place.is_file() else "no such folder"
+    there = "a file" if place.is_file() else "the folder does not exist"
     return UserError(
         "there is no run to compare",
         where=place,
@@ -151,7 +151,7 @@ def _broken(error: UserError) -> UserError:
 
 def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | None) -> None:
     if results.summary is None:
-        found.left_out[name] = "has not ended: no summary.json"
+        found.left_out[name] = "has not finished: no summary.json"
         return
     _check_summary(results)
     run = Run(name, results, results.summary, _config(results), label)

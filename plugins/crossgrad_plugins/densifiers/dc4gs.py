@@ -95,8 +95,12 @@ class DirectionalConsistency(CloneSplit):
 
     needs = frozenset({"directions"})
 
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to clone at")
-    split_threshold: float = Field(4e-4, gt=0, description="mean (1 - R) ga, NDC, to split at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which Gaussians are cloned"
+    )
+    split_threshold: float = Field(
+        4e-4, gt=0, description="mean (1 - R) ga, NDC, above which Gaussians are split"
+    )
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:

@@ -187,17 +187,21 @@ class MarkovChainMonteCarlo(Densifier):
     observes: ClassVar[bool] = False
 
     cap: int = Field(1_000_000, ge=0, description="most Gaussians")
-    growth: float = Field(0.05, ge=0, le=1, description="share added per pass")
-    dead_opacity: float = Field(0.005, gt=0, lt=1, description="relocated at or below")
-    noise: float = Field(5e5, ge=0, description="noise of positions, per learning rate; 0 for none")
+    growth: float = Field(0.05, ge=0, le=1, description="share of Gaussians added per edit")
+    dead_opacity: float = Field(
+        0.005, gt=0, lt=1, description="Gaussians with at most this opacity are relocated"
+    )
+    noise: float = Field(
+        5e5, ge=0, description="noise added to positions, per learning rate; 0 for none"
+    )
     opacity_weight: float = Field(0.01, ge=0, description="weight of the mean opacity in the loss")
     scale_weight: float = Field(
         0.01, ge=0, description="weight of the mean scale in the loss, per scene extent"
     )
     initial_opacity: float | None = Field(
-        0.5, gt=0, lt=1, description="opacity at the start; none keeps the backbone's"
+        0.5, gt=0, lt=1, description="initial opacity; null uses the backbone's"
     )
-    initial_scale: float = Field(0.1, gt=0, description="factor of the scales at the start")
+    initial_scale: float = Field(0.1, gt=0, description="factor of the initial scales")
 
     @override
     def window(self, schedule: Schedule) -> Schedule:

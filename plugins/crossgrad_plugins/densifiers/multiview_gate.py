@@ -56,7 +56,7 @@ class MultiViewGate(CountsMarkedPixels):
     """
 
     of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (
-        Field(cast("Any", "adc"), description="the densifier behind the gate: adc, anchor, octree")
+        Field(cast("Any", "adc"), description="inner densifier: adc, anchor, octree")
     )
 
     @property

@@ -21,9 +21,14 @@ class PixelDensityControl(AxisSplit):
 
     needs = frozenset({"pixels"})
 
-    grad_threshold: float = Field(2e-4, gt=0, description="scaled NDC gradient to densify at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="scaled NDC gradient above which Gaussians are densified"
+    )
     depth_threshold: float = Field(
-        0.37, gt=0, description="Gaussians nearer to the camera count for less; scene extents"
+        0.37,
+        gt=0,
+        description="distance to a camera below which Gaussians receive a lower weight; scene "
+        "extents",
     )
 
     @override

@@ -116,7 +116,7 @@ def diagnose(
         try:
             report = diagnose_scene(config, options)
         except TrainingFailedError as error:
-            return _failed(f"{error}; nothing was probed before")
+            return _failed(f"{error}; nothing was probed before this error")
         folder = out or Path("runs") / report.scene / "diagnose" / stamp
     _write(report, folder)
     return 0 if report.failure is None else _failed(report.failure)
@@ -186,7 +186,7 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
     except TrainingFailedError as error:
         if watch.last is None:
             raise
-        model = f"{model}, which failed; probed before that"
+        model = f"{model}, which failed; the probes before the failure are shown"
         return replace(_report(model, watch, model_of(setup, state), options), failure=str(error))
     return _report(model, watch, model_of(setup, state), options)
 

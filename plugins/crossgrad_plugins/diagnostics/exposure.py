@@ -38,9 +38,9 @@ class SceneExposure:
     def lines(self) -> list[str]:
         """Return the lines for a terminal."""
         verdict = (
-            "the photos differ in exposure; a run models that by itself (--exposure auto)"
+            ("the photos differ in exposure; a run models this by default (--exposure auto)")
             if self.differ
-            else "no exposure needs a model (--exposure none)"
+            else "the exposures need no model (--exposure none)"
         )
         return ["exposure", f"  {self.evidence}", f"  {verdict}"]
 

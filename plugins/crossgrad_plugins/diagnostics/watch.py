@@ -89,7 +89,7 @@ def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row
         near = plan.near([measurement.views[place] for place in places])
         probed = min(int(near.sum()), int((~near).sum()))
         if probed < SMALLEST_GROUP:
-            rows.append({"grouping": name, "note": "too few probed views in one of its groups"})
+            rows.append({"grouping": name, "note": "one of its groups has too few probed views"})
             continue
         rows += _read_by(plan.grouping, plan.cameras, _part(measurement, places), near)
     return rows
@@ -211,6 +211,6 @@ class Watch:
 
 def _shortcomings(measurement: Measurement) -> Iterator[str]:
     if measurement.dropped:
-        yield f"left out, gradient not finite: {', '.join(measurement.dropped)}"
+        yield f"left out, because their gradient is not finite: {', '.join(measurement.dropped)}"
     if measurement.share < 1.0:
-        yield f"gradients of a random {measurement.share:.0%} of the primitives"
+        yield f"gradients of a random {measurement.share:.0%} of the Gaussians"

@@ -79,12 +79,17 @@ def write_ply(
     valid = _representable(moved)
     if not valid.all():
         moved = moved.selected(valid)
-        notes.append(f"{path.name}: {np.sum(~valid):,} Gaussians that are not finite left out")
+        notes.append(
+            f"{path.name}: {np.sum(~valid):,} Gaussians left out, because they are not finite"
+        )
     tags = [f"{_MODE_TAG} {cloud.render_mode}"]
     if offset.any():
         text = " ".join(_plain(value) for value in offset)
         tags.append(f"{_OFFSET_TAG} {text}")
-        notes.append(f"{path.name}: coordinates are relative to {text} (float32 is too coarse)")
+        notes.append(
+            f"{path.name}: coordinates are relative to {text}, because float32 is not "
+            "precise enough"
+        )
     header = _header(len(moved), [*tags, *comments])
     with atomic_file(path, len(header) + 4 * len(PROPERTIES) * len(moved)) as file:
         file.write(header)
@@ -253,7 +258,7 @@ def _require_properties(names: Collection[str], path: Path) -> None:
     todo = (
         "decompress it, e.g. with splat-transform"
         if packed
-        else f"--points {path} starts from its points; --init takes a file of Gaussians"
+        else (f"use --points {path} to start from its points; --init needs a file of Gaussians")
         if points
         else "export the Gaussians, not the sparse points or a mesh"
     )

@@ -63,4 +63,4 @@ class NoExposure(Exposure):
             return ()
         if not gains.differ:
             return ()
-        return (f"the photos differ in exposure, which --exposure gain models: {gains.evidence}",)
+        return ((f"the photos differ in exposure, which --exposure gain models: {gains.evidence}"),)

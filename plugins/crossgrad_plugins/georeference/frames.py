@@ -124,7 +124,7 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
     than half of the points agree.
     """
     if len(points) < FEWEST:
-        return f"there are {len(points)} of them, and {FEWEST} are needed"
+        return f"there are {len(points)} of them, but at least {FEWEST} are needed"
     kept = np.ones(len(points), dtype=bool)
     if len(points) >= _FEWEST_TO_REJECT:
         kept = _agreeing(points, measured)
@@ -136,10 +136,10 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
     along, *across = np.linalg.svd(posed, compute_uv=False)
     width = float(np.hypot(*across))
     if not along > 0.0:
-        return "they stand all at one place"
+        return "they are all at the same position"
     tilt = sigma / width if width > _THINNEST * along else np.inf
     if tilt > _LARGEST_TILT:
-        return "they stand in one line, or closer to one than their errors: any turn about it fits"
+        return "they are on a line, within their errors, so the rotation about it is unknown"
     return Fit(frame, errors, kept, tilt)
 
 

@@ -80,9 +80,14 @@ class Projection:
     def messages(self) -> tuple[str, ...]:
         """Messages on the accuracy of coordinates in this system."""
         if self.accuracy is None:
-            return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)
+            return (
+                (
+                    f"{self.code}: PROJ does not report the accuracy; positions may be wrong by "
+                    "metres"
+                ),
+            )
         if self.accuracy > _KNOWN_WELL:
-            return (f"{self.code}: exact to {self.accuracy:g} m, says PROJ",)
+            return (f"{self.code}: accurate to {self.accuracy:g} m, according to PROJ",)
         return ()
 
     def points(self, geocentric: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,14 +114,15 @@ class Projection:
         here, *sides = self.points(to_enu.inverse.points(ends))
         stretch = (np.array(sides[:3]) - np.array(sides[3:])).T / (2.0 * _NEAR)
         if not np.isfinite(stretch).all():
-            raise self._unusable(where, "the scene is outside of where it is defined")
+            raise self._unusable(where, "the scene is outside the area of the coordinate system")
         left, sizes, right = np.linalg.svd(stretch)
         rotation = left @ right
         if np.linalg.det(rotation) < 0.0:
             raise self._unusable(where, "its axes are left-handed")
         if sizes[0] > (1.0 + _UNEVEN) * sizes[2]:
             raise self._unusable(
-                where, f"a metre is {sizes[2]:.4g} to {sizes[0]:.4g} units, by direction"
+                where,
+                f"one metre is {sizes[2]:.4g} to {sizes[0]:.4g} units, depending on the direction",
             )
         scale = float(np.cbrt(sizes.prod()))
         return Frame3D(rotation, here - scale * rotation @ place, scale)

@@ -46,9 +46,11 @@ class ConflictSignature(Regrouping):
 
     needs_probe: ClassVar[bool] = True
 
-    at: int = Field(500, ge=1, description="step after which gradients group the views")
+    at: int = Field(
+        500, ge=1, description="step after which the views are grouped by their gradients"
+    )
     cameras: int = Field(
-        96, ge=2, description="probe at most so many training views, evenly spaced by name"
+        96, ge=2, description="maximum number of probed views, evenly spaced by name"
     )
 
     @override
@@ -58,7 +60,7 @@ class ConflictSignature(Regrouping):
         require_training_views(scene, "conflict-signature")
         if probe is None:
             early = Radial().fit(scene, rng)
-            later = f"grouping conflict-signature: by gradients after step {self.at}, until then:"
+            later = f"grouping conflict-signature: by gradients after step {self.at}, before that:"
             return GroupingRule(early.labels, (later, *early.notes))
         count = min(self.cameras, len(scene.train))
         probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
@@ -67,14 +69,17 @@ class ConflictSignature(Regrouping):
         chosen = [scene.train_views[i] for i in probed]
         near = smaller_mean_first(sides, radial_distances(scene, chosen))
         train = [NEAR if side == near else FAR for side in sides]
-        require_groups("conflict-signature", train, (NEAR, FAR), "the directions of gradients")
+        require_groups("conflict-signature", train, (NEAR, FAR), "gradient directions")
         tree = cKDTree(centers_of(chosen))
 
         def labels(views: Sequence[View]) -> tuple[str, ...]:
             _, nearest = tree.query(centers_of(views))
             return tuple(train[i] for i in nearest)
 
-        note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
+        note = (
+            f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed "
+            "views are near"
+        )
         return GroupingRule(labels, (note,))
 
     @property
@@ -91,7 +96,7 @@ class ConflictSignature(Regrouping):
         except UserError as error:
             # Gradients that all agree form one group; the run then keeps its present groups.
             early = Radial().fit(model.scene, rng)
-            return GroupingRule(early.labels, (f"the groups stay as they are: {error.what}",))
+            return GroupingRule(early.labels, (f"the groups do not change: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:

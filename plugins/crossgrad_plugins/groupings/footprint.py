@@ -68,7 +68,10 @@ class Footprint(Grouping):
         require_groups("footprint", halves(train, threshold), (NEAR, FAR), "projected footprint")
         note = f"grouping footprint: near from {-threshold:.4g} pixels per local unit"
         if blind.any():
-            note += f"; training views without SfM points go with the nearest other: {blind.sum()}"
+            note += (
+                "; training views without SfM points join the group of the nearest other "
+                f"view: {blind.sum()}"
+            )
         return GroupingRule(lambda views: halves(sizes(views), threshold), (note,))
 
     @override

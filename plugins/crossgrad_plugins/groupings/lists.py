@@ -57,7 +57,7 @@ def read_labels(path: Path) -> dict[str, str]:
     Raises:
         UserError: The file is missing, a row does not have two columns, or a name has two labels.
     """
-    todo = "check the path; the file is text in UTF-8 with rows `name,label`"
+    todo = "check the path; the file must be UTF-8 text with rows `name,label`"
     rows = [row for row in read_rows(path, "the list of labels", todo) if row]
     table: dict[str, str] = {}
     for row in rows:

@@ -10,7 +10,7 @@ from crossgrad_core.plugin import GroupingRule, Quantity, Scene, UserError, View
 
 #: The threshold between near and far: the median distance, or Otsu's threshold of its logarithm.
 Cut: TypeAlias = Literal["median", "otsu"]
-CUT: Final = "where near ends: the median, or Otsu's cut of the logarithms"
+CUT: Final = "threshold between near and far: the median, or Otsu's threshold of the logarithms"
 NEAR, MIDDLE, FAR = "near", "middle", "far"
 
 

@@ -70,12 +70,15 @@ class Filled(Initializer):
     Ours.
     """
 
-    cells: int = Field(12, ge=2, le=200, description="along the longer side of a photo")
+    cells: int = Field(12, ge=2, le=200, description="points along the longer side of a photo")
     margin: float = Field(
-        0.5, ge=0.0, le=2.0, description="beyond each edge, in longer sides of the photo; 0: none"
+        0.5,
+        ge=0.0,
+        le=2.0,
+        description="margin beyond each edge of the photo, as a share of its longer side; 0: none",
     )
-    opacity: float = Field(0.5, gt=0.0, lt=1.0, description="of the added Gaussians")
-    views: int = Field(200, ge=1, description="photos that are looked at, at most")
+    opacity: float = Field(0.5, gt=0.0, lt=1.0, description="opacity of the added Gaussians")
+    views: int = Field(200, ge=1, description="maximum number of photos to fill")
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
@@ -94,10 +97,13 @@ class Filled(Initializer):
     def messages(self, scene: Scene) -> tuple[str, ...]:
         filling = self._filling(scene)
         beyond = len(filling.points) - len(scene.points) - filling.inside
-        aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were left aside"
+        aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were skipped"
         return (
-            f"start: {filling.inside} Gaussians fill what photos show without points, {beyond} "
-            f"stand beyond their edges{aside if filling.left_aside else ''}",
+            (
+                f"start: {filling.inside} Gaussians added inside photos where there are no "
+                f"points, {beyond} beyond the edges of "
+                f"photos{(aside if filling.left_aside else '')}"
+            ),
         )
 
     def _filling(self, scene: Scene) -> _Filling:

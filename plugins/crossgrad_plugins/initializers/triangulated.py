@@ -78,10 +78,14 @@ class Triangulated(Initializer):
 
     alone: ClassVar[bool] = True
 
-    views: int = Field(200, ge=2, description="photos that are looked at, at most")
-    neighbours: int = Field(4, ge=1, le=50, description="photos that each one is compared with")
-    features: int = Field(2048, ge=16, le=65_536, description="features of a photo, at most")
-    pixels: float = Field(2.0, gt=0.0, description="of a point from its feature, at most")
+    views: int = Field(200, ge=2, description="maximum number of photos to match")
+    neighbours: int = Field(
+        4, ge=1, le=50, description="number of photos that each photo is matched with"
+    )
+    features: int = Field(
+        2048, ge=16, le=65_536, description="maximum number of features per photo"
+    )
+    pixels: float = Field(2.0, gt=0.0, description="maximum reprojection error of a point")
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
@@ -96,7 +100,7 @@ class Triangulated(Initializer):
     def messages(self, scene: Scene) -> tuple[str, ...]:
         more = self.more_points(scene)
         if more is None:
-            return ("start: the scene has points; none are triangulated",)
+            return ("start: the scene has points, so none are triangulated",)
         return (f"start: {len(more.positions)} points triangulated from pairs of photos",)
 
     def _found(self, scene: Scene) -> MorePoints:

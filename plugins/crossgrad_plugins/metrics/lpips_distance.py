@@ -93,7 +93,7 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
 
 
 def _read_trunk(net: Trunk, path: Path, setting: str) -> tuple[tuple[Tensor, Tensor], ...]:
-    todo = f"--set {setting}=FILE names torchvision's {net.model}, such as {net.published}"
+    todo = f"--set {setting}=FILE must name torchvision's {net.model}, such as {net.published}"
     found = {name.removeprefix("features."): tensor for name, tensor in _read(path, todo).items()}
     pairs = []
     for layer in net.layers:
@@ -108,7 +108,9 @@ def _name(layer: Convolution, part: str) -> str:
 
 
 def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
-    todo = f"--set {setting}=FILE names the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
+    todo = (
+        f"--set {setting}=FILE must name the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
+    )
     found = _read(path, todo)
     shapes: dict[str, tuple[int, ...]] = {
         f"lin{place}.model.1.weight": (1, layer.shape[0], 1, 1)
@@ -149,7 +151,7 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
     except Exception as error:  # Exceptions for damaged files are not documented.
         # Torch's own message ends with the advice to execute code from the file, so it is not
         # shown.
-        raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error
+        raise _unreadable(path, f"{type(error).__name__} while reading", todo) from error
     if not isinstance(found, Mapping):
         raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
     return {name: tensor for name, tensor in found.items() if isinstance(tensor, Tensor)}
@@ -172,7 +174,7 @@ def _check(
     for name, shape in shapes.items():
         tensor = found.get(name)
         if tensor is None or tuple(tensor.shape) != shape:
-            told = "nothing of that name" if tensor is None else f"shape {list(tensor.shape)}"
+            told = "no tensor with that name" if tensor is None else f"shape {list(tensor.shape)}"
         elif not bool(torch.isfinite(tensor).all()):
             told = "numbers that are not finite"
         else:

@@ -34,7 +34,7 @@ class TrackExposedPSNR(Metric):
         "to the photo at the SfM points that the view observed (3 x 3 means, least squares of sRGB "
         "values)",
         undefined=f"no held-out view has {LEAST} SfM observations that are neither too dark nor "
-        "cut off",
+        "saturated",
     )
 
     @override

@@ -43,10 +43,12 @@ class Progress(Observer):
 
     level: Literal["quiet", "normal", "verbose"] = Field(
         "normal",
-        description="quiet: nothing; normal: scene, decisions, progress, evaluations, messages; "
-        "verbose: also all notes and every change of density control",
+        description="quiet: print nothing; normal: scene, decisions, progress, evaluations, "
+        "messages; verbose: also all notes and every change of density control",
     )
-    interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
+    interval: float = Field(
+        10.0, gt=0.0, description="seconds between lines if the output is not a terminal"
+    )
 
     # The state of the display; it is not part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
@@ -72,7 +74,7 @@ class Progress(Observer):
         for line in shown:
             self._say(f"- {line}")
         if run.notes and not verbose:
-            self._say(f"- further notes: {len(run.notes)} (in log.txt, or with -v)")
+            self._say(f"- more notes: {len(run.notes)} (in log.txt, or with -v)")
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:

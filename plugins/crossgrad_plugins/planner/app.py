@@ -43,8 +43,8 @@ def lines_of(plan: Plan, width: int) -> Iterator[str]:
     if width >= _WIDE:
         yield ""
     changed = [f"{name} = {value}" for name, value in plan.settings.items()]
-    summary = f"changed: {', '.join(changed)}" if changed else "nothing is changed"
-    yield from wrap(f"{summary}; default: the evidence is missing or undecided", width)
+    summary = f"changed: {', '.join(changed)}" if changed else "no settings changed"
+    yield from wrap(f"{summary}; default: the evidence is missing or not conclusive", width)
     yield f"decided in {plan.seconds:.1f} s"
 
 
@@ -120,7 +120,7 @@ def plan(
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:
-        return made, "--write FILE keeps this for crossgrad run --config FILE"
+        return made, "use --write FILE to save these settings for `crossgrad run --config FILE`"
     named = None if options.get("scene") is None else config.scene
     return made, f"run it: {_command(named, {**options, 'config': file}, assignments)}"
 

@@ -121,4 +121,6 @@ class Finding:
 
 def given(part: str, choice: object, force: str) -> Finding:
     """Return the choice of the user, which applies without evidence from the scene."""
-    return Finding(part, str(choice), "given", "set by you", "what you set wins", "you", force)
+    return Finding(
+        part, str(choice), "given", "set by you", "your own setting has priority", "you", force
+    )

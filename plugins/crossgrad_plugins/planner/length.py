@@ -33,13 +33,13 @@ def length(evidence: Evidence) -> Finding:
         usual,
         "default",
         "",
-        f"{PASSES} views of each training photo, {FEWEST_VIEWS:,} at least: more of them gain "
-        "little and take long, as Gaussians grow",
+        f"{PASSES} views of each training photo, at least {FEWEST_VIEWS:,}: more "
+        "views gain little and take long, because the number of Gaussians grows",
         "docs/plan.md, four scenes",
         _EXACTLY,
     )
     if not evidence.is_measured or config.schedule == "absolute":
-        return plain.found("a published schedule, which a shorter run would cut")
+        return plain.found("a published schedule, which a shorter run would cut off")
     if not photos:
         return plain.found("no training photos")
     shown = f"{most // photos:,} views of each of {photos:,} training photos"

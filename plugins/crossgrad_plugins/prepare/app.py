@@ -191,18 +191,20 @@ def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
     """
     layout, why = Layout(scene), ""
     if layout.is_ready and not layout.is_whole:
-        why = f"{layout.work} is gone, which says what it was made of"
+        why = f"{layout.work} is missing, which records how the scene was made"
     elif layout.is_ready and not has_photos(photos):
-        why = f"there are no photos in {photos} any more"
+        why = f"{photos} no longer contains photos"
     told = (
-        [f"{why}: the scene is taken as it is"]
+        [f"{why}: the scene is used unchanged"]
         if why
         else summary_lines(prepared(photos, scene, settings))
     )
     able = [name for name in entries("readers") if accepts(name, photos)]
     return told + [
-        f"the folder has poses of its own (reader {name}), which are not used; to train with them, "
-        "leave --prepare out"
+        (
+            f"the folder already has poses (reader {name}), which are not used; leave "
+            "--prepare out to train with them"
+        )
         for name in able[:1]
     ]
 
@@ -236,7 +238,7 @@ def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
     progress = Progress(_PAUSE)
 
     def tell(done: int, of: int) -> None:
-        progress.tell(f"looking at photos: {done} of {of}")
+        progress.tell(f"reading photos: {done} of {of}")
 
     used, left_out = find_photos(photos, settings, tell, fewest)
     root = str(photos.resolve())

@@ -210,7 +210,7 @@ def _looked_again(
     adjust = partial(_adjusted, threads, Path(plan.photos))
     with disk_errors(scratch):
         return waited(
-            "placing doubtful photos",
+            "finding poses for doubtful photos",
             lambda token: looked_again(
                 models, layout.database, scratch, partial(adjust, token), lambda: token.is_cancelled
             ),

@@ -194,10 +194,13 @@ def _tell_folders(
                 name=name_some([f"{folder}/"]), why="the folder of masks (--masks), not of photos"
             )
         elif strays:
-            why = f"masks, but {count(len(strays), 'file')} of no photo: {name_some(strays)}"
+            why = (
+                f"masks, including {count(len(strays), 'file')} that belong to no photo: "
+                f"{name_some(strays)}"
+            )
             yield LeftOut(name=name_some([f"{folder}/"]), why=why)
         elif folder != _MASKS:
-            yield LeftOut(name=name_some([f"{folder}/"]), why="masks of the photos beside it")
+            yield LeftOut(name=name_some([f"{folder}/"]), why="masks of the photos next to it")
 
 
 def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
@@ -207,9 +210,9 @@ def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
     for name in beside:
         path = PurePosixPath(name)
         if str(path.with_suffix("")) not in masks:
-            why = "named as a mask, but of no photo: rename it if it is one"
+            why = "named like a mask, but without a photo: rename it if it is a photo"
         elif path.suffix != ".png":
-            why = "the name of a mask beside its photo has to end in .png"
+            why = "the name of a mask next to its photo must end in .png"
         else:
             continue
         yield LeftOut(name=name_some([name]), why=why)

@@ -309,11 +309,11 @@ def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> 
     """Return the error for too few usable photos."""
     first = "; ".join(f"{each.name}: {each.why}" for each in left_out[:3])
     nothing = not used and not left_out
-    todo = "name the folder that the photos are in"
+    todo = "name the folder that contains the photos"
     if left_out:
-        todo = "repair, convert or leave out what is named, or name another folder"
+        todo = "repair, convert or remove these photos, or name another folder"
     elif used:
-        todo = "add photos that overlap with it, taken from other places"
+        todo = "add photos that overlap with it, taken from other positions"
     return UserError(
         "the folder contains no photos" if nothing else "too few photos can be used",
         where=root,

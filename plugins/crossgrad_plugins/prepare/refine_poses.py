@@ -99,7 +99,7 @@ def looked_again(
         try:
             main = adjust(again.copy, place)
         except (RuntimeError, ValueError) as error:
-            _LOG.warning("doubtful photos stay where they are: pycolmap failed: %s", error)
+            _LOG.warning("doubtful photos keep their poses: pycolmap failed: %s", error)
             break
         _leave_out_impossible(main)
         look = again.look(main)

@@ -7,4 +7,7 @@ from typing import Literal, TypeAlias
 #: `published`).
 Footprint: TypeAlias = Literal["alpha", "3-sigma"]
 
-DESCRIPTION = "alpha: all pixels with alpha >= 1/255; 3-sigma: as the original code"
+DESCRIPTION = (
+    "size of the rendered footprint: alpha: all pixels with alpha >= 1/255; "
+    "3-sigma: as in the original code"
+)

@@ -191,7 +191,7 @@ class Kind:
 
 METASHAPE: Final = Kind(
     *("XML", "Metashape", ".xml", _is_metashape),
-    "one file of File > Export > Export Cameras, with a chunk in a document",
+    "one file of File > Export > Export Cameras that contains a chunk in a document",
 )
 REALITYCAPTURE: Final = Kind(
     *("CSV", "RealityCapture", ".csv", _has_columns),

@@ -12,8 +12,11 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 
 _OPENGL: Final = np.diag([1.0, -1.0, -1.0])
-_UNDISTORT = "undistort the photos with the program that posed them and export them as pinhole ones"
-_CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective ones first"
+_UNDISTORT = (
+    "undistort the photos with the program that estimated their poses, and "
+    "export them with pinhole cameras"
+)
+_CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective photos first"
 
 
 def from_opengl(

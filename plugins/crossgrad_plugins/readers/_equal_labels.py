@@ -154,7 +154,9 @@ def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
             for i, names in found.items():
                 fits[i] = names
             pairs = ", ".join(f"{owner or 'none'} {place}" for owner, place in places.items())
-            return [f"photos of equal labels are paired by the order of {of}s and folders: {pairs}"]
+            return [
+                (f"photos with equal labels are paired by the order of {of}s and folders: {pairs}")
+            ]
     return []
 
 

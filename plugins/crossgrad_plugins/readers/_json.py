@@ -17,7 +17,7 @@ from crossgrad_core.scene.raw import FARTHEST
 LARGEST: Final = 512 << 20
 #: Largest width or height of a photo, in pixels.
 LONGEST_SIDE: Final = 10_000_000
-_AGAIN = "mend the file, or export it again"
+_AGAIN = "correct the file, or export it again"
 _LONGEST: Final = 80
 
 
@@ -53,7 +53,7 @@ class Fields:
         Raises:
             UserError: Always.
         """
-        here = repr(self.value[key])[:_LONGEST] if key in self.value else "no such field"
+        here = repr(self.value[key])[:_LONGEST] if key in self.value else "the field is missing"
         raise UserError(
             "a field of the scene file cannot be read",
             where=self.where(key),
@@ -105,10 +105,10 @@ class Fields:
         """Return a list of texts."""
         value = self.value.get(key)
         if not isinstance(value, list):
-            self.wrong(key, "a list of texts")
+            self.wrong(key, "a list of strings")
         texts = [each for each in value if isinstance(each, str)]
         if len(texts) != len(value):
-            self.wrong(key, "a list of texts")
+            self.wrong(key, "a list of strings")
         return texts
 
     def inner(self, key: str) -> "Fields":

@@ -97,7 +97,7 @@ def read_frame(
     matrix = transform_of(frame, "transform_matrix")
     rotation = rotation_of(matrix[:, :3])
     if rotation is None:
-        frame.wrong("transform_matrix", "an orthonormal, right-handed rotation, and a shift")
+        frame.wrong("transform_matrix", "an orthonormal, right-handed rotation and a translation")
     calibration = read_lens(inside, frame, whole, photo)
     return Posed(photo, calibration, from_opengl(rotation, matrix[:, 3], world), mask)
 
@@ -223,5 +223,5 @@ def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
 
 def _existing(path: Path, frame: Fields) -> Path:
     if not is_file(path):
-        frame.wrong("mask_path", "a mask that is there", f"no file {path}")
+        frame.wrong("mask_path", "an existing mask", f"no file {path}")
     return path

@@ -43,13 +43,11 @@ class ColmapReader(Reader):
     model: str | None = Field(
         None, description="folder of the model within the scene, such as sparse/1"
     )
-    crs: str | None = Field(
-        None, description="coordinate system that the poses are in, such as epsg:32633"
-    )
+    crs: str | None = Field(None, description="coordinate system of the poses, such as epsg:32633")
     gps: Path | None = Field(
         None,
-        description="what tells where photos were taken: a folder with the photos as the camera "
-        "wrote them, or a list as geo.txt; by itself georef.json, geo.txt, database.db, the photos",
+        description="source of the photo positions: a folder with the original photos, or a list "
+        "such as geo.txt; by default georef.json, geo.txt, database.db, the photos",
     )
 
     @override

@@ -43,8 +43,8 @@ class NerfstudioReader(Reader):
     file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
     points: str | None = Field(
         None,
-        description="PLY of points within the scene; by itself what the file names, or one "
-        "beside it",
+        description="PLY file of points within the scene; by default the PLY that the file "
+        "names, or one next to it",
     )
 
     @override
@@ -65,7 +65,7 @@ class NerfstudioReader(Reader):
         check_seen(points, views, whole.file)
         notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]
         if "fisheye_crop_radius" in whole:
-            notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
+            notes.append("nerfstudio: fisheye_crop_radius is not supported; use masks instead")
         raw = raw_scene(inside, images, views, points, *notes)
         if options.split == "auto" and not has_lists(path):
             names = [view.name for view in views]
@@ -91,7 +91,7 @@ def _applied(whole: Fields) -> Frame3D:
     matrix = transform_of(whole, "applied_transform")
     rotation = rotation_of(matrix[:, :3])
     if rotation is None:
-        whole.wrong("applied_transform", "an orthonormal, right-handed rotation, and a shift")
+        whole.wrong("applied_transform", "an orthonormal, right-handed rotation and a translation")
     return Frame3D(rotation, scale * matrix[:, 3], scale)
 
 

@@ -19,7 +19,9 @@ class PhotosAloneReader(Reader):
     """
 
     scene: Path | None = Field(
-        None, description="folder of the prepared scene; None: beside the photos, with -scene"
+        None,
+        description="folder of the prepared scene; by default the photo folder's name with "
+        "-scene, next to it",
     )
 
     @override

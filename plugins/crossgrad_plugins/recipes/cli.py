@@ -8,7 +8,7 @@ import typer
 from crossgrad_core.commands import announce, entries
 
 app = typer.Typer(
-    help="List the recipes, which decide the settings of a run; show one.",
+    help="List the recipes, which decide the settings of a run, or show one recipe.",
     rich_markup_mode=None,
     add_completion=False,
     no_args_is_help=False,

@@ -42,8 +42,8 @@ class Floaters(Rule):
         le=1,
         # The ground below a level camera is farther away, because the camera sees it only from a
         # distance.
-        description="share of the distance from a camera to the nearest point it sees that counts "
-        "as empty",
+        description="depth range that counts as empty, as a share of the distance from a camera "
+        "to the nearest point that it observes",
     )
 
     @hookimpl
@@ -59,9 +59,9 @@ class Floaters(Rule):
     @override
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         if not backbone.positions:
-            return "the backbone names no positions"
+            return "the backbone defines no positions"
         if not cameras_that_tell(scene):
-            return "no photo observes enough points to say what around it is empty"
+            return "no photo observes enough points to show which space is empty"
         return ""
 
 
@@ -69,8 +69,8 @@ def removed(count: int) -> str:
     """Return the log line about the removal of `count` primitives."""
     were = "primitive was" if count == 1 else "primitives were"
     return (
-        f"floaters: {count:,} {were} removed that no training photo shows, in the empty space "
-        "around its cameras (--no-rule floaters: they stay)"
+        f"floaters: {count:,} {were} removed, which no training photo shows, from the "
+        "empty space around training cameras (--no-rule floaters keeps them)"
     )
 
 

@@ -43,8 +43,8 @@ class ScaleClamp(Rule):
     ratio: float = Field(
         0.5,
         gt=0,
-        description="most that a standard deviation may be of the distance to the nearest training "
-        "camera that has a Gaussian at its side",
+        description="maximum standard deviation of a Gaussian, as a share of its distance to the "
+        "nearest training camera that has it at its side",
     )
 
     @hookimpl
@@ -70,7 +70,7 @@ class ScaleClamp(Rule):
     @override
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         learns = backbone.learns_scales
-        return "" if learns else "the backbone has no Gaussians with axes that learn"
+        return "" if learns else "the backbone trains no Gaussians with axes"
 
 
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:

@@ -38,8 +38,10 @@ class Anchors30(Sampler):
         """Return an objection if the grouping has no near or no far group."""
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
             return [
-                "sampler anchors-30 needs groups labelled near and far; grouping "
-                f"{selection.names['grouping']} gives {', '.join(selection.labels)}"
+                (
+                    "sampler anchors-30 needs groups labelled near and far, but grouping "
+                    f"{selection.names['grouping']} makes {', '.join(selection.labels)}"
+                )
             ]
         return []
 

@@ -18,7 +18,8 @@ def check(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="One setting of data, repeatable: reader=colmap, data.max_size=800.",
+            help="One setting of the scene, such as reader=colmap or data.max_size=800. "
+            "Repeatable.",
         ),
     ] = None,
 ) -> None:

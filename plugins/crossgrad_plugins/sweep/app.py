@@ -37,7 +37,7 @@ from crossgrad_plugins.sweep.progress import Screen, Watch, estimated
 from crossgrad_plugins.sweep.run_status import Standing, read_records, standings
 from crossgrad_plugins.sweep.summary import listing, table, write_plan
 
-_WORDS = "stopping: the runs under way save a checkpoint first (once more: without an evaluation)"
+_WORDS = "stopping: running runs save a checkpoint first (press again to skip their evaluation)"
 
 
 @contextmanager
@@ -189,7 +189,8 @@ class Sweep:
         with locked(self.layout.out, "sweeping") as held:
             if not held:
                 _note(
-                    "the file system has no locks: nothing keeps a second sweep out of the folder"
+                    "the file system does not support locks: nothing prevents a second sweep in "
+                    "the folder"
                 )
             for place in (self.layout.out, self.layout.out / "settings"):
                 clear_half_written(place)
@@ -234,10 +235,11 @@ class Sweep:
         _say(f"failed: {each.job.title} ({each.job.id}): {each.error}" for each in failed)
         if left:
             are, them = ("is", "it") if len(left) == 1 else ("are", "them")
-            _say([f"{count(len(left), 'run')} {are} left; the same command goes on with {them}"])
+            runs = f"{count(len(left), 'run')} {are} left"
+            _say([f"{runs}; run the same command to continue with {them}"])
         if failed:
-            _say([f"what they printed is in {self.layout.output('ID')}; the same command tries "
-                  "them again"])  # fmt: skip
+            _say([(f"their output is in {self.layout.output('ID')}; run the same command to try "
+"them again")])  # fmt: skip
         if signals:
             return exit_code(signals[0])
         return FAILED if failed or left else 0

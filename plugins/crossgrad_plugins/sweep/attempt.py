@@ -56,8 +56,9 @@ class Bound:
     def reason(self) -> str:
         """The message for a process that exceeded the limit."""
         return (
-            f"took {self.taken / _GIB:.1f} GiB, more than the {(self.most or 0) / _GIB:.1f} GiB of "
-            "a run; start fewer --workers, or name more --memory"
+            f"used {self.taken / _GIB:.1f} GiB, more than the "
+            f"{(self.most or 0) / _GIB:.1f} GiB of a run; start fewer --workers, or raise "
+            "--memory"
         )
 
     def is_exceeded(self, process: int) -> bool:
@@ -230,7 +231,7 @@ def _signal(code: int) -> str:
     """Return the name of the signal that ended a process; empty without a signal."""
     number = -code if code < 0 else code - 128
     known = {each.value: each.name for each in signal.Signals}
-    killed = " (by hand, or for want of memory)" if known.get(number) == "SIGKILL" else ""
+    killed = " (by hand, or because memory was full)" if known.get(number) == "SIGKILL" else ""
     return f"{known[number]}{killed}" if number in known else ""
 
 
@@ -260,7 +261,7 @@ class Retries:
         self._deaths[job.id] += 1
         if self._deaths[job.id] < MOST:
             return True
-        error = f"{outcome.error}, {MOST} times without a new checkpoint between"
+        error = f"{outcome.error}, {MOST} times without a new checkpoint"
         record = {"event": "ended", "run": job.id, "worker": worker}
         append(self._layout.records, {**record, "status": "failed", "error": error})
         return False

@@ -182,7 +182,7 @@ def _no_candidate(
 ) -> str:
     seeds = [seed for seed, value in by_seed.items() if value is None]
     return (
-        f"{scene}, {choice.label}: not among the candidates, as the run failed or has no "
+        f"{scene}, {choice.label}: not a candidate, because a run failed or has no "
         f"{grid.metric.name} with seed {listed(map(str, seeds))}"
     )
 
@@ -196,4 +196,7 @@ def _at_the_end(best: Choice, scene: str, own: list[Choice]) -> Iterator[str]:
             and value in {min(numbers), max(numbers)}
             and len(set(numbers)) > 1
         ):
-            yield f"{scene}, {best.arm.name}: the best {name} is {value}, at the end of its values"
+            yield (
+                f"{scene}, {best.arm.name}: the best {name} is {value}, the smallest or "
+                "largest of its values"
+            )

@@ -30,8 +30,8 @@ MOST_RUNS = 100_000
 #: Settings that the sweep itself controls -> explanation.
 _RESERVED = {
     "out": "every run has its own folder below --out",
-    "stop_after": "a sweep runs its runs to their ends",
-    "threads": "say --threads, for all runs alike",
+    "stop_after": "a sweep runs every run to its end",
+    "threads": "use --threads, which applies to all runs",
 }
 #: Settings that have an option of the sweep.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
@@ -304,7 +304,7 @@ def _of_the_configurations(grid: Grid) -> Iterator[Problem]:
     if _twice(arm.name for arm in grid.arms):
         return
     for label in _twice(choice.label for choice in choices(grid)):
-        hint = "tables tell configurations apart by their names"
+        hint = "tables identify configurations by their names"
         yield Problem("arms", f"two configurations have the name {label!r}", hint)
 
 

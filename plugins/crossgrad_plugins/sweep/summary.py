@@ -53,7 +53,7 @@ def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
     if not found and any(each.summary for each in known):
         there = listed(sorted({name for each in known for name in figures(each)})) or "no figures"
-        yield f"no finished run has {metric.name}; they have {there} (`metric` of the grid)"
+        yield f"no finished run has {metric.name}; the runs have {there} (`metric` of the grid)"
 
 
 def _best(found: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:

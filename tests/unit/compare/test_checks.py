@@ -78,7 +78,7 @@ def test_a_missing_scene_file_is_reported(tmp_path):
     assert not any("scene.json" in note for note in comparison(tmp_path).notes)
     (folder / "scene.json").unlink()
     (told,) = (note for note in comparison(tmp_path).notes if "scene.json" in note)
-    assert told.startswith("1 without") and told.endswith("which photos they had: 2")
+    assert told.startswith("1 without") and told.endswith("their photos are not known: 2")
 
 
 @pytest.mark.parametrize("rows", [0, 1])
@@ -141,8 +141,8 @@ def test_seconds_of_another_machine_are_not_drawn(tmp_path, environment):
     runs = RunFolder(environment=usual), RunFolder(seed=1, environment=environment)
     found = comparison(tmp_path, *runs)
     assert costs(found) == ["views", "steps"]
-    assert any("seconds of the clock are not compared" in note for note in found.notes)
-    with pytest.raises(UserError, match="seconds of these runs do not compare") as error:
+    assert any("wall-clock seconds are not compared" in note for note in found.notes)
+    with pytest.raises(UserError, match="seconds of these runs cannot be compared") as error:
         compared(read_runs([tmp_path], skip_broken=False), Options(clock=ClockChoice.WALL))
     assert "leave --clock out" in error.value.todo
 
@@ -250,7 +250,7 @@ def test_arms_and_pairs_of_different_code_have_a_note(tmp_path, commits, expecte
     else:
         (note,) = notes
         assert expected in note
-        assert note.endswith("that they are equally fast is not given, and bits may differ")
+        assert note.endswith("their speed may differ, and so may their bits")
 
 
 def test_runs_that_do_not_say_where_they_come_from_have_no_note(tmp_path):

@@ -136,7 +136,7 @@ def test_a_run_without_an_end_is_left_out_and_listed(folder):
     RunFolder(seed=7, status="stopped").write(folder / "stopped")
     RunFolder(seed=8, status="failed").write(folder / "failed")
     found = compared(read_runs([folder], skip_broken=False), Options())
-    assert "has not ended" in found.left_out["1-1"]
+    assert "has not finished" in found.left_out["1-1"]
     assert "stopped" in found.left_out["stopped"]
     assert "failed" in found.left_out["failed"]
     assert len(found.ends[0].pairs) == 2
@@ -173,7 +173,7 @@ def test_one_seed_is_inconclusive_and_says_so(tmp_path):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
     assert "Inconclusive: views=2 is 1.00 dB ahead of views=1" in text
-    assert "one pair says nothing about noise" in text
+    assert "one pair does not show the noise" in text
 
 
 def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
@@ -181,7 +181,7 @@ def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
     assert "not told apart from views=2, views=1" in text
-    assert "one pair says nothing about noise" in text and "1 pairs" not in text
+    assert "one pair does not show the noise" in text and "1 pairs" not in text
 
 
 def test_three_seeds_say_how_many_would_do(tmp_path):
@@ -197,8 +197,8 @@ def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
-    assert "One arm: there is nothing to compare it with" in page
-    assert "nothing to compare" in capsys.readouterr().out
+    assert "One arm: so nothing can be compared" in page
+    assert "nothing can be compared" in capsys.readouterr().out
 
 
 def test_arms_on_other_scenes_are_not_paired(tmp_path):
@@ -207,7 +207,7 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
     # No setting varies within a scene, so there is one arm.
     assert "One arm" in headlines(tmp_path)
     RunFolder(scene="city", seed=5, views_per_step=2).write(tmp_path / "3")
-    assert "share no scene with the same seed" in headlines(tmp_path)
+    assert "have no scene with the same seed in common" in headlines(tmp_path)
 
 
 def test_a_figure_that_one_run_did_not_measure_is_not_compared(tmp_path):
@@ -271,7 +271,7 @@ def test_the_reason_for_missing_pairs_is_reported(tmp_path):
     for seed in range(2):
         RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
         RunFolder(seed=seed, views_per_step=2, status="failed").write(tmp_path / f"bad-{seed}")
-    assert "Nothing is paired: every run of views=2 failed" in headlines(tmp_path)
+    assert "No pairs: every run of views=2 failed" in headlines(tmp_path)
 
 
 def test_arms_without_final_metrics_are_reported_as_such(tmp_path):

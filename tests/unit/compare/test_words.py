@@ -33,7 +33,7 @@ def test_different_lengths_of_arms_are_reported(tmp_path):
             run.write(tmp_path / f"{views}-{seed}")
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     told = {each.claim: each.support for each in headline(found)}
-    assert told["The arms were given different lengths"] == "views=2 900 steps; views=1 300 steps"
+    assert told["The arms had different lengths"] == "views=2 900 steps; views=1 300 steps"
 
 
 def test_lengths_that_depend_on_the_scene_only_are_not_reported(tmp_path):

@@ -160,9 +160,9 @@ def test_the_zone_of_utm_is_one_that_is_used_there(latitude, longitude):
 @pytest.mark.parametrize(
     ("code", "found"),
     [
-        ("epsg:3857", "a metre is 1 to 1.20"),
-        ("epsg:4326", "a metre is"),
-        ("epsg:2263", "a metre is 1 to 3.3"),
+        ("epsg:3857", "one metre is 1 to 1.20"),
+        ("epsg:4326", "one metre is"),
+        ("epsg:2263", "one metre is 1 to 3.3"),
         ("epsg:99999", "crs not found"),
     ],
 )

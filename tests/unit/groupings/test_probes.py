@@ -49,7 +49,7 @@ def test_a_view_of_nothing_goes_with_the_nearest_camera(place, label):
     scene = posed_scene([*views, blind], [(0, 0, 0)])
     rule = Footprint().fit(scene, RNG)
     assert rule.labels(scene.views) == ("near", "near", "near", "far", "far", label)
-    assert "views without SfM points go with the nearest other: 1" in rule.notes[0]
+    assert "views without SfM points join the group of the nearest other view: 1" in rule.notes[0]
 
 
 @pytest.mark.parametrize("depths", [(1, 1.1, 1.2, 1.3, 1.4, 1.5, 9, 10), (1, 2, 7, 8, 9, 10, 11)])

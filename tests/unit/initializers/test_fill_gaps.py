@@ -318,8 +318,8 @@ def test_the_margin_is_where_no_training_photo_looks_that_shows_as_far():
         assert not shown.any()
     told = Filled(margin=0.5).messages(scene)
     assert told == (
-        f"start: {len(inner.positions)} Gaussians fill what photos show without points, "
-        f"{len(beyond)} stand beyond their edges",
+        f"start: {len(inner.positions)} Gaussians added inside photos where there are no points, "
+        f"{len(beyond)} beyond the edges of photos",
     )
 
 

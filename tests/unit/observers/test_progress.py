@@ -55,7 +55,7 @@ def test_plain_lines_at_every_tenth(capsys: pytest.CaptureFixture[str]):
     assert lines[:3] == [
         "boruszyn: 24 training views, 4 held out; 20 steps on cpu",
         "results in runs/x",
-        "- further notes: 1 (in log.txt, or with -v)",
+        "- more notes: 1 (in log.txt, or with -v)",
     ]
     assert lines[3] == ("step 2/20 (10 %), loss 0.2500, 1,000 primitives, 10.0 steps/s, 2 s left")
     assert len([line for line in lines if line.startswith("step ")]) == 10

@@ -441,7 +441,7 @@ def test_a_view_without_points_does_not_keep_pairs_from_being_drawn():
     assert cut.two
     choice = cut.grouping
     rule = build("groupings", choice.name, choice.options).fit(scene, rng)
-    assert "without SfM points go with the nearest other: 1" in rule.notes[0]
+    assert "without SfM points join the group of the nearest other view: 1" in rule.notes[0]
     assert rule.label(blind) == "near"
     assert rule.labels(views) == ("near", "far") * 10
 
@@ -542,7 +542,7 @@ def test_the_table_keeps_to_the_terminal(width):
     assert max(map(len, lines)) <= width
     text = " ".join(lines)
     assert all(part in text for part in PARTS_OF_THE_TABLE)
-    assert "nothing is changed" in text
+    assert "no settings changed" in text
 
 
 def test_every_decision_says_why_and_how_to_overrule_it():

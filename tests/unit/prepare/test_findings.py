@@ -65,7 +65,7 @@ def test_one_bridge_covers_all_pieces_of_a_folder():
 def test_a_folder_that_falls_apart_is_reported_so():
     pieces = [frozenset(AERIAL[:2]), frozenset(AERIAL[2:])]
     (bridge,) = bridges_of(plan_of(*map(photo, AERIAL)), [], pieces, {})
-    assert "aerial: the photos fall apart" in bridge.advice
+    assert "aerial: the photos form separate parts" in bridge.advice
 
 
 def test_a_folder_in_no_model_needs_a_bridge_and_one_model_of_all_needs_none():

@@ -128,7 +128,7 @@ def test_on_a_straight_way_photos_that_all_look_aside_tell_nothing():
         model.frame(number).rig_from_world = pycolmap.Rigid3d(pose, -pose.matrix() @ center)
     placement, why = placement_of(model, gps, tops_of(model))
     assert placement is None
-    assert "which way is up" in why
+    assert "the upward direction" in why
 
 
 def test_gps_coarser_than_the_scene_places_nothing():

@@ -124,7 +124,7 @@ def test_masks_are_paired_by_the_rule_of_the_readers(wanted, tmp_path):
         "2_SEG.png",
         "3.tif",
     ]
-    assert not any("of no photo" in why for why in left_out.values())
+    assert not any("without a photo" in why for why in left_out.values())
 
 
 def test_a_folder_of_masks_that_is_named_has_to_be_there(tmp_path):
@@ -143,7 +143,7 @@ def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_reported(tmp_p
     assert sorted(used) == sorted(shot)
     assert left_out == {
         "a/masks/": "masks, but 1 file of no photo: a/masks/gone.png",
-        "c/masks/": "masks of the photos beside it",
+        "c/masks/": "masks of the photos next to it",
     }
     masked = {name: photo.mask for name, photo in used.items() if photo.mask}
     assert masked == {
@@ -168,8 +168,8 @@ def test_masks_of_no_photo_are_reported(tmp_path):
     assert sorted(used) == ["1.jpg", "2.jpg"]
     assert left_out == {
         "masks/": "masks, but 1 file of no photo: masks/IMG_9.jpg",
-        "death_mask.jpg": "named as a mask, but of no photo: rename it if it is one",
-        "1_mask.jpg": "the name of a mask beside its photo has to end in .png",
+        "death_mask.jpg": "named like a mask, but without a photo: rename it if it is a photo",
+        "1_mask.jpg": "the name of a mask next to its photo must end in .png",
     }
     assert used["2.jpg"].mask == str(tmp_path / "2.mask.png")
 

@@ -298,7 +298,7 @@ def test_a_ready_scene_is_read_without_its_intermediate_files_and_photos(
     before = content(copied)
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
     assert len(read.views) == COUNT
-    as_it_is = any("the scene is taken as it is" in note for note in read.notes)
+    as_it_is = any("the scene is used unchanged" in note for note in read.notes)
     assert as_it_is == (lost not in {"some photos", "most photos"})
     assert content(copied) == before and not (copied / "run.lock").exists()
 
@@ -354,7 +354,7 @@ def test_run_with_prepare_prepares_the_photos(report, photos, capsys):
     assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
     told = capsys.readouterr().out
     assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
-    assert "poses of its own" not in told
+    assert "already has poses" not in told
     read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos-alone"}), photos)
     assert (name, len(read.views)) == ("photos-alone", COUNT)
 
@@ -363,7 +363,7 @@ def test_poses_that_are_there_already_and_not_used_are_named(copied, tmp_path):
     shutil.rmtree(copied / "prepare")
     place = shutil.copytree(bundled_scene(), tmp_path / "photos")
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
-    (told,) = (note for note in read.notes if "poses of its own" in note)
+    (told,) = (note for note in read.notes if "already has poses" in note)
     assert "reader colmap" in told and "leave --prepare out" in told
 
 
@@ -400,9 +400,9 @@ def test_bad_input_is_one_error_and_nothing_is_written(tmp_path, capsys, photos_
 @pytest.mark.parametrize(
     ("names", "todo"),
     [
-        ([], "name the folder that the photos are in"),
+        ([], "name the folder that contains the photos"),
         (["a.jpg"], "add photos that overlap"),
-        (["a.jpg", "b.HEIC"], "repair, convert or leave out what is named"),
+        (["a.jpg", "b.HEIC"], "repair, convert or remove these photos"),
     ],
 )
 def test_too_few_photos_say_what_to_do(names, todo, tmp_path, capsys):

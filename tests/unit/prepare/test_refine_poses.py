@@ -284,7 +284,7 @@ def test_a_mapping_that_fails_leaves_the_model_that_was_there(made, caplog):
 
     (found,), _ = looked_again([model], path, path.parent / "scratch", failing)
     assert all(np.array_equal(pose.matrix(), before[n]) for n, pose in poses_of(found).items())
-    assert "doubtful photos stay where they are" in caplog.text
+    assert "doubtful photos keep their poses" in caplog.text
 
 
 def test_a_photo_whose_camera_no_lens_is_like_is_left_out(tmp_path):

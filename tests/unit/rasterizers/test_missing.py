@@ -63,7 +63,7 @@ def test_gswarp_without_warp_is_not_there(machine):
 @pytest.mark.parametrize(
     ("nvcc", "reason"),
     [
-        (None, "there is no nvcc: install the CUDA toolkit 12.8"),
+        (None, "nvcc was not found: install the CUDA toolkit 12.8"),
         ("13.0", "is of CUDA 13.0, torch"),
         ("12.4", None),
     ],
@@ -94,7 +94,7 @@ def test_gsplat_needs_ninja_on_the_path_or_next_to_python(machine, monkeypatch, 
     monkeypatch.setattr(missing.shutil, "which", lambda name: None if name == "ninja" else name)
     monkeypatch.setattr(missing.sys, "executable", str(tmp_path / "env" / "python"))
     monkeypatch.setenv("PATH", "/usr/bin")
-    assert "finds no ninja: pip install ninja" in objections(GsplatRasterizer())[0]
+    assert "ninja was not found: pip install ninja" in objections(GsplatRasterizer())[0]
     (tmp_path / "env").mkdir()
     (tmp_path / "env" / "ninja").touch()
     assert objections(GsplatRasterizer()) == []
@@ -152,7 +152,7 @@ def test_gswarp_refuses_a_backbone_that_sets_its_dilation(machine):
     class Own(type(build("backbones", "vanilla", {}))):
         sets_dilation = True
 
-    assert "by its own" in objections(GswarpRasterizer(), backbone=Own())[0]
+    assert "sets its own dilation" in objections(GswarpRasterizer(), backbone=Own())[0]
 
 
 def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(machine):

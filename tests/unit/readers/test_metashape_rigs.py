@@ -197,7 +197,7 @@ def test_equal_labels_are_resolved_by_order_as_a_last_resort_with_a_note(of, siz
     found, notes = pairs(cameras, names)
     assert found == names
     assert notes == [
-        f"photos of equal labels are paired by the order of {of}s and folders: "
+        f"photos with equal labels are paired by the order of {of}s and folders: "
         "first left, second right"
     ]
 

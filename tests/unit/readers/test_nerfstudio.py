@@ -228,7 +228,7 @@ def test_an_applied_transform_is_undone(tmp_path):
 
 def test_a_crop_that_is_left_out_is_reported(tmp_path):
     path = write(tmp_path, camera_model="OPENCV_FISHEYE", fisheye_crop_radius=10, **LENS)
-    assert "fisheye_crop_radius is left out" in "\n".join(read(path).notes)
+    assert "fisheye_crop_radius is not supported" in "\n".join(read(path).notes)
 
 
 @pytest.mark.parametrize(("named", "stored"), [("a", "a.png"), ("a.b", "a.b.png"), ("a", "a")])

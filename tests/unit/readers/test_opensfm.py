@@ -108,7 +108,7 @@ def test_other_cameras_are_refused_with_the_way_out(kind, tmp_path):
     write(tmp_path, CAMERA | {"projection_type": kind})
     with pytest.raises(UserError, match=f"projection type {kind}") as caught:
         OpenSfmReader().read(tmp_path, SceneOptions())
-    assert "export them as pinhole" in caught.value.todo
+    assert "export them with pinhole cameras" in caught.value.todo
 
 
 def test_a_project_of_opendronemap_is_read(tmp_path):

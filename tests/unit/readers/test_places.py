@@ -137,7 +137,7 @@ def without(*keys):
         (lambda tags: {**tags, 2: (IFDRational(1, 0), 0.0, 0.0)}, ""),
         (lambda tags: {**tags, 2: (95.0, 0.0, 0.0)}, ""),
         (lambda tags: {**tags, 4: (13.75,)}, ""),
-        (lambda tags: tags_of(ORIGIN), "all at one place"),
+        (lambda tags: tags_of(ORIGIN), "all at the same position"),
     ],
 )
 def test_what_is_missing_is_reported(scene, change, why):
@@ -167,7 +167,7 @@ def test_a_flight_line_does_not_tell_how_it_is_rolled(tmp_path):
         frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, -(pose.rotation.matrix() @ center))
     model.write_binary(str(scene / "sparse/0"))
     found = read(located(scene, noise=0.5))
-    assert "they stand in one line" in found.georeference.why
+    assert "they are on a line" in found.georeference.why
     assert any("not georeferenced" in note for note in found.notes)
 
 
@@ -186,7 +186,7 @@ def test_photos_as_the_camera_wrote_them_tell_in_place_of_their_copies(with_gps,
         read(plain, gps=str(plain / "nowhere"))
     for path in (plain / "images", plain / "sparse"):
         found = read(plain, gps=str(path))
-        assert f"{path}: no photo of the scene is there" in found.georeference.why
+        assert f"{path}: it contains no position for a photo of the scene" in found.georeference.why
         assert found.notes[-1] == found.georeference.note
 
 

@@ -197,5 +197,5 @@ def test_the_default_of_the_scale_clamp_rule(settings, bound):
 def test_a_bound_is_refused_where_no_sizes_learn(settings):
     setup = setup_of(**settings)
     config = setup.config.model_copy(update={"rules": using(0.5)})
-    with pytest.raises(UserError, match="no Gaussians with axes that learn"):
+    with pytest.raises(UserError, match="trains no Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)

@@ -1,4 +1,4 @@
-"""Photos that are because all of their pixels are masked are left out of training; the others stay."""
+"""Photos whose pixels are all masked are left out of training; the other photos stay."""
 
 import numpy as np
 import pytest

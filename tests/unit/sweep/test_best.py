@@ -109,7 +109,7 @@ def test_values_are_compared_on_the_same_seeds(swept, tmp_path):
         gone = with_ends(swept, {("one, rate_factor=0.5", "town", 2): end})
         content, notes = best_grid(*gone, tmp_path)
         assert content["arms"][1]["by_scene"]["town"] == {"rate_factor": 1}
-        assert notes[0].startswith("town, one, rate_factor=0.5: not among the candidates")
+        assert notes[0].startswith("town, one, rate_factor=0.5: not a candidate")
         assert notes[0].endswith("with seed 2")
 
 

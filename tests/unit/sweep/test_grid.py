@@ -149,7 +149,7 @@ def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
     [
         (("--set", "seed=7"), "say --seed"),
         (("--set", "scene=there"), "say --scene"),
-        (("--set", "stop_after=2"), "to their ends"),
+        (("--set", "stop_after=2"), "to its end"),
         (("--set", " threads =2"), "use --threads"),
         (("--set", "out=there"), "--set out"),
         (("--seed", "3", "--seed", "3"), "a seed is listed twice"),

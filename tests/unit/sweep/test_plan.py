@@ -120,7 +120,7 @@ def test_everything_that_is_wrong_is_said_at_once(scene, tmp_path):
 
 
 def test_a_fault_of_all_configurations_is_said_once(scene, tmp_path):
-    with pytest.raises(UserError, match="something is wrong") as caught:
+    with pytest.raises(UserError, match="has an error") as caught:
         plan(
             tmp_path,
             scenes=[str(scene)],

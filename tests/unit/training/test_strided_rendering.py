@@ -162,10 +162,10 @@ def test_stages_are_those_of_the_photos(width, height, coarsest, scales, note):
     assert found == [scale for count, scale in scales for _ in range(count)]
     (remark,) = resolution.messages(schedule)
     if note is None:
-        assert "all pixels from the start, as resolution.coarsest is 1" in remark
+        assert "all pixels from the start, because resolution.coarsest is 1" in remark
         assert "fewer than 240,000 pixels or with a side of fewer than 192" in remark
     else:
-        assert f"one pixel of each {note}, in each step another one; then all" in remark
+        assert f"one pixel of each {note}, another one in each step; then all pixels" in remark
     pixels = sum(count * scale**2 for count, scale in scales)
     assert resolution.pixels(schedule, 200) == pytest.approx(pixels)
 
@@ -180,7 +180,7 @@ def test_longer_runs_have_all_pixels_sooner(steps, share):
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
     assert resolution.pixels(schedule, steps) == pytest.approx((1 - 0.75 * share) * steps, rel=1e-3)
     (remark,) = resolution.messages(schedule)
-    assert ("all pixels from the start: the run is a long one" in remark) == (steps >= 30_000)
+    assert ("all pixels from the start: the run is long" in remark) == (steps >= 30_000)
     assert build("resolutions", "strided", {"until": 0.5}).window(schedule) == 0.5 * steps
 
 

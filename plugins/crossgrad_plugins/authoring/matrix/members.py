@@ -80,13 +80,13 @@ def members_of(package: str) -> Members:
 def _cannot_be_combined(entry: Entry) -> str:
     """Return why a component is left out; empty if it is not."""
     if [each.name for each in offers(entry.slot)].count(entry.name) > 1:
-        return "two packages offer that name"
+        return "two packages offer this name"
     try:
         loaded = load_entry(entry)
     except UserError as error:
         return error.found or error.what
     if issubclass(loaded, Rasterizer) and not _runs_here(loaded):
-        return f"it runs on {listed(sorted(loaded.devices))}, not on this machine"
+        return f"it runs only on {listed(sorted(loaded.devices))}, which this machine does not have"
     return ""
 
 

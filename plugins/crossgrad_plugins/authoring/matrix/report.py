@@ -136,11 +136,11 @@ def report(tally: Tally, package: str) -> str:
     lines = [_filled(heading, ""), f"{numbers} trained for {STEPS} steps, twice with the same bits"]
     lines += [_filled(f"left out: {reason}", "  ") for reason in members.left_out]
     refused = sum(map(len, tally.refused.values()))
-    lines.append(f"{count(refused, 'combination')} refused before training, with the reason")
+    lines.append(f"{count(refused, 'combination')} refused before training, with a reason")
     for slots, rows in tally.refused.items():
         lines += [_filled(line, "  ") for line in _refusals(rows, slots, tally)]
     lines += [
-        f"FAIL  {name} was trained in no combination: each one was refused"
+        f"FAIL  {name} was not trained in any combination: all were refused"
         for name in tally.never_trained
     ]
     lines.append(f"{count(len(tally.failed), 'combination')} failed")

@@ -71,10 +71,11 @@ def draw_differences(c: Comparison) -> Drawn | None:
             figure,
             "differences",
             "Paired differences",
-            "Each small sign is a pair of runs on one scene with one seed. The bar is the 95 % "
-            "interval, its thick part the 90 % interval, the large sign the estimate; an "
-            "arrowhead says that the interval goes on beyond the axis; the grey "
-            f"band is the margin of {f'{margin:g} {c.quantity.unit}'.strip()}.",
+            "Each small marker is a pair of runs on one scene with one seed. The thin "
+            "bar is the 95 % interval, its thick part the 90 % interval, the large "
+            "marker the estimate. An arrowhead means that the interval continues beyond "
+            "the axis. The grey band is the margin of "
+            f"{f'{margin:g} {c.quantity.unit}'.strip()}.",
         )
 
 

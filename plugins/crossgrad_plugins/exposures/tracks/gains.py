@@ -131,14 +131,15 @@ class TrackGains:
         """The figures of the rule, as text."""
         known = self.gains[self.known]
         if not len(known):
-            return "no SfM tracks tell how bright the photos are beside each other"
+            return "no SfM tracks connect the photos, so their brightness cannot be compared"
         error = f", standard error {self.error:.2f}" if isfinite(self.error) else ""
         return (
-            f"brightness of {len(known)} photos at {int(self.counts.sum()):,} observations of SfM "
-            f"points: gains of {self.spread:.2f} stops standard deviation ({known.min():+.2f} to "
-            f"{known.max():+.2f}{error}); where points join photos "
-            f"of different gains, they take {100.0 * self.fit.reduction:.0f} % off the deviation "
-            f"({self.fit.before:.2f} to {self.fit.after:.2f} stops)"
+            f"brightness of {len(known)} photos at {int(self.counts.sum()):,} "
+            "observations of SfM points: gains with a standard deviation of "
+            f"{self.spread:.2f} stops ({known.min():+.2f} to {known.max():+.2f}{error}); "
+            "where points connect photos of different gains, the gains reduce the "
+            f"deviation by {100.0 * self.fit.reduction:.0f} % ({self.fit.before:.2f} to "
+            f"{self.fit.after:.2f} stops)"
         )
 
 

@@ -52,8 +52,10 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
         return best, []
     others = ", ".join(f"{m.relative_to(scene)} {counts[m]}" for m in models if m != best)
     return best, [
-        f"COLMAP: {best.relative_to(scene)} is taken, it has most images ({counts[best]}); left "
-        f"out: {others}"
+        (
+            f"COLMAP: {best.relative_to(scene)} is used, because it has the most images "
+            f"({counts[best]}); left out: {others}"
+        )
     ]
 
 
@@ -80,7 +82,7 @@ def check_scene_folder(scene: Path) -> None:
             found=str(error),
             todo="check the permissions of the folder",
         ) from error
-    check = "check the path (of a run that goes on: `scene:` in its config.yaml)"
+    check = "check the path (for a resumed run: `scene:` in its config.yaml)"
     hint = f"did you mean {near}?" if near else check
     raise UserError("the scene folder does not exist", where=scene, todo=hint)
 

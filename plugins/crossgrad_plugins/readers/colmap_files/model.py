@@ -148,7 +148,7 @@ def _read_images(lines: _Lines) -> Iterator[tuple[int, ColmapImage]]:
         except (ValueError, IndexError):
             lines.wrong(line, _IMAGE)
         if number in seen:
-            lines.wrong(line, f"an IMAGE_ID that occurs once, not {number} again")
+            lines.wrong(line, f"an IMAGE_ID that occurs only once, unlike {number}")
         seen.add(number)
         points = _read_observations(lines)
         yield number, ColmapImage(name, camera, pose[:4], pose[4:], points)

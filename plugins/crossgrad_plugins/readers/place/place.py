@@ -60,9 +60,11 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
                 notes.append(f"{measured.source}: {count(measured.flat, 'photo')} without altitude")
             elif measured.strangers:
                 names, first = count(len(measured.strangers), "name"), measured.strangers[0]
-                notes.append(f"{measured.source}: {names}, such as {first}, and none of a photo")
+                notes.append(
+                    f"{measured.source}: {names}, such as {first}, which belong to no photo"
+                )
             elif named is not None:
-                notes.append(f"{measured.source}: no photo of the scene is there, or has a place")
+                notes.append(f"{measured.source}: it contains no position for a photo of the scene")
             continue
         found = _fitted(scene, shown, measured)
         if not isinstance(found, str):
@@ -86,7 +88,7 @@ def _sources(
             try:
                 yield _listed(path, names)
             except UserError as error:  # A run does not need it.
-                notes.append(f"{path.name} tells no places: {error.what} ({error.found})")
+                notes.append(f"{path.name} contains no positions: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
 
 
