@@ -195,7 +195,7 @@ def _tell_folders(
             )
         elif strays:
             why = (
-                f"masks, including {count(len(strays), 'file')} that belong to no photo: "
+                f"masks; {count(len(strays), 'file')} without a photo: "
                 f"{name_some(strays)}"
             )
             yield LeftOut(name=name_some([f"{folder}/"]), why=why)

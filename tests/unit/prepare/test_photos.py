@@ -142,7 +142,7 @@ def test_masks_in_folders_of_the_photos_are_no_photos_and_that_is_reported(tmp_p
     used, left_out = found(tmp_path)
     assert sorted(used) == sorted(shot)
     assert left_out == {
-        "a/masks/": "masks, but 1 file of no photo: a/masks/gone.png",
+        "a/masks/": "masks; 1 file without a photo: a/masks/gone.png",
         "c/masks/": "masks of the photos next to it",
     }
     masked = {name: photo.mask for name, photo in used.items() if photo.mask}
@@ -167,7 +167,7 @@ def test_masks_of_no_photo_are_reported(tmp_path):
     used, left_out = found(tmp_path)
     assert sorted(used) == ["1.jpg", "2.jpg"]
     assert left_out == {
-        "masks/": "masks, but 1 file of no photo: masks/IMG_9.jpg",
+        "masks/": "masks; 1 file without a photo: masks/IMG_9.jpg",
         "death_mask.jpg": "named like a mask, but without a photo: rename it if it is a photo",
         "1_mask.jpg": "the name of a mask next to its photo must end in .png",
     }

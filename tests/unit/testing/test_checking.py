@@ -74,7 +74,8 @@ def test_the_name_of_a_command_of_the_core_is_not_free(installed):
     source = 'def run():\n    """Runs."""\n'
     installed(source, commands={"run": "made_up_check:run"})
     assert failures("commands", "run") == {
-        "its name is not used by another plugin": "the core has a command run, which is called instead"
+        "its name is not used by another plugin": "the core has a command run, "
+        "which is called instead"
     }
 
 

@@ -234,7 +234,8 @@ def test_a_budget_is_met_whatever_the_probe_said(planned, cost):
     assert run.schedule.total == run.schedule.lr_until
     assert run.notes == (
         "a note on the scene",
-        f"the number of steps was adapted to the time budget: {run.schedule.total} steps instead of {planned}",
+        "the number of steps was adapted to the time budget: "
+        f"{run.schedule.total} steps instead of {planned}",
     )
 
 
