@@ -135,7 +135,7 @@ class MipSplatting(Vanilla):
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
     parity: bool = Field(
-        False, description="one focal length, the longest, for all cameras, as published"
+        False, description="use the longest focal length for all cameras, as published"
     )
 
     @override

@@ -35,11 +35,15 @@ def label_objections(
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:
-        return [f"operator {name} needs labelled views; sampler {sampler} draws from no groups"]
+        return [
+            (f"operator {name} needs labelled views, but sampler {sampler} draws without groups")
+        ]
     if not given or set(needed.values()) <= set(given):
         return []
     wanted = " and ".join(f"{label} (operator.{option})" for option, label in needed.items())
     return [
-        f"operator {name} looks for views labelled {wanted}; {source} gives {', '.join(given)}: "
-        "set these options to labels that there are"
+        (
+            f"operator {name} needs views labelled {wanted}, but {source} makes "
+            f"{', '.join(given)}: set these options to existing labels"
+        )
     ]

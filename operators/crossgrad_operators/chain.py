@@ -41,7 +41,9 @@ class Chain(GramianOperator):
     links, the chain equals `sum`.
     """
 
-    links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
+    links: tuple[OperatorField, ...] = Field(
+        (), description="operators in the order in which they are applied"
+    )
 
     @override
     def is_identity(self, views: int) -> bool:

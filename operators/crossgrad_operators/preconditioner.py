@@ -22,7 +22,7 @@ class Preconditioner(MatrixOperator):
 
     geometry: float = Field(2.0, description="exponent d for means, scales and rotations")
     appearance: float = Field(1.0, description="exponent d for opacity and colour")
-    neutral: float = Field(1.0, description="exponent d for blocks of neither kind")
+    neutral: float = Field(1.0, description="exponent d for neutral blocks")
 
     @override
     def transform(

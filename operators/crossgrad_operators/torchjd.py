@@ -36,11 +36,12 @@ class TorchJD(GramianOperator):
     """
 
     weighting: str = Field(
-        "AlignedMTL", description="name of a TorchJD weighting, with or without `Weighting`"
+        "AlignedMTL",
+        description="name of a TorchJD weighting, with or without the suffix `Weighting`",
     )
     options: Annotated[
         tuple[tuple[str, _Value], ...], BeforeValidator(_pairs), PlainSerializer(dict)
-    ] = Field((), description="the weighting's own arguments")
+    ] = Field((), description="arguments of the weighting")
 
     @override
     def reads_gramians(self) -> bool:

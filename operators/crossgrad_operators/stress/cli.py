@@ -65,25 +65,25 @@ class Options:
     operators: list[str] | None = argument(
         "OPERATOR...", "Names of operators. Default: all installed.", default=None
     )
-    case: str | None = option(None, "Only cases whose name contains this text.", "TEXT")
+    case: str | None = option(None, "Run only cases whose name contains this text.", "TEXT")
     elements: int | None = option(
-        None, f"Elements of the largest gradients. Default: {LARGE:,}.", "N", min=1000
+        None, f"Number of elements of the largest gradients. Default: {LARGE:,}.", "N", min=1000
     )
-    csv: Path | None = option(None, "Also write the table to a CSV file.", "FILE")
+    csv: Path | None = option(None, "Also write the table to this CSV file.", "FILE")
     search: float | None = option(
         None,
-        "Instead of the fixed cases: look at random for the worst gradients, that long.",
+        "Instead of the fixed cases: search at random for the worst gradients, for this time.",
         "SECONDS",
     )
     matrices: int | None = option(
         None,
-        "Instead of the fixed cases: whether results are finite on N short random ones.",
+        "Instead of the fixed cases: check whether results are finite for N short random matrices.",
         "N",
         min=1,
     )
     rows: str | None = option(
         None,
-        "Instead of the fixed cases: this one, a row per view, as a search prints it.",
+        "Instead of the fixed cases: run this case, one row per view, as a search prints it.",
         "[[...],...]",
     )
     precision: Precision | None = option(
@@ -222,4 +222,4 @@ class _Clock:
     def tick(self, turn: int, tallies: "Sequence[WorstCases]") -> None:
         if self._progress.due:
             matrices, broken = (sum(getattr(t, n) for t in tallies) for n in ("matrices", "broken"))
-            self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a promise")
+            self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a guarantee")

@@ -152,15 +152,24 @@ class AnchorDensifier(Densifier):
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
     resets: ClassVar[bool] = False
 
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to grow at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which anchors grow"
+    )
     success_threshold: float = Field(
         0.8,
         ge=0,
-        description="an anchor is judged after more views than this share of the interval, "
-        "an offset after more renders than half of it",
+        description="an anchor is judged if it was rendered in more than this share of the "
+        "interval's views, an offset if it was rendered in more than half of this "
+        "share",
     )
-    prune_opacity: float = Field(0.005, ge=0, description="prune below; sum over the offsets")
-    largest_log_scale: float = Field(0.05, description="cap of the Gaussians' log size, extents")
+    prune_opacity: float = Field(
+        0.005,
+        ge=0,
+        description="anchors with a lower sum of opacities over their offsets are pruned",
+    )
+    largest_log_scale: float = Field(
+        0.05, description="upper limit of the log size of Gaussians, extents"
+    )
 
     @abstractmethod
     def grown(

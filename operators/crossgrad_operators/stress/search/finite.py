@@ -94,7 +94,7 @@ def as_text(found: Sequence[Finite]) -> str:
         for each in found
         if each.example is not None
     ]
-    legend = "longest |u|: over the longest gradient of its case"
+    legend = "longest |u|: relative to the longest gradient of its case"
     return "\n".join([head, *lines, legend, *bad])
 
 

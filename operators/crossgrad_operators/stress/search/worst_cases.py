@@ -101,9 +101,9 @@ class WorstCases:
             self.jump = found
         if found.value > JUMP:
             self.broken += 1
-            moved = f"moves by {found.value:.3g} of the longest gradient"
+            moved = f"the result moves by {found.value:.3g} of the longest gradient"
             # Insert at the front, because other failures are numerous and would fill the list.
-            jump = (found, f"{moved} where the gradients do by 1e-12")
+            jump = (found, f"{moved} if the gradients move by 1e-12")
             self.failures = [jump, *self.failures][:KEPT]
 
 
