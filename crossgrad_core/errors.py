@@ -5,7 +5,8 @@ from typing import Final
 
 from crossgrad_core.wording import one_line, showable
 
-#: Longest part and longest place of a message; the middle of a longer text is left out.
+#: Maximum length of one part of a message, and of its `where`; the middle of a longer text is left
+#: out.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
 

@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    if arguments is None:  # This process belongs to the command.
+    if arguments is None:  # If this function runs, the process belongs to the command.
         outlast_readers()
     try:
         # Not `app()`, which would replace `sys.excepthook`.

@@ -99,7 +99,7 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
-    """Write the trained scene to a file that viewers open."""
+    """Write the trained scene to a file for viewers."""
     announce()
     from crossgrad_core.run.postprocess import export
     from crossgrad_core.run.postprocess.open_options import How
@@ -152,7 +152,7 @@ def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
-    """Draw the views of a run as PNG files."""
+    """Render the views of a run as PNG files."""
     alone = "a video shows the views of the cameras on its path"
     _check_together(("--on", on), ("--path", path), alone)
     _check_together(("--split", split), ("--path", path), alone)

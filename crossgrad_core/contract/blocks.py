@@ -143,7 +143,8 @@ class PluginState:
     per_primitive: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PluginState":
-        # By hand, because the read-only mappings of `EMPTY_STATE` cannot be copied deeply.
+        # Copy the fields one by one, because `deepcopy` fails for the read-only mappings of
+        # `EMPTY_STATE`.
         values = deepcopy(dict(self.values), memo)
         tensors, rows = (deepcopy(dict(part), memo) for part in (self.tensors, self.per_primitive))
         return PluginState(values, tensors, rows)
@@ -347,7 +348,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
     return new
 
 
-#: Added to the root of the second moment (3DGS).
+#: Epsilon that is added to the root of the second moment (3DGS).
 EPS: Final = 1e-15
 #: Decay of the first and of the second moment (3DGS).
 BETAS: Final = (0.9, 0.999)

@@ -28,7 +28,7 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: Log messages before and after the compilation of a kernel; `system/startup.py` relies on them.
+#: Log messages before and after the compilation of a kernel; `system/startup.py` reads them.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
@@ -199,7 +199,9 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                with suppress(OSError):  # Another process may be faster, or hold it open.
+                with suppress(
+                    OSError
+                ):  # Another process may have removed it first, or may hold it open.
                     path.unlink()
 
 

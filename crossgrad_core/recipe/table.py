@@ -15,7 +15,7 @@ from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.wording import listed, plural
 
-#: Settings without a default that training and assembly need: a recipe decides each of them.
+#: Settings that training and assembly need and that have no default: a recipe decides each of them.
 DECIDED: Final = (
     *(
         "views_per_step",
@@ -28,7 +28,8 @@ DECIDED: Final = (
     *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
-#: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.
+#: Setting whose rows in the table are rules: `rules.NAME` has the options of the rule as its value,
+#: or False if the rule is not used.
 RULES: Final = "rules"
 #: Largest number of decision lines in the terminal.
 LINES: Final = 12
@@ -153,7 +154,8 @@ def without_decided(settings: dict[str, Any]) -> None:
 def rows_of(config: RunConfig) -> tuple[Decision, ...]:
     """Return the decisions recorded in a configuration, without their evidence."""
     values = ((name, _value(config, name), why) for name, why in config.decided.items())
-    # The bound on the views of a run within seconds has become a number of steps.
+    # The limit on views of a run with a time budget has already been converted to a number of
+    # steps.
     return tuple(Decision(*row) for row in values if row[1] is not None)
 
 

@@ -182,7 +182,7 @@ def refuse_other_version(entry: Entry) -> None:
 
 def notes_on(error: BaseException) -> list[str]:
     """Return the notes on the step, hook and plugin in which an exception was raised."""
-    # The hook adds its note first.
+    # Keep the order of the notes: the hook adds its note first.
     return list(reversed(getattr(error, "__notes__", ())))
 
 
@@ -271,7 +271,7 @@ def installed_as(kind: "type[Component]") -> Entry | None:
     package = kind.__module__.partition(".")[0]
     for entry in entries(kind.slot).values():
         module, _, attribute = entry.value.partition(":")
-        # Another package's module is not imported for a class of the same name.
+        # Do not import the module of another package to find a class with the same name.
         alike = attribute.strip() == kind.__qualname__ and entry.package == package
         if alike and (module.strip() == kind.__module__ or resolve_entry(entry) is kind):
             return entry

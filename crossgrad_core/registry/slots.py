@@ -51,7 +51,8 @@ QUICK: Final = {
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
 _KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"
-#: Similarity above which a group without the prefix `crossgrad` counts as misspelt.
+#: A group without the prefix `crossgrad` counts as misspelt if its similarity to a known group is
+#: above this value.
 _ALIKE: Final = 0.85
 
 

@@ -103,8 +103,8 @@ def check_clock(config: RunConfig) -> None:
         )
 
 
-#: The length of a run on the bundled scene if the user sets no length: it ends after this many
-#: training seconds, or after 100 views of each training photo. More views overfit
+#: Length of a run on the bundled scene if the user sets no length. The run ends after this many
+#: training seconds, or after 100 views of each training photo, because more views overfit
 #: (docs/few-photos.md).
 BUNDLED_SECONDS = 120.0
 
@@ -155,7 +155,8 @@ class Outcome:
         return 0 if self.signal is None else exit_code(self.signal)
 
 
-#: Receives the results (table, folder and exit messages) while signals are still only recorded.
+#: Function that receives the results (table, folder and exit messages) while signals are still only
+#: recorded.
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
@@ -358,7 +359,7 @@ def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
     needed = expected_bytes(state.primitives(setup), 2)
     folder = create_run_folder(name, setup.config.out, needed=needed)
     with _held(folder):
-        # Another run may have begun and ended here meanwhile.
+        # Check again after taking the lock, because another run may have used the folder before.
         check_out(folder)
         yield folder
 
@@ -397,7 +398,7 @@ def _train(
 
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
     print(table)  # noqa: T201 - the result of the command
-    if folder.is_dir():  # Nobody moved it meanwhile.
+    if folder.is_dir():  # Print the folder only if nobody moved it.
         print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:
         print(line, file=sys.stderr)  # noqa: T201
@@ -425,13 +426,15 @@ def resumed(
             the training, or the scene or a package has changed.
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-    read_config(folder)  # Before the lock, which must not be written into any other folder.
+    read_config(
+        folder
+    )  # Check before taking the lock, because a folder of another kind must not be changed.
     with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
-        damaged = set(changed_files(folder)) - {CONFIG}  # Its settings are compared by themselves.
+        damaged = set(changed_files(folder)) - {CONFIG}  # Settings are compared separately.
         if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
                 "the run is finished, so that it cannot be resumed",

@@ -215,7 +215,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
     """Return the cache of photos, in addition to the photos that were decoded last."""
     mib, device = config.data.cache_mib, choose_device(config.device)
-    # At half the size photos take a quarter of the memory.
+    # At half the size, photos use a quarter of the memory.
     scaled = ScaledPhotos(mib // 4)
     return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
 

@@ -249,7 +249,7 @@ def _is_map(value: object) -> bool:
     return isinstance(value, dict)
 
 
-#: Part of a state -> test for a valid value.
+#: Part of a state -> function that tests whether its value is valid.
 _PARTS: Mapping[str, Callable[[Any], bool]] = {
     "sha256": lambda value: isinstance(value, str),
     "step": _is_count,
@@ -338,7 +338,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # The library creates a file of its own that only its owner may read.
+        # The library creates a new file that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -360,7 +360,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         if showable(str(path)) != str(path):  # The library opens names in UTF-8 only.
             return load(path.read_bytes())
-        # Clones, because the library maps the file, which a later checkpoint may delete.
+        # Clone the tensors, because the library maps the file, which a later checkpoint may delete.
         return {key: tensor.clone() for key, tensor in load_file(path).items()}
     except SafetensorError as error:
         raise ValueError(str(error)) from error

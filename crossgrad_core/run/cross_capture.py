@@ -16,17 +16,17 @@ from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
-#: A pose nearer than this to the pose of a training view counts as the same: local units (extents),
-#: and radians.
+#: A view counts as a training view if its pose is nearer to a training pose than these limits:
+#: local units (extents), and radians.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: At least this share of the other capture's points must be in the box around the run's points and
-#: cameras, enlarged by this factor.
+#: The capture is accepted if at least this share of its points is inside the box around the run's
+#: points and cameras, enlarged by this factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of two captures of one place are on the same surfaces. Their median distance from the
 #: run's points is at most this share of the median after any of `TURNS` random rotations about the
 #: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Numbers of points for this test: at least, at most of the other capture, at most of the run.
+#: Numbers of points for this test: minimum, maximum from the other capture, maximum from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -157,7 +157,8 @@ def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
     """
     from scipy.spatial import cKDTree
 
-    # Points outside the run's points do not count: the other capture may show more of the place.
+    # Ignore points outside the box of the run's points, because the other capture may show a larger
+    # area.
     points = points[((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1)]
     if min(len(own), len(points)) < FEWEST_POINTS:
         return True

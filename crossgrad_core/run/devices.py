@@ -122,7 +122,7 @@ def _missing() -> list[str]:
     for name in entries("rasterizers"):
         try:
             told.append(load(Rasterizer, name).missing("cuda"))
-        except UserError:  # Another note already reports that it cannot be imported.
+        except UserError:  # Another note already reports that the package cannot be imported.
             continue
     return told
 

@@ -28,7 +28,7 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: Texts in torch errors that mean out of memory; some such errors have a type of their own.
+#: Texts in errors of torch that mean out of memory; some of these errors also have their own type.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
@@ -122,7 +122,8 @@ class RunLoop:
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
-        # A state that a step left half changed, and that was not restored, cannot be continued.
+        # A run cannot continue from a state that a failed step changed partly and that was not
+        # restored.
         if self.state.step > 0 and not self.state.touched:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
@@ -155,8 +156,12 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    guard.copy(state)  # No rollback before the step of a new length.
-                if revised.config is not self.setup.config:  # A planned length is written already.
+                    guard.copy(
+                        state
+                    )  # Do not allow a rollback to a step before the length changed.
+                if (
+                    revised.config is not self.setup.config
+                ):  # A planned length has already been written.
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised
@@ -197,7 +202,7 @@ class RunLoop:
             try:
                 return part()
             except Exception as error:
-                # Compiled code can turn an interrupt into an error of its own.
+                # Compiled code can replace an interrupt by its own error.
                 if self.stopper.at_once:
                     raise KeyboardInterrupt from error
                 raise
@@ -305,7 +310,7 @@ def _kept(course: RunLoop) -> list[str]:
 
 #: Steps and training seconds to observe before the estimate; the very first step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
-#: No estimate is given for less than this many seconds: the run ends before it helps.
+#: No estimate is shown if less time than this remains, in seconds.
 WORTH_A_LINE = 60.0
 
 

@@ -54,8 +54,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Clock, Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
-#: Settings that do not affect what was trained, or that a resumed run may have changed: paths,
-#: times of evaluations, the number of tolerated faults, and a length that follows the clock.
+#: Settings that do not affect the trained result, or that a resumed run may have changed: paths,
+#: times of evaluations, the number of tolerated faults, and a length that follows a time budget.
 _LOOSE: Final = frozenset(
     {
         "clock",
@@ -83,9 +83,9 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
-#: The component that another machine may lack.
+#: Component that another machine may lack.
 _DRAWN: Final = "rasterizer"
-#: Key that tells whether the length follows a clock.
+#: Key that records whether the length follows a time budget.
 _TIMED: Final = "the length follows a time budget"
 
 
@@ -95,10 +95,12 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     if config.planned_seconds is None:
         loose -= {"revisions"}
     else:
-        loose |= {"steps"}  # The clock may have changed the number.
+        loose |= {"steps"}  # The run may have changed the number to meet its time budget.
     data = config.model_dump(mode="json", exclude=loose)
-    del data[_DRAWN]["name"]  # Another machine may use another rasterizer; its options still count.
-    # The same default as in `_config`, for a run that did not write this setting.
+    del data[_DRAWN][
+        "name"
+    ]  # Another machine may use another rasterizer, but its options still count.
+    # The default is equal to that of `_config`, for a run that did not write this setting.
     data |= {
         "sh_from": config.sh_from or 0,
     }
@@ -164,12 +166,14 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
-        return  # Written by another version: it stored no settings, or they may have other names.
+        return  # Another version wrote the checkpoint: it stored no settings, or under other names.
     ours = settings_of(config)
-    # A setting that is newer than the checkpoint is not a change; an option of a component may be.
+    # A setting that did not exist when the checkpoint was written is not a change. A new option of
+    # a component may be a change.
     known = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
-    # Another rasterizer has other options. A length that follows the clock lacks these settings.
+    # Another rasterizer has other options. A length that follows a time budget lacks these
+    # settings.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
@@ -279,11 +283,11 @@ _PLAIN: Final = {
     "operator": defaults.OPERATOR,
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
-    # It needs no points; the scene may have none.
+    # This initializer needs no points, because the scene may have none.
     "initializer": defaults.INITIALIZER_WITHOUT_POINTS,
     "resolution": defaults.RESOLUTION,
 }
-#: Slots (singular words) whose components are not needed to look at a run.
+#: Slots (singular words) whose components are not needed to evaluate a run.
 REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
@@ -333,7 +337,7 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: Note of a run that has to begin again.
+#: Note of a run that has to start again.
 BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
@@ -483,7 +487,7 @@ def _from(
     looks: bool = False,
 ) -> tuple[Setup, TrainState]:
     checkpoint = load_latest(folder)
-    # Read after the checkpoint: a run that follows the clock only adds to its configuration.
+    # Read the file after the checkpoint, because a run with a time budget only adds settings to it.
     config = _config(folder, settings)
     config_now = without_missing(config) if looks else config
     setup, seconds = set_up(config_now, verbosity, check, looks=looks)
@@ -520,7 +524,7 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # Runs write the degree that they begin with; runs of the first versions began with degree 0.
+    # Runs write the initial degree; runs of the first versions started with degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})

@@ -32,7 +32,7 @@ from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
-#: The search for a K that suits sampler and operator ends before this number.
+#: The search for a K that suits both sampler and operator ends before this number.
 _MOST_VIEWS: Final = 13
 
 
@@ -264,7 +264,7 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     named = config.operator != RunConfig.model_fields["operator"].default
     found, why = usual, ""
     if usual not in both:
-        # If no K suits both, the objections say so.
+        # If no K suits both, the validation of the selection reports it.
         found, why = next(iter(both), usual), f"the operator needs {operator.views}"
     elif named and operator.needs_more_views(usual):
         found = next((k for k in both if not operator.needs_more_views(k)), usual)

@@ -34,7 +34,7 @@ from crossgrad_core.training.state import TrainState
 
 #: The trained scene, for viewers; the exporter gives the suffix.
 CLOUD = "point_cloud"
-#: Number of held-out views for which panels are drawn.
+#: Number of held-out views for which panels are rendered.
 PANELS = 4
 
 

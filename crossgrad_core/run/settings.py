@@ -211,13 +211,13 @@ def _overlaid(
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
     had = {(key,) for key, value in settings.items() if value is not None} & {*LENGTHS}
     if lengths:
-        # A new length replaces the earlier one as a whole, including its clock and the step at
-        # which it was to stop.
+        # A new length replaces all settings of the earlier length, including its time budget and
+        # the step of `stop_after`.
         timed = bool(had & {("seconds",), ("planned_seconds",)}) and ("seconds",) not in lengths
         gone = had | ({("stop_after",)} if had else set()) | ({("clock",)} if timed else set())
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
     settings = _opened(settings, [*chosen, *(path for path, _ in assigned)])
-    # Names first: the choice of another component drops the options of the previous one.
+    # Set names first, because a new component drops the options of the previous component.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
             _assign(settings, path, value)

@@ -77,7 +77,7 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
         yield from _of_choice(slot, slot, getattr(config, slot), setup)
     links = config.operators
     for link in links:
-        # An option of a link in a chain is set by the name of the link.
+        # Options of an operator in a chain are set by the name of the operator.
         place = "operator" if len(links) == 1 else f"operator.{link.name}"
         yield from _of_choice("operator", place, link, setup)
 
@@ -88,7 +88,8 @@ def _of_choice(
     if choice is None or not choice.options:
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
-    # As the user set it: a component fitted to the scene may have lost unneeded options.
+    # Use the options as the user set them: a component that was fitted to the scene may have lost
+    # unneeded options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{place}.{option}", why
@@ -117,7 +118,7 @@ def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
             "reset_every",
             f"densifier {setup.selection.names['densifier']} makes no opacity resets",
         )
-    # A run that follows the clock reports this as a note once its length is known.
+    # A run with a time budget reports this as a note as soon as its length is known.
     if not (config.seconds or config.planned_seconds):
         yield from without_resets(config, setup)
 

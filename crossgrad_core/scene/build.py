@@ -36,8 +36,9 @@ from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: If at least this share of the stored pixels counts, some pixels count after every later step.
-#: Below this share, undistorting and resizing could remove all of them, so the photo is decoded.
+#: If at least this share of the stored pixels is unmasked, some unmasked pixels remain after every
+#: later step. Below this share, undistorting and resizing could remove all of them, so the photo is
+#: decoded to check.
 _SURE = 0.05
 _HALF = 128
 

@@ -161,7 +161,7 @@ class Calibration:
         rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
         columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
         plane = (np.concatenate(rows + columns) - [frame.cx, frame.cy]) / [frame.fx, frame.fy]
-        # Bilinear interpolation needs a pixel centre on either side.
+        # Bilinear interpolation needs a neighbouring pixel centre on each side.
         pixels = source_pixels(self._camera, plane) - 0.5
         inside = (pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])
         return bool(inside.all() and not self._reach.beyond(plane).any())

@@ -192,11 +192,11 @@ def _points_of(scene: Scene) -> PointsMark:
 class Weight(IntEnum):
     """The effect of a difference on a model that was trained on the former scene."""
 
-    #: Pixels or points differ; every camera and every parameter is unchanged.
+    #: Only pixels or points differ; all cameras and parameters are unchanged.
     CONTENT = 1
     #: Other views are held out.
     HELD_OUT = 2
-    #: Other views are trained, or cameras moved: parameters would be misplaced.
+    #: Other views are trained, or cameras moved, so the parameters would be misplaced.
     PLACE = 3
 
 
@@ -223,7 +223,7 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     if not any(each.weight is Weight.PLACE for each in found):
         found += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     found += _files(was, now)
-    # Other changed files are reported only if no difference was found, else their effect is listed.
+    # If a difference was found, it is listed, and other changed files are not reported in addition.
     return found or _others(was, now)
 
 

@@ -10,7 +10,8 @@ from crossgrad_core.contract.scene import Similarity, stray_rows
 # 1.1 x the largest distance of a training camera from the mean of all (3DGS, scene extent).
 _MARGIN = 1.1
 
-# If cameras are closer together than this share of their distance to the scene, they give no unit.
+# If the distance between cameras is below this share of their distance to the scene, it is not used
+# as the unit.
 _SAME_PLACE = 1e-6
 
 # A smaller size, in input units, is treated as 0, because its inverse must be finite.

@@ -29,7 +29,7 @@ SUFFIXES: Final = (".las", ".laz")
 #: Suffixes of all point clouds.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
-#: Colours have 16 bits if this percentile of them is at least `_LONG`.
+#: Colours have 16 bits if this percentile is at least `_LONG`.
 _MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -37,22 +37,24 @@ _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "di
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: The most points that are read from a file; from a larger file, every second, third ... point.
+#: Maximum number of points that are read from a file; from a larger file, only every n-th point is
+#: read.
 _MOST_IN_LAS: Final = 20_000_000
-#: Points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more. Structure
-#: from motion finds a few hundred points per photo.
+#: Number of points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more.
+#: Structure from motion finds a few hundred points per photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: The most cube sizes that are tried, and the share of the wanted points that ends the search.
+#: Maximum number of cube sizes that are tried. The search ends early at this share of the wanted
+#: points.
 _TRIES, _ENOUGH = 12, 0.8
-#: Sampled points from which the size of a cloud is estimated.
+#: Number of sampled points from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
-#: Points are on surfaces, so their number falls with the square of the side.
+#: Points are on surfaces, so the number of occupied cubes falls with the square of the side.
 _SURFACE: Final = 2.0
 #: Odd factors that hash the integer coordinates of a cube.
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _FARTHEST: Final = 2.0**62
-#: Side of the cubes if all points are in one place, in input units.
+#: Side of the cubes in input units, if all points have the same position.
 _SMALLEST: Final = 1e-12
 
 

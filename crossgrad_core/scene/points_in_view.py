@@ -14,7 +14,8 @@ from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
-#: Points and photos that are tested, and the least share of points that must be in some photo.
+#: Number of points and photos that are tested, and the minimum share of points that must be visible
+#: in a photo.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
 #: If a change of the poses brings this share of points into photos, it is the likely cause.

@@ -139,7 +139,7 @@ def check_views(raw: RawScene) -> None:
 
 def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
     """Leave out points that are not finite, and note their number."""
-    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
+    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # This is also False for NaN.
     broken = int((~finite).sum())
     notes = (
         [f"points: {count(broken, 'point')} left out, because they are not finite"]
@@ -206,7 +206,7 @@ def _check_view(raw: RawScene, view: RawView) -> None:
     where = f"{raw.root}: image {view.name}"
     view.calibration.check(where)
     pose = view.world_to_camera
-    if not (np.abs(pose) <= FARTHEST).all():  # False for NaN
+    if not (np.abs(pose) <= FARTHEST).all():  # This is also False for NaN.
         raise UserError(
             "a pose contains numbers that are not finite",
             where=where,

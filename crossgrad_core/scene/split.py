@@ -15,7 +15,8 @@ from crossgrad_core.system.input_files import read_file
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
-#: Names of training views -> regime of every view; without folders, their median is the threshold.
+#: Function that maps the names of training views to the regime of every view. Without folders, the
+#: median of the training views is the threshold.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
 _LINES: Final = {b"\n": 150}  # bytes of a name in memory
@@ -132,7 +133,7 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # A split prescribed by the input is in no list file.
+    # No list file contains a split that the input prescribes.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:

@@ -15,7 +15,7 @@ from crossgrad_core.system.files import (
     unfinished_name,
 )
 
-#: Bytes that a path of a file below a folder of results may add.
+#: Maximum number of bytes that the path of a file below a folder of results adds.
 _BELOW: Final = 200
 
 

@@ -20,8 +20,8 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.input_files import open_file
 
-#: Bounds of a text: bytes, values (an alias counts like the value that it copies), depth of nested
-#: lists, digits of a number.
+#: Limits of a text: bytes, values (an alias counts as often as the value that it copies), nesting
+#: depth of lists, digits of a number.
 MOST_BYTES: Final = 1 << 18
 MOST_VALUES: Final = 10_000
 DEEPEST: Final = 32

@@ -14,7 +14,7 @@ from crossgrad_core.registry.signatures import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
 from crossgrad_core.wording import in_one_line, listed, singular
 
-#: `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
+#: Function `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
 AnyCheck: TypeAlias = Callable[[Any], None]
 
 
@@ -89,7 +89,7 @@ def _announced_at(entry: registry.Entry) -> str:
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)
-    # The object may belong to another package; its location would not help then.
+    # If the object belongs to another package, its location would not help the author.
     own = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
     return own or getattr(loaded, "__file__", None) or entry.origin
 

@@ -17,7 +17,8 @@ from crossgrad_core.registry.commands import Command, as_group_member
 from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
-#: Libraries with a long import time; a command imports them after it has reported its start.
+#: Libraries with a long import time. A command imports them only after it has printed its first
+#: message.
 HEAVY: Final = ("matplotlib", "numba", "numpy", "pydantic", "scipy", "torch")
 _IMPORTED = """
 import sys

@@ -49,7 +49,7 @@ from crossgrad_core.wording import listed
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
 _EDIT = 600
 _ROOM = 10_000
-#: Least share of the present primitives that remains after one edit.
+#: Minimum share of the present Gaussians that must remain after one edit.
 _LEFT = 0.1
 #: Typical gradient of the projected mean, per pixel: for images of the sample scene's size, 2e-5
 #: corresponds to the published threshold in NDC units.
@@ -174,7 +174,7 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # Of equally good backbones the first is used: crossgrad's own.
+    # Of several suitable backbones, use the first one, which is crossgrad's own.
     known = sorted(entries("backbones").values(), key=lambda each: each.distribution != "crossgrad")
     for entry in sorted(known, key=lambda each: each.name != BACKBONE):
         try:
@@ -182,7 +182,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             usual = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
-            # A broken backbone of another package is not this densifier's fault.
+            # If a backbone of another package is broken, the densifier is not the cause.
             continue
         if densifier.tensors <= have:
             fitting.append((type(densifier) is not usual, backbone))

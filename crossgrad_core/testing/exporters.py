@@ -93,7 +93,7 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
         len(found) == len(stored),
         f"{len(stored)} Gaussians were written, but {len(found)} were read",
     )
-    # The offset in the input frame costs the positions their last bits.
+    # Positions lose their last bits, because the offset of the input frame is large.
     size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
     for name in ("means", "scales", "opacities"):
         error = float((getattr(found, name) - getattr(stored, name)).abs().max())

@@ -305,7 +305,9 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
-    if not isinstance(answer, kind):  # Formatting the answer takes long, so it is not done before.
+    if not isinstance(
+        answer, kind
+    ):  # Format the answer only after a failure, because formatting takes long.
         raise ContractError(f"a hook returned {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
         require(
@@ -406,7 +408,8 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # Memory that it allocates once, such as a buffer, is allocated in the first steps.
+    # Ignore the first steps, in which the observer allocates memory that it reuses, such as a
+    # buffer.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(
         grown <= _KEPT,

@@ -238,7 +238,7 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
         again = transformed(operator, scaled)[0].sum(axis=1)
         lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
         for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
-            # The error is relative to the longest summand, because rounding is.
+            # The error is relative to the longest summand, because rounding errors are.
             error = np.abs((one - other) * length).max()
             size = np.abs(one * length).max()
             require(

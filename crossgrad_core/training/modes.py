@@ -24,7 +24,7 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
         return ()
     found = bimodality(quantity.values[np.isfinite(quantity.values)])
     figure = found.deciding
-    # The figure is NaN if all values are equal or there are too few values.
+    # The coefficient is NaN if all values are equal or there are too few values.
     if not figure < ONE_MODE:
         return ()
     return (

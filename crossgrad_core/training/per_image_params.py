@@ -24,7 +24,7 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import NonFiniteError, TrainState
 from crossgrad_core.wording import listed
 
-#: The file in a run's folder.
+#: Name of the file in a run's folder.
 PHOTO_VALUES: Final = "exposure.json"
 #: Version of the format; increased when an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
@@ -119,7 +119,7 @@ def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserErro
     )
 
 
-#: The name among the states of plugins.
+#: Name of this state among the states of plugins.
 STATE = "photos"
 _VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
 #: Name -> leaf [...] of one photo.
@@ -243,7 +243,7 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # A checkpoint may have put it on the GPU, where each step would wait for it.
+    # A checkpoint may have moved it to the GPU, where each step would wait for it.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():

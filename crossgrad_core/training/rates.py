@@ -12,7 +12,7 @@ from crossgrad_core.wording import listed
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
 
-#: The learning rate of a tensor that learns in one of n steps is multiplied by n to this power.
+#: If a tensor learns in one of n steps, its learning rate is multiplied by n to this power.
 RESTED: Final = 0.5
 
 

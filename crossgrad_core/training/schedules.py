@@ -13,7 +13,7 @@ from crossgrad_core.training.setup import Setup
 #: The highest degree of harmonics.
 MOST_DEGREES: Final = 3
 
-#: Times of density control that the user may set.
+#: Times of density control that the user can set.
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
@@ -45,7 +45,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # Settings of the user do not change with the length.
+    # Settings of the user do not change with the length of the run.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 

@@ -116,10 +116,10 @@ if __name__ == "__main__":
 _LOG = logging.getLogger(__name__)
 #: Number of random initial points (`--init random`).
 RANDOM_POINTS = 20_000
-#: Share of the bound on primitives at the start of a run whose points would make more
-#: (docs/schedules.md), and the name of the state that stores the original number.
+#: Maximum share of --max-gaussians at the start of a run whose points would give more Gaussians
+#: (docs/schedules.md), and the name of the state that stores the number without this limit.
 BEGINNING, THINNED = 2 / 3, "thinned"
-#: Largest share of points that another attempt keeps.
+#: Maximum share of points that the next attempt keeps.
 _LESS = 0.8
 
 
@@ -131,7 +131,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # Contiguous, as from a checkpoint, because another memory layout changes the rounding.
+        # Make the tensors contiguous, as after a checkpoint, because another memory layout changes
+        # the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -175,7 +176,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     while made > bound and share * len(begun.points) >= 1.0:
         parameters = _made(setup, setup.backbone.create(thinned(begun, share, rng), rng), "create")
         made = primitives_of(setup.blocks, parameters)
-        # If the number of primitives per point is not 1, this takes more than one attempt.
+        # If the number of Gaussians per point is not 1, several attempts are needed.
         share *= min(_LESS, wanted / made)
     return parameters, present
 
@@ -191,7 +192,7 @@ def _begun(setup: Setup) -> Scene:
         begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        initializer.more_points(scene)  # An error of the initializer itself is raised here.
+        initializer.more_points(scene)  # This raises errors of the initializer itself.
         wrong = in_one_line(error)
     if not wrong:
         return begun
@@ -217,7 +218,7 @@ def _misfit(begun: Scene, known: int) -> str:
     if not np.isfinite(points).all():
         return "a position that is not finite"
     sizes, opacities = sizes[known:], opacities[known:]
-    # NaN leaves the size or the opacity to the backbone.
+    # NaN means that the backbone chooses the size or the opacity.
     if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
         return "a size that is not a number above 0"
     inside = (opacities > 0.0) & (opacities < 1.0) | np.isnan(opacities)

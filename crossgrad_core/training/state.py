@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams, restored_streams, stream_
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Unit of a time budget: wall-clock seconds, or CPU seconds of the process.
+#: Clock of a time budget: wall-clock seconds, or CPU seconds of the process.
 ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
@@ -570,5 +570,7 @@ def is_whole(state: TrainState) -> bool:
     """Return True if all parameters are finite; False if they are not or cannot be checked."""
     try:
         return are_parameters_finite(state)
-    except Exception:  # The last step failed, there is no memory for the check, or the GPU failed.
+    except (
+        Exception
+    ):  # The last step failed, the check needs more memory than available, or the GPU failed.
         return False

@@ -152,7 +152,8 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Fewest primitives that are sorted; with 59 parameters each, parameters and moments take 12 MB.
+#: Minimum number of Gaussians that are sorted; with 59 parameters each, parameters and moments use
+#: 12 MB.
 FEWEST_SORTED = 2**14
 #: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame. The cameras
 #: span about one unit; positions farther away than 128 units are clamped to the border cells.
@@ -465,7 +466,7 @@ def _finish(
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # Background steps hold gradients, and an edit needs their memory.
+            # Background steps keep gradients in memory, which an edit needs.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:

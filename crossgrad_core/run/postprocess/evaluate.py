@@ -126,7 +126,9 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.
     """
-    require_checkpoint(folder)  # Before the lock, which must not be written into any other folder.
+    require_checkpoint(
+        folder
+    )  # Check before taking the lock, because a folder of another kind must not be changed.
     with writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points

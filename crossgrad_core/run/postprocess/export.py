@@ -77,7 +77,9 @@ def exported(
             check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
-        exporter = setup.selection.exporter  # With the run's own options, if it is the run's.
+        exporter = (
+            setup.selection.exporter
+        )  # If the exporter is the run's exporter, use the options of the run.
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:

@@ -126,7 +126,7 @@ def render_path(
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
             for video in video_files(out) if own else ():
-                if video != made:  # A video of other frames.
+                if video != made:  # Frames of another video exist.
                     video.unlink(missing_ok=True)
         told = (
             f"video {made}"

@@ -21,7 +21,7 @@ from crossgrad_core.system.files import (
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
-#: Folder of all runs, relative to the working folder.
+#: Folder that contains all runs, relative to the working folder.
 RUNS = Path("runs")
 _UNSAFE = re.compile(r"[^\w.+-]+")
 
@@ -120,7 +120,9 @@ def clear_half_written(folder: Path) -> None:
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
     """Estimate the bytes that a run writes: SH degree 3, two Adam moments, one PLY file."""
-    floats = 59 * 3 * (checkpoints + 1) + 62  # one more checkpoint exists while it is written
+    floats = (
+        59 * 3 * (checkpoints + 1) + 62
+    )  # Count one more checkpoint, because the old ones exist while a new one is written.
     return max(SMALLEST_NEED, 4 * floats * primitives)
 
 

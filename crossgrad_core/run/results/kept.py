@@ -14,9 +14,9 @@ from crossgrad_core.system.input_files import read_file
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml
 from crossgrad_core.wording import listed
 
-#: The scalar of a checkpoint that holds the texts: name of a file -> its content.
+#: Scalar of a checkpoint that contains the texts: name of a file -> its content.
 KEY: Final = "files"
-#: Settings that a run which follows the clock rewrites.
+#: Settings that a run with a time budget rewrites.
 _REVISED: Final = frozenset({"steps", "revisions"})
 
 
@@ -40,7 +40,7 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     text = (scalars.get(KEY) or {}).get(METRICS)
     found = _content(folder / METRICS)
     if text is None or found == text.encode():
-        return ()  # There was no file when the checkpoint was written, or it is whole.
+        return ()  # The file did not exist when the checkpoint was written, or it is complete.
     write_atomically(folder / METRICS, text.encode())
     if found is not None and found.startswith(text.encode()):
         return ()

@@ -18,11 +18,13 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: The locked file. It stays when its process has ended; then no process holds the lock.
+#: Name of the locked file. The file remains when its process has ended; then no process holds the
+#: lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
-# Windows locks ranges of bytes that other processes cannot read, so lock one far after the content.
+# Windows locks ranges of bytes, which other processes then cannot read. Lock a byte far after the
+# content.
 _FAR = 2**30
 _MOST = 4096  # most bytes of a holder's description
 
@@ -79,7 +81,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
     path = folder / FILE
     check_own(path)
     with disk_errors(path):
-        # Unbuffered: a buffer would write again on close what a full disk had refused.
+        # Do not buffer: on close, a buffer would write again the data that a full disk had refused.
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
     with file:
         taken = _take(file)

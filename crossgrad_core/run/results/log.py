@@ -13,7 +13,7 @@ from crossgrad_core.wording import showable
 
 #: Weight of a new value in the smoothed loss and step rate.
 SMOOTHING = 0.05
-#: A change of the length by a smaller share is not reported.
+#: A change of the length is reported only if it is larger than this share.
 NEWS_SHARE = 0.1
 
 

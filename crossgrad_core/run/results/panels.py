@@ -197,7 +197,8 @@ def _unreadable(path: Path, found: str) -> UserError:
     )
 
 
-#: Errors of this size and above get the last colour; fixed, so that panels are comparable.
+#: Errors of at least this size get the last colour; the limit is fixed, so that panels are
+#: comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)

@@ -17,9 +17,9 @@ from crossgrad_core.system.interrupts import HELPERS
 #: The program that writes videos; without it, Pillow writes an animated image.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
-#: Most bytes of all frames of an animated image, which are in memory at once.
+#: Maximum number of bytes of all frames of an animated image, which are in memory at the same time.
 _LARGEST: Final = 1 << 29
-#: Most pixels of a side of an animated image.
+#: Maximum side of an animated image in pixels.
 _LONGEST: Final = 16_383
 
 

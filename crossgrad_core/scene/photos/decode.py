@@ -27,7 +27,7 @@ WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
 _MOST_GREY = 0.05
 #: Bytes of a photo that are copied at once, so that they stay in the processor's cache.
 _BAND = 1 << 19
-#: Standard deviations at which SciPy cuts its Gaussians off.
+#: SciPy cuts its Gaussian filter off at this many standard deviations.
 _WIDTHS = 4.0
 
 

@@ -30,11 +30,11 @@ _LOG = logging.getLogger(__name__)
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
 PIXELS_VERSION: Final = 2
-#: Bytes of a disk that stay free.
+#: Bytes of a disk that are kept free.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4
 _KEPT, _TEMPORARY = ".photo", ".tmp"
-#: Seconds after which an unfinished file belongs to a killed process.
+#: An unfinished file that is older than this many seconds belongs to a killed process.
 _STALE = 3600.0
 #: Uncertainty of file times in seconds.
 _GRAIN = 2.0
@@ -163,7 +163,9 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            with suppress(OSError):  # Another process may be faster, or hold it open.
+            with suppress(
+                OSError
+            ):  # Another process may have replaced the file first, or may hold it open.
                 path.unlink()
                 used -= length
         return used

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-#: More pixels are not decoded at once. This is Pillow's default limit, 0.5 GB of RGB.
+#: Maximum number of pixels that are decoded at once: Pillow's default limit, 0.5 GB of RGB.
 MOST_PIXELS: Final = 178_956_970
 # Formats of cameras and mask tools. Pillow knows more formats, some of which run programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
@@ -63,7 +63,8 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
             "the file is not a photo", where=path, found=found, todo="replace or remove the file"
         ) from error
     except Exception as error:
-        # For damaged files, decoders raise any exception: KeyError, struct.error ...
+        # Catch every exception, because decoders raise any type for damaged files: KeyError,
+        # struct.error ...
         raise UserError(
             what,
             where=path,

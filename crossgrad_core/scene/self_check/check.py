@@ -21,21 +21,22 @@ from crossgrad_core.scene.self_check.evidence import Floats, Integers, Pixels, p
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
-#: Poses are equal below this difference of their numbers, local units.
+#: Poses are equal if their numbers differ by less than this, in local units.
 _SAME_POSE: Final = 1e-9
 #: Points beyond this many times the median distance from the cameras count as infinitely far.
 _INFINITE: Final = 1e4
-#: Pixels of the small copy for the comparison of photos, in either direction.
+#: Photos are compared as small copies with this many pixels in either direction.
 _SMALL: Final = 16
-#: Mean difference in levels of 255 below which two photos are almost equal.
+#: Two photos are almost equal if their mean difference is below this, in levels of 255.
 _ALMOST: Final = 0.5
 #: A photo is blurred below this share of the median sharpness. It is dark or bright if it differs
 #: from the median brightness by more than this many stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
-#: With fewer photos, no median is computed.
+#: No median is computed for fewer photos.
 _FEWEST_PHOTOS: Final = 5
-#: Sharpness is the difference of neighbouring pixels over that of pixels this far apart.
+#: Sharpness is the difference of neighbouring pixels divided by the difference of pixels at this
+#: distance.
 _APART: Final = 6
 
 

@@ -18,15 +18,15 @@ from crossgrad_core.scene.self_check.evidence import (
 
 #: Cameras that are used in trials.
 MOST_CAMERAS: Final = 12
-#: With fewer points in frame, a camera without tracks counts as seeing nothing.
+#: A camera without tracks counts as seeing nothing if fewer points are in its frame.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
-#: A later trial must score this much more than an earlier, simpler trial.
+#: A later trial must score higher by this much than an earlier, simpler trial.
 _CLEARLY: Final = 0.03
-#: A probe must score this much more than the unchanged scene.
+#: A probe must score higher by this much than the unchanged scene.
 _PROBED: Final = 0.01
 #: Number of times that the step of a search is halved.
 _ROUNDS: Final = 4
-#: The least score of a consistent scene, and the least gain of a change that repairs a scene.
+#: Minimum score of a consistent scene, and minimum gain of a change that repairs a scene.
 LEAST: Final = 0.35
 GAINED: Final = 0.25
 Change: TypeAlias = Callable[[Rig], Rig]
@@ -359,7 +359,8 @@ def _scaled(factor: float) -> Trial:
     return Trial(
         f"points and camera positions have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # This gives the same image as scaled points, and each camera may have its own factor.
+        # Scaling the depth gives the same image as scaling the points, and each camera may have its
+        # own factor.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 

@@ -26,12 +26,13 @@ from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)
 
-#: Returns a fresh component with default options.
+#: Function that returns a fresh component with default options.
 Make = Callable[[], C]
-#: Raises `ContractError` if a component breaks the contract, `SkipTest` if it cannot be decided.
+#: Function that raises `ContractError` if a component breaks the contract, or `SkipTest` if this
+#: cannot be decided.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that checks try if the component admits them.
+#: Numbers of views per step that the checks try if the component supports them.
 VIEW_COUNTS = range(1, 7)
 
 

@@ -17,9 +17,10 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Steps of the first measurement, which is enough for a state that does not grow.
+#: Number of steps before the first measurement; a state that does not grow is complete by then.
 _FEW = 16
-#: Length of each of the three further windows: states with a shorter history stop growing there.
+#: Length of each of the three further windows; states with a shorter history have stopped growing
+#: by then.
 _WINDOW = 1000
 
 

@@ -55,7 +55,8 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     """
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")
-    # The manager would collect the same answers; registration with it would take most of the time.
+    # Do not register the observer with the manager, because registration would take most of the
+    # time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.plugins.values(), *observers)
     asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)

@@ -96,10 +96,10 @@ class Options:
 
 @command_of(Options)
 def stress(given: Options) -> None:
-    """Hold operators against exact arithmetic on extreme gradients.
+    """Test the accuracy of operators on extreme gradients.
 
-    Results are compared with 50-digit arithmetic. The exit status is 1 if an operator breaks its
-    promise.
+    Results are compared with 50-digit arithmetic. The exit status is 1 if an operator is less
+    accurate than docs/operators.md guarantees.
     """
     announce()
     _refuse_idle(given)

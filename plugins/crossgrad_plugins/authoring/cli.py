@@ -1,4 +1,4 @@
-"""List, explain, check and begin plugins."""
+"""List, explain, check and create plugins."""
 
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +31,9 @@ app = typer.Typer(
 
 SlotOption = Annotated[
     str | None,
-    typer.Option("--slot", metavar="SLOT", help=f"List only this slot: {listed(OFFERED)}."),
+    typer.Option(
+        "--slot", metavar="SLOT", help=f"Restrict the command to this slot: {listed(OFFERED)}."
+    ),
 ]
 
 
@@ -45,7 +47,7 @@ PackageArgument = Annotated[
 
 @app.callback(invoke_without_command=True)
 def plugins(context: typer.Context) -> None:
-    """List, explain, check and begin plugins. Without a command: list."""
+    """List, explain, check and create plugins. Without a command: list."""
     if context.invoked_subcommand is None:
         list_plugins(None)
 
@@ -66,7 +68,7 @@ def show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a plugin.")],
     slot: SlotOption = None,
 ) -> None:
-    """Explain a plugin: purpose, options, origin."""
+    """Show the purpose, the options and the origin of a plugin."""
     from crossgrad_plugins.authoring.describe import describe
 
     found = [entry for each in _slots(slot) for entry in offers(each)]
@@ -90,8 +92,8 @@ def check(
 ) -> None:
     """Run the contract checks of a package's plugins.
 
-    Every plugin of the package is loaded and checked as its slot demands.
-    Exit status: 0 where all of them pass, 1 where one fails.
+    Every plugin of the package is loaded and tested with the checks of its slot.
+    Exit status: 0 if all plugins pass, 1 if a plugin fails.
     """
     from crossgrad_plugins.authoring.check import check_package
 
@@ -121,9 +123,9 @@ def matrix(
 ) -> None:
     """Train a package's components with all others for a few steps.
 
-    Each combination of installed components trains a tiny scene twice; losses and parameters must
-    be finite, and both runs the same. A combination that is refused before training, with a
-    reason, is no failure. Exit status: 0 where all others train, 1 where one fails.
+    Each combination of installed components trains a tiny scene twice. Losses and parameters must
+    be finite, and both runs must be equal. A combination that is refused before training, with a
+    reason, does not count as a failure. Exit status: 0 if all other combinations train, else 1.
     """
     announce()
     from crossgrad_plugins.authoring.matrix.report import train_matrix, train_one
@@ -151,9 +153,9 @@ def new(
         typer.Option("--out", metavar="DIR", help="Folder of the package. Default: NAME."),
     ] = None,
 ) -> None:
-    """Write a small package with one plugin, to begin with.
+    """Create a small package with one plugin as a starting point.
 
-    The package holds a pyproject.toml, one module and one test, and passes `crossgrad plugins
+    The package contains a pyproject.toml, one module and one test, and passes `crossgrad plugins
     check`. Nothing is overwritten.
     """
     from crossgrad_plugins.authoring.new import write_package

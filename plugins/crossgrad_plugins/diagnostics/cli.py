@@ -81,11 +81,11 @@ class Given:
 
 @command_of(Given)
 def diagnose(given: Given) -> None:
-    """Measure a scene: camera regimes, gradient conflict, variance.
+    """Measure a scene: camera regimes, gradient conflict and gradient variance.
 
-    Trains a short vanilla run (or takes --run), probes the gradients of single views at frozen
-    parameters, and writes CSV files and a picture. The variance is split into the part within
-    groups of views and the part between them.
+    Trains a short vanilla run, or uses the run of --run. Then it measures the gradients of single
+    views at fixed parameters, and writes CSV files and a figure. The variance is split into the
+    part within groups of views and the part between groups.
     """
     vanilla = {
         "--seconds": given.seconds, "--max-size": given.max_size, "--probes": given.probes

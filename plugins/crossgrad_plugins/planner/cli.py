@@ -51,12 +51,12 @@ class Options:
 
 @command_of(Options)
 def plan(given: Options) -> None:
-    """Decide on evidence what a run on a scene needs.
+    """Decide which components a run on a scene needs, and show the evidence.
 
-    Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
-    stands in a table with the decision, the figure it rests on, what it saves, and the option that
-    overrules it. If evidence is missing, the default stays. `crossgrad run` decides likewise and
-    trains; with `--plan off` it does not. `crossgrad recipes show` lists what the recipe decides.
+    Reads cameras, photos, SfM points and tracks; trains only with --probe. A table shows each
+    decision, its evidence, what it saves, and the option that overrides it. If evidence is missing,
+    the default is used. `crossgrad run` makes the same decisions, except with `--plan off`.
+    `crossgrad recipes show` lists the decisions of the recipe.
     """
     announce(quiet=given.as_json)
     from crossgrad_plugins.planner import app

@@ -81,10 +81,10 @@ class Options:
 
 @command_of(Options)
 def prepare(given: Options) -> None:
-    """Find the cameras of a folder of photos: from photos to a scene for `crossgrad run`.
+    """Estimate the camera poses of photos and make a scene for `crossgrad run`.
 
     The command finds features, matches and poses, and writes undistorted photos. If photos have
-    GPS, it also finds the place on Earth. A report (report.md, report.png) lists the photos in the
+    GPS, it also georeferences the scene. A report (report.md, report.png) lists the photos in the
     scene, the missing photos, and the reasons.
     """
     announce(quiet=True)

@@ -194,10 +194,7 @@ def _tell_folders(
                 name=name_some([f"{folder}/"]), why="the folder of masks (--masks), not of photos"
             )
         elif strays:
-            why = (
-                f"masks; {count(len(strays), 'file')} without a photo: "
-                f"{name_some(strays)}"
-            )
+            why = f"masks; {count(len(strays), 'file')} without a photo: {name_some(strays)}"
             yield LeftOut(name=name_some([f"{folder}/"]), why=why)
         elif folder != _MASKS:
             yield LeftOut(name=name_some([f"{folder}/"]), why="masks of the photos next to it")

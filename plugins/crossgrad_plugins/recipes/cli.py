@@ -1,4 +1,4 @@
-"""List the recipes, which decide the settings of a run; show one."""
+"""List the recipes, which decide the settings of a run, or show one recipe."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def recipes(context: typer.Context) -> None:
-    """List the recipes, which decide the settings of a run; show one."""
+    """List the recipes, which decide the settings of a run, or show one recipe."""
     if context.invoked_subcommand is None:
         from crossgrad_core.commands import load_component
 

@@ -80,10 +80,10 @@ class Options:
 
 @command_of(Options)
 def sweep(given: Options) -> None:
-    """Run a grid of configurations, scenes and seeds; resume it after any interruption.
+    """Run a grid of configurations, scenes and seeds; the same command resumes it.
 
-    Every run is one of `crossgrad run` in a folder of its own; its name is a hash of its
-    configuration, scene and seed, so that what is finished is never repeated.
+    Every run is a run of `crossgrad run` in its own folder. The name of the folder is a hash of
+    configuration, scene and seed, so that finished runs are never repeated.
     """
     looks = {
         "--dry-run": given.dry_run, "--list": given.list_runs, "--best": given.best is not None

@@ -195,7 +195,7 @@ def test_runs_with_different_regimes_are_compared_overall_only(tmp_path):
     found = comparison(tmp_path, RunFolder(), other)
     assert [each.where for each in found.ends] == ["at the end"]
     assert found.regimes == ()
-    assert any("regimes are not compared on city" in note for note in found.notes)
+    assert any("regimes of scene city are not compared" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
