@@ -47,9 +47,8 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
             most = next(bits)
             found.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
-            value = float(
-                largest(tensor)
-            )  # Check all parts at once, because every check on a GPU waits for the device.
+            # Use one pass and one wait for the device.
+            value = float(largest(tensor))
             found.append((isfinite(value), value > 0.0))
         else:
             found.append((bool(torch.isfinite(tensor).all()), bool(tensor.any())))

@@ -199,9 +199,8 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                with suppress(
-                    OSError
-                ):  # Another process may have removed it first, or may hold it open.
+                # Another process may have removed it first, or may hold it open.
+                with suppress(OSError):
                     path.unlink()
 
 

@@ -426,9 +426,8 @@ def resumed(
             the training, or the scene or a package has changed.
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-    read_config(
-        folder
-    )  # Check before taking the lock, because a folder of another kind must not be changed.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    read_config(folder)
     with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total

@@ -156,12 +156,10 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    guard.copy(
-                        state
-                    )  # Do not allow a rollback to a step before the length changed.
-                if (
-                    revised.config is not self.setup.config
-                ):  # A planned length has already been written.
+                    # Do not allow a rollback to a step before the length changed.
+                    guard.copy(state)
+                # If the configuration is the same object, the planned length is already written.
+                if revised.config is not self.setup.config:
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised

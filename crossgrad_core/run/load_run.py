@@ -97,9 +97,8 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     else:
         loose |= {"steps"}  # The run may have changed the number to meet its time budget.
     data = config.model_dump(mode="json", exclude=loose)
-    del data[_DRAWN][
-        "name"
-    ]  # Another machine may use another rasterizer, but its options still count.
+    # Another machine may use another rasterizer, but its options still count.
+    del data[_DRAWN]["name"]
     # The default is equal to that of `_config`, for a run that did not write this setting.
     data |= {
         "sh_from": config.sh_from or 0,

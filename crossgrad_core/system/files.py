@@ -152,9 +152,8 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 def _is_alive(process: int) -> bool:
     """Return True if another process of this machine has that number."""
-    if (
-        process == os.getpid()
-    ):  # An earlier process with the same number left it, as in a container.
+    # An earlier process with the same number left it, as in a container.
+    if process == os.getpid():
         return False
     try:
         os.kill(process, 0)

@@ -305,9 +305,8 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
-    if not isinstance(
-        answer, kind
-    ):  # Format the answer only after a failure, because formatting takes long.
+    # Format the answer only after a failure, because formatting takes long.
+    if not isinstance(answer, kind):
         raise ContractError(f"a hook returned {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
         require(

@@ -363,9 +363,8 @@ def _fitting(cost: Callable[[int], float], affordable: float) -> int:
         affordable: Largest cost, in full-size views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
-    while (
-        cost(too_many) <= affordable and too_many < _NEVER
-    ):  # These views have less than full size.
+    # These views have less than full size.
+    while cost(too_many) <= affordable and too_many < _NEVER:
         too_many *= 2
     while too_many - fits > 1:
         steps = (fits + too_many) // 2

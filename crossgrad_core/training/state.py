@@ -570,7 +570,6 @@ def is_whole(state: TrainState) -> bool:
     """Return True if all parameters are finite; False if they are not or cannot be checked."""
     try:
         return are_parameters_finite(state)
-    except (
-        Exception
-    ):  # The last step failed, the check needs more memory than available, or the GPU failed.
+    except Exception:
+        # The last step failed, the check needs more memory than available, or the GPU failed.
         return False

@@ -126,9 +126,8 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.
     """
-    require_checkpoint(
-        folder
-    )  # Check before taking the lock, because a folder of another kind must not be changed.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    require_checkpoint(folder)
     with writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points

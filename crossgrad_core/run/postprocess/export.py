@@ -77,9 +77,8 @@ def exported(
             check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
-        exporter = (
-            setup.selection.exporter
-        )  # If the exporter is the run's exporter, use the options of the run.
+        # If the exporter is the run's exporter, use the options of the run.
+        exporter = setup.selection.exporter
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:

@@ -36,9 +36,8 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
 @contextmanager
 def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
     """Lock the run's folder, unless the results go to `out`."""
-    require_checkpoint(
-        folder
-    )  # Check before taking the lock, because a folder of another kind must not be changed.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    require_checkpoint(folder)
     if out is not None:
         yield
         return

@@ -26,9 +26,8 @@ def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> 
 
     A run that follows the clock rewrites the file.
     """
-    config = config.model_copy(
-        update={"stop_after": None}
-    )  # This setting applies to one start only.
+    # This setting applies to one start only.
+    config = config.model_copy(update={"stop_after": None})
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))
 

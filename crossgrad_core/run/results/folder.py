@@ -120,9 +120,8 @@ def clear_half_written(folder: Path) -> None:
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
     """Estimate the bytes that a run writes: SH degree 3, two Adam moments, one PLY file."""
-    floats = (
-        59 * 3 * (checkpoints + 1) + 62
-    )  # Count one more checkpoint, because the old ones exist while a new one is written.
+    # Count one more checkpoint, because the old ones exist while a new one is written.
+    floats = 59 * 3 * (checkpoints + 1) + 62
     return max(SMALLEST_NEED, 4 * floats * primitives)
 
 

@@ -163,9 +163,8 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            with suppress(
-                OSError
-            ):  # Another process may have replaced the file first, or may hold it open.
+            # Another process may have replaced the file first, or may hold it open.
+            with suppress(OSError):
                 path.unlink()
                 used -= length
         return used

@@ -118,11 +118,8 @@ def _update_fused(updates: Sequence[Update]) -> None:
     update_at(addresses, sizes, [step for *_, step in updates])
     # NumPy wrote without autograd, so invalidate graphs that use the old values.
     for param, _, exp_avg, exp_avg_sq, _ in updates:
-        for tensor in (
-            param,
-            exp_avg,
-            exp_avg_sq,
-        ):  # Older versions of torch accept only one tensor at a time.
+        # Older versions of torch accept only one tensor at a time.
+        for tensor in (param, exp_avg, exp_avg_sq):
             torch.autograd.graph.increment_version(tensor)
 
 
