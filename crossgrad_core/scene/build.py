@@ -62,8 +62,8 @@ def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root:
         raise _all_blank(blank, root)
     train = tuple(name for name in split.train if name not in set(blank))
     what = (
-        f"{count(len(blank), 'training photo')} left out, because all of their pixels "
-        f"are masked: {name_some(blank)}"
+        f"{count(len(blank), 'training photo')} left out (all pixels are masked): "
+        f"{name_some(blank)}"
     )
     return replace(split, train=train, notes=(*split.notes, f"masks: {what}"))
 

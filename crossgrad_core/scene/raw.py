@@ -141,11 +141,7 @@ def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
     """Leave out points that are not finite, and note their number."""
     finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # This is also False for NaN.
     broken = int((~finite).sum())
-    notes = (
-        [f"points: {count(broken, 'point')} left out, because they are not finite"]
-        if broken
-        else []
-    )
+    notes = [f"points: {count(broken, 'point')} left out (not finite)"] if broken else []
     new_row = np.where(finite, np.cumsum(finite) - 1, -1)
     return CheckedPoints(raw.points[finite], raw.point_colors[finite], new_row), notes
 
@@ -174,8 +170,8 @@ def check_distances(
         return points, []
     return points.selected(near), [
         (
-            f"points: {count(far, 'point')} left out, because they are farther away than "
-            f"{FARTHEST_LOCAL:g} times the extent of the training cameras"
+            f"points: {count(far, 'point')} left out (farther away than "
+            f"{FARTHEST_LOCAL:g} times the extent of the training cameras)"
         )
     ]
 

@@ -159,8 +159,7 @@ def _split_by_lists(
     unlisted = sorted(set(names) - listed[0] - listed[1])
     if unlisted:
         notes.append(
-            f"split: {count(len(unlisted), 'view')} left out, because no list contains "
-            f"them: {name_some(unlisted)}"
+            f"split: {count(len(unlisted), 'view')} left out (in no list): {name_some(unlisted)}"
         )
     return Split(train, test, tuple(notes))
 

@@ -138,12 +138,12 @@ def test_the_list_and_the_check_report_an_entry_point_in_an_unknown_group(
     monkeypatch.syspath_prepend(tmp_path / "site")
     out = ran("plugins")[1]
     assert (
-        "never read\n  lost  lost-package 1.0: there is no entry-point group crossgrad.operator"
-        in out
+        "never read\n  lost  lost-package 1.0: "
+        "the entry-point group crossgrad.operator does not exist" in out
     )
     assert "write crossgrad.operators" in out
     code, _, err = ran("plugins", "check", "lost-package")
-    assert code == 2 and "there is no entry-point group crossgrad.operator" in err
+    assert code == 2 and "the entry-point group crossgrad.operator does not exist" in err
 
 
 def test_the_check_of_a_package_fails_for_an_entry_point_in_an_unknown_group(
@@ -209,7 +209,7 @@ def test_check_passes_a_good_package(ran, third_party, package):
     assert code == 0
     assert "half-package 1.0" in out
     assert "operator halving  pass" in out
-    assert "1 of 1 plugins keep the contract" in out
+    assert "1 of 1 plugins fulfil the contract" in out
 
 
 def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatch):
@@ -223,7 +223,7 @@ def test_check_fails_a_bad_package_with_the_reasons(ran, third_party, monkeypatc
     assert "scales with the gradients" in flat
     assert "compare lengths with each other" in flat
     assert "it can be loaded: ModuleNotFoundError: No module named 'made_up_lost'" in flat
-    assert "0 of 3 plugins keep the contract" in flat
+    assert "0 of 3 plugins fulfil the contract" in flat
     places = [line.strip() for line in out.splitlines() if line.startswith("      at ")]
     assert max(len(line) for line in out.splitlines() if line.strip() not in places) <= 80
     file = third_party.parent / "good" / "made_up_cli.py"
@@ -282,7 +282,7 @@ def test_a_plugin_that_fails_to_import_is_refused_with_the_line(ran, tmp_path, m
 @pytest.mark.parametrize(
     ("package", "words"),
     [
-        ("numpy", "package 'numpy' offers no plugins"),
+        ("numpy", "package 'numpy' contains no plugins"),
         ("crossgrda", "did you mean 'crossgrad'?"),
         ("", "no package named"),
         ("..", "no package named"),
@@ -340,7 +340,7 @@ def test_show_names_the_slot_in_which_the_plugin_exists(ran):
     code, _, err = ran("plugins", "show", "near-far", "--slot", "operators")
     assert code == 2
     assert "no plugin named 'near-far' among the operators" in err
-    assert "one among the samplers" in err
+    assert "a plugin with this name among the samplers" in err
 
 
 def test_a_bad_value_is_reported_without_the_words_of_a_library(ran):

@@ -55,7 +55,7 @@ def test_it_passes_the_checks_of_its_slot(ran, tmp_path, monkeypatch, slot):
     assert list(installed(tmp_path / name, monkeypatch)) == [slot]
     code, out, _ = ran("plugins", "check", name)
     assert code == 0, out
-    assert "1 of 1 plugins keep the contract of their slot" in out
+    assert "1 of 1 plugins fulfil the contract of their slot" in out
 
 
 @pytest.mark.parametrize("slot", OFFERED)

@@ -264,7 +264,7 @@ def test_the_options_of_an_instance_are_those_that_were_given():
 
 
 def test_a_class_of_another_slot_is_refused_though_its_name_is_known():
-    with pytest.raises(UserError, match="Anchors cannot be chosen as a grouping"):
+    with pytest.raises(UserError, match="class Anchors cannot be used as a grouping"):
         settled(grouping=load("operators", "anchors"))
 
 

@@ -170,7 +170,7 @@ def test_the_command_writes_beside_the_runs_own_file_and_replaces_none(trained, 
     assert {name: (trained / name).read_bytes() for name in before} == before
     with pytest.raises(UserError, match="the output file already exists"):
         export.exported(trained, file_format=None, out=None, coordinates="utm")
-    with pytest.raises(UserError, match=r"no such coordinates(?s:.*)epsg:32633"):
+    with pytest.raises(UserError, match=r"coordinate system is unknown(?s:.*)epsg:32633"):
         export.exported(trained, file_format=None, out=None, coordinates="gauss")
 
 

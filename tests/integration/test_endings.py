@@ -421,7 +421,7 @@ def test_floaters_are_removed_when_a_run_is_finished(scene, tmp_path, with_plugi
     for out, primitives in ((cleaned, count - 3), (kept, count)):
         assert len(read_ply(out / "point_cloud.ply").means) == primitives
         assert read_metrics(out)[-1]["primitives"] == primitives
-    said = "floaters: 3 primitives were removed that no training photo shows"
+    said = "floaters: 3 primitives were removed from the empty space"
     assert said in (cleaned / "log.txt").read_text()
     assert not any("floaters: 3" in (each / "log.txt").read_text() for each in (stopped, kept))
     assert resumed(stopped) == 0

@@ -267,7 +267,7 @@ def test_gains_of_ten_stops_from_a_file_are_finite_and_named(varied, tmp_path, m
     settings = {"exposure": {"name": model}, "exposure_from": str(file)}
     assert run(varied, tmp_path / "run", steps=6, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "photos are more than 4 stops from the mean" in notes(tmp_path / "run")
+    assert "photos differ by more than 4 stops from the mean" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize("model", [*with_long("gain"), "auto"])

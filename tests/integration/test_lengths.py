@@ -156,7 +156,7 @@ def test_a_dry_run_of_views_within_seconds_is_a_configuration_of_it(scene, tmp_p
 def test_a_dry_run_refuses_more_different_views_than_there_are(scene, views):
     given = {"scene": str(scene), "steps": 8, "views_per_step": views, "threads": 1}
     given["sampler"] = {"name": "epoch"}
-    with pytest.raises(UserError, match="9 different views of 7 training views"):
+    with pytest.raises(UserError, match="9 different views, but only 7 training views"):
         app.run(given, dry_run=True, verbosity=-1)
 
 

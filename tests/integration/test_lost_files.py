@@ -177,4 +177,7 @@ def test_an_outdated_video_is_removed_if_no_new_one_is_made(run, monkeypatch, ca
     monkeypatch.setattr(video.shutil, "which", lambda _: None)
     render.render_path(run, path=ZOOM, frames=3, out=None)
     assert not made.exists()
-    assert "no video: too many or too large without ffmpeg" in capsys.readouterr().out
+    assert (
+        "no video was written: there are too many frames, or they are too large without ffmpeg"
+        in capsys.readouterr().out
+    )

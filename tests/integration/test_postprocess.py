@@ -93,7 +93,7 @@ def test_the_same_export_writes_the_same_file(finished):
 
 def test_a_backbone_that_is_not_baked_has_no_file_for_a_view(scene, tmp_path):
     run(scene, tmp_path / "run", stop_after=1)
-    with pytest.raises(UserError, match="vanilla has nothing to bake"):
+    with pytest.raises(UserError, match="vanilla exports the same file for every view"):
         export_file(tmp_path / "run", camera="street/0002.png")
 
 
@@ -122,7 +122,9 @@ def test_a_run_that_is_training_is_only_read(finished, tmp_path, caplog, capsys)
             lambda: export_file(finished, camera="street/0002.png"),
             lambda: render.render(finished, split="test", out=None),
         ):
-            with pytest.raises(UserError, match=r"training since(.|\n)*another place with --out"):
+            with pytest.raises(
+                UserError, match=r"training since(.|\n)*another output path with --out"
+            ):
                 write()
         export_file(finished, out=tmp_path / "mine.ply")
         render.render(finished, split="test", out=tmp_path / "renders")

@@ -290,7 +290,7 @@ def test_max_gaussians_below_the_number_of_points_is_applied_and_reported(scene,
     )
     counts = [int(row["primitives"]) for row in quality(tmp_path / "run")]
     assert max(counts) <= 90
-    told = "start: 60 primitives instead of 200"
+    told = "start: 60 Gaussians instead of 200"
     assert told in (tmp_path / "run/log.txt").read_text()
     notes = json.loads((tmp_path / "run/summary.json").read_text())["notes"]
     assert any(told in note for note in notes)
@@ -322,7 +322,7 @@ def poisoned(monkeypatch, poison):
 def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100) == 0
-    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 0" in (tmp_path / "run" / "log.txt").read_text()
     # The evaluation of step 6 was before the rewind and is there once, from after it.
     assert [row["step"] for row in quality(tmp_path / "run")] == ["6", "12"]
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
@@ -335,7 +335,7 @@ def test_where_training_goes_back_to_does_not_depend_on_the_clock(
     each_step_takes(monkeypatch, seconds)  # Of a second: the run thinks about its length at once.
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100) == 0
-    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 0" in (tmp_path / "run" / "log.txt").read_text()
 
 
 def test_a_run_within_a_budget_that_was_rewound_is_repeated(scene, tmp_path, monkeypatch):
@@ -352,7 +352,7 @@ def test_a_run_within_a_budget_that_was_rewound_is_repeated(scene, tmp_path, mon
 def test_a_bad_value_right_before_the_length_is_revised_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
-    assert "rewound to step 4" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 4" in (tmp_path / "run" / "log.txt").read_text()
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 

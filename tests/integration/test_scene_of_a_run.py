@@ -135,7 +135,9 @@ def test_a_run_goes_on_with_changed_photos_only_where_the_user_says_so(root):
 
 def test_a_run_goes_on_only_with_its_own_held_out_views(root):
     words = spoilt(root / "scene", "held out")
-    with pytest.raises(UserError, match=rf"{words}(.|\n)*eval, render and export take it"):
+    with pytest.raises(
+        UserError, match=rf"{words}(.|\n)*eval, render and export accept the change"
+    ):
         resume(root, accept_scene=True)
 
 

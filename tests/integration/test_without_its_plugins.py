@@ -121,7 +121,10 @@ def test_a_figure_that_cannot_be_measured_now_stays(run, capsys):
     (run / "per_view.csv").write_text(text)
     assert ended("eval", run) == 0
     assert (run / "per_view.csv").read_text() == text
-    assert "per_view.csv stays as it is: gains, lpips not measured here" in capsys.readouterr().err
+    assert (
+        "per_view.csv was not changed: "
+        "it contains metrics that were not computed here (gains, lpips)" in capsys.readouterr().err
+    )
 
 
 def test_a_default_replaces_an_operator_that_names_a_missing_operator():

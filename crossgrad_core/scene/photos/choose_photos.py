@@ -211,8 +211,8 @@ def _prefer_reduced(
         if len(paths) < len(full.paths):
             absent = [name for name in full.paths if name not in paths]
             notes.append(
-                f"photos: {folder.path.name}/ is not used, because "
-                f"{count(len(absent), 'photo')} of it are missing: {name_some(absent)}"
+                f"photos: {folder.path.name}/ is not used, because it lacks "
+                f"{count(len(absent), 'photo')}: {name_some(absent)}"
             )
             continue
         found = _read_found(folder, paths)

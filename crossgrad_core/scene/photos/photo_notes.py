@@ -40,7 +40,7 @@ def note_pairing(
     renamed = [name for name, path in paths.items() if path != folder.path / name]
     told = (
         (absent, "posed image", "left out, because the photo is missing"),
-        (spare, "photo", "left out, because they have no pose"),
+        (spare, "photo", "left out (no pose)"),
         (renamed, "photo", "matched with a photo whose suffix or case differs"),
     )
     return [

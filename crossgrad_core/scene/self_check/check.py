@@ -99,7 +99,7 @@ def _equal_poses(poses: Floats, names: Sequence[str]) -> Iterator[str]:
     equal = _repeated(rounded, names)
     if equal:
         photos = count(len(equal), "photo")
-        yield f"check: {photos} have the same pose as another photo: {name_some(equal)}"
+        yield f"check: {photos} with the same pose as another photo: {name_some(equal)}"
 
 
 def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
@@ -243,7 +243,7 @@ def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[
     for cause in verdict.some_wrong:
         names = [scene.views[view].name for view in cause.views]
         told.append(
-            f"check: {count(len(names), 'photo')} do not match the points: "
+            f"check: {count(len(names), 'photo')} not matching the points: "
             f"{name_some(names)}; {cause.what}: {cause.todo}"
         )
     return told

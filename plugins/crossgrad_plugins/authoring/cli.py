@@ -77,7 +77,7 @@ def show(
         slots = [each for each in _slots(None) if any(e.name == name for e in offers(each))]
         raise UserError(
             f"there is no plugin named {name!r}" + (f" among the {slot}" if slot else ""),
-            found=f"one of the slots {listed(slots)}" if slots else "",
+            found=f"a plugin with this name among the {listed(slots)}" if slots else "",
             todo=sentences(
                 did_you_mean(name, [entry.name for entry in found]),
                 "`crossgrad plugins list` shows all plugins",

@@ -69,8 +69,8 @@ def removed(count: int) -> str:
     """Return the log line about the removal of `count` primitives."""
     were = "primitive was" if count == 1 else "primitives were"
     return (
-        f"floaters: {count:,} {were} removed, which no training photo shows, from the "
-        "empty space around training cameras (--no-rule floaters keeps them)"
+        f"floaters: {count:,} {were} removed from the empty space around training cameras, "
+        "because no training photo shows them (--no-rule floaters keeps them)"
     )
 
 

@@ -180,7 +180,7 @@ def test_one_seed_of_three_arms_says_nothing_about_noise(tmp_path):
     for views in (1, 2, 3):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
-    assert "not told apart from views=2, views=1" in text
+    assert "not distinguishable from views=2, views=1" in text
     assert "one pair does not show the noise" in text and "1 pairs" not in text
 
 
@@ -190,14 +190,14 @@ def test_three_seeds_say_how_many_would_do(tmp_path):
             RunFolder(seed=seed, views_per_step=views, final=20.0 + offset).write(
                 tmp_path / f"{views}-{seed}"
             )
-    assert "pairs needed to tell 0.1 dB" in headlines(tmp_path)
+    assert "pairs are needed to detect 0.1 dB" in headlines(tmp_path)
 
 
 def test_one_arm_alone_still_has_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
-    assert "One arm: so nothing can be compared" in page
+    assert "There is only one arm: so nothing can be compared" in page
     assert "nothing can be compared" in capsys.readouterr().out
 
 
@@ -205,7 +205,7 @@ def test_arms_on_other_scenes_are_not_paired(tmp_path):
     RunFolder(scene="city").write(tmp_path / "1")
     RunFolder(scene="park", views_per_step=2).write(tmp_path / "2")
     # No setting varies within a scene, so there is one arm.
-    assert "One arm" in headlines(tmp_path)
+    assert "There is only one arm" in headlines(tmp_path)
     RunFolder(scene="city", seed=5, views_per_step=2).write(tmp_path / "3")
     assert "have no scene with the same seed in common" in headlines(tmp_path)
 

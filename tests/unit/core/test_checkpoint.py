@@ -147,7 +147,7 @@ def test_a_checkpoint_that_lost_a_file_is_not_passed_over(tmp_path: Path, name: 
     (save(tmp_path, make_checkpoint(200)) / name).unlink()
     with pytest.raises(UserError, match="the checkpoint is damaged") as told:
         load_latest(tmp_path)
-    assert told.value.found == f"no {name}" and "goes on from step-000100" in told.value.todo
+    assert told.value.found == f"no {name}" and "continues from step-000100" in told.value.todo
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "checkpoints"])

@@ -83,7 +83,7 @@ def test_a_forgotten_mark_is_refused():
             return None
 
     error = refusal(silent=Unmarked())
-    assert "crossgrad_step_end that would never be called" in error.what
+    assert "method crossgrad_step_end of plugin" in error.what
     assert "add the decorator @hookimpl" in error.todo
 
 

@@ -348,7 +348,7 @@ def test_the_margin_goes_on_behind_what_another_photo_sees_before_it(away, hides
 def test_photos_without_enough_points_or_pixels_are_left_out():
     scene = ground_scene(LEFT, seen=np.arange(7))
     assert Filled().more_points(scene) is None
-    assert "2 photos with fewer than 8 points were left aside" in Filled().messages(scene)[0]
+    assert "2 photos with fewer than 8 points were skipped" in Filled().messages(scene)[0]
     hidden = ground_scene(LEFT)
     views = tuple(
         replace(view, photo=Picture(view.camera, hidden=True)) for view in hidden.train_views

@@ -227,7 +227,7 @@ def test_the_command_runs_very_many_matrices(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--search", "1", "--rows", "[[1]]"], "--search and --rows do not go together"),
+        (["--search", "1", "--rows", "[[1]]"], "--search and --rows cannot be combined"),
         (["--search", "1", "--case", "plain"], "--case does nothing with --search"),
         (["--rows", "[[1]]", "--seed", "1"], "--seed does nothing with --rows"),
         (["--type", "float32"], "--type does nothing with the fixed cases"),

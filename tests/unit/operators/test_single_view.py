@@ -91,7 +91,7 @@ def test_a_named_operator_gets_enough_views_per_step(operator):
 
 def test_an_operator_without_a_second_view_is_noted_once_with_the_way_out():
     (note,) = notes_of({"name": "pcgrad"}, views=1)
-    assert "operator pcgrad does nothing at K = 1" in note
+    assert "operator pcgrad has no effect at K = 1" in note
     assert "--views 2" in note
 
 

@@ -373,7 +373,7 @@ def test_a_probe_that_fails_decides_nothing():
 def test_an_infinite_noise_scale_is_reported_as_beyond_all_views():
     probe = Probe(rho=0.5, rho_low=0.1, rho_high=0.9, noise_scale=inf, conflict=0.5)
     found = grouping.views_per_step(evidence_of("city_unimodal", probe))
-    assert found.evidence.endswith("gradient noise scale beyond all views: no common part")
+    assert found.evidence.endswith("gradient noise scale larger than all views: no common part")
 
 
 def orbit(count=40):

@@ -143,7 +143,8 @@ def test_too_little_gps_places_nothing():
     model = synthetic()
     gps = dict(list(moved(similarity(np.random.default_rng(0)), centers_of(model)).items())[:2])
     assert (
-        placement_of(model, gps, tops_of(model))[1] == "2 of its photos have GPS, and 3 are needed"
+        placement_of(model, gps, tops_of(model))[1]
+        == "2 of its photos have GPS, but at least 3 are needed"
     )
 
 

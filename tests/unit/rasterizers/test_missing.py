@@ -64,7 +64,7 @@ def test_gswarp_without_warp_is_not_there(machine):
     ("nvcc", "reason"),
     [
         (None, "nvcc was not found: install the CUDA toolkit 12.8"),
-        ("13.0", "is of CUDA 13.0, torch"),
+        ("13.0", "belongs to CUDA 13.0, but torch"),
         ("12.4", None),
     ],
 )
@@ -136,8 +136,8 @@ def test_on_a_cpu_the_device_alone_is_objected_to(machine):
         ("densifier", "dc4gs", "gsplat", "needs the screen statistics directions"),
         ("densifier", "multiview", "gswarp", "needs the screen statistics abs_gradient, count"),
         ("densifier", "absgrad", "gswarp", "needs the screen statistics abs_gradient"),
-        ("backbone", "analytic", "gsplat", "does not draw the pixel response analytic"),
-        ("backbone", "mip", "gswarp", "does not draw the pixel response antialiased"),
+        ("backbone", "analytic", "gsplat", "does not support the pixel response analytic"),
+        ("backbone", "mip", "gswarp", "does not support the pixel response antialiased"),
     ],
 )
 def test_what_a_rasterizer_does_not_give_is_refused_before_training(slot, name, rasterizer, reason):
@@ -161,7 +161,7 @@ def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(mach
     assert choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"count"})))[0] == "gsplat"
     chosen, notes = choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"directions"})))
     assert chosen == "torch"
-    assert "rasterizer gsplat left out: this run needs directions" in notes
+    assert "rasterizer gsplat is not used: this run needs directions" in notes
     inria = Wanted("cuda", "plain", options=frozenset({"footprint"}))
     assert choose_rasterizer("auto", inria)[0] == "gswarp"
     assert choose_rasterizer("auto", Wanted("cuda", "antialiased"))[0] == "gsplat"

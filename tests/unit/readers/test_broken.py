@@ -438,7 +438,7 @@ class TestCsv:
             (b"#name,x,y,alt,heading,pitch,roll,f,f\n", "two columns f"),
             (b"#name,x,y,alt,heading,pitch,roll,f\na.png,1\n", "8 cells in line 2"),
             (b"\xff\n", "cannot be read"),
-            (b"#name,x,y,alt,heading,pitch,roll,f\n", "no posed image"),
+            (b"#name,x,y,alt,heading,pitch,roll,f\n", "no image with a pose"),
         ],
     )
     def test_other_tables_are_refused(self, content, word, make):

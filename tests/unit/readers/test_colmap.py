@@ -176,8 +176,8 @@ class TestReading:
             "local frame: 1 unit = 2.64818 input units, the extent of the training cameras "
             "(1.1 x largest distance from their mean)",
             "regimes by footprint: far 4 views (3 train, 1 test), near 4 views (4 train, 0 test)",
-            "split: no photo of near is held out, so no figure tells how good it gets; --split "
-            "stratified holds photos of every regime out",
+            "split: no photo of near is held out, so no metric shows its quality; --split "
+            "stratified holds out photos of every regime",
         )
 
     @pytest.mark.parametrize("scale", [1.0, 1000.0])
@@ -231,7 +231,7 @@ class TestPhotos:
         (path / "images" / "0003.png").unlink()
         scene = read(path)
         assert len(scene.views) == 7
-        assert "1 posed image left out, the photo is missing: 0003.png" in notes(scene)
+        assert "1 posed image left out, because the photo is missing: 0003.png" in notes(scene)
 
     def test_a_photo_without_pose_is_left_out(self, make):
         path = make()
@@ -240,7 +240,7 @@ class TestPhotos:
             shutil.copy(path / "images" / "0001.png", path / "images" / name)
         (path / "images" / "Thumbs.db").write_bytes(b"x")
         scene = read(path)
-        assert "2 photos without a pose left out: aaa.png, extra/0001.png" in notes(scene)
+        assert "2 photos left out (no pose): aaa.png, extra/0001.png" in notes(scene)
         assert color_error(scene.views[1], scene) < 8
 
     def test_photos_under_other_names_are_refused(self, make):
@@ -262,7 +262,7 @@ class TestPhotos:
         (path / "images" / "0001.png").rename(path / "images" / "0001.PNG")
         scene = read(path)
         assert len(scene.views) == 8
-        assert "1 photo paired by a name that differs in suffix or case: 0001.png" in notes(scene)
+        assert "1 photo matched with a photo whose suffix or case differs: 0001.png" in notes(scene)
 
     @pytest.mark.parametrize("share", [0.5, 0.95])
     def test_a_photo_cut_short_is_refused_before_training(self, make, share):
@@ -304,7 +304,7 @@ class TestPhotos:
         for k in range(7):
             Image.new("RGB", (24, 16)).save(path / "images_2" / f"{k:04d}.png")
         scene = read(path, max_size=24)
-        assert "images_2/ is not used, 1 photo of it missing: 0007.png" in notes(scene)
+        assert "images_2/ is not used, because it lacks 1 photo: 0007.png" in notes(scene)
         assert "24 x 16 px (8) from images/, 8 resized (scikit-image" in notes(scene)
 
     def test_reduced_photos_without_the_originals_are_enough(self, make):
@@ -338,7 +338,7 @@ class TestPhotos:
                 lying = image.rotate(90, expand=True)
             lying.save(photo, exif=exif, quality=95, subsampling=0)
         turned = read(path)
-        assert "8 of 8 turned by EXIF orientation" in notes(turned)
+        assert "8 of 8 rotated as their EXIF orientation says" in notes(turned)
         assert tuple(turned.views[1].photo.image().shape) == (32, 48, 3)
         assert color_error(turned.views[1], turned) < 8
 
@@ -354,7 +354,7 @@ class TestPhotos:
             converted.save(path / "images" / f"{name}.png")
         scene = read(path)
         assert "1 of 8 with transparency: pixels with alpha < 0.5 are ignored" in notes(scene)
-        assert "1 of 8 grey: three equal channels" in notes(scene)
+        assert "1 of 8 grey: copied into three equal channels" in notes(scene)
         assert scene.views[1].photo.image().shape == (32, 48, 3)
         keep = scene.views[2].photo.mask()
         assert not keep[:, :24].any() and keep[:, 24:].all()
@@ -402,7 +402,10 @@ class TestModels:
         shutil.copytree(model(small), path / "sparse" / "2")
         scene = read(path)
         assert len(scene.views) == 8
-        assert "sparse/10 is taken, it has most images (8); left out: sparse/2 3" in notes(scene)
+        assert (
+            "sparse/10 is used, because it has the most images (8); left out: sparse/2 3"
+            in notes(scene)
+        )
         assert len(read(path, ColmapReader(model="sparse/2")).views) == 3
         with pytest.raises(UserError, match=r"sparse/2, sparse/10"):
             read(path, ColmapReader(model="sparse/7"))
@@ -489,7 +492,7 @@ class TestModels:
     def test_an_unknown_camera_model_is_refused(self, make):
         path = make()
         patch(model(path) / "cameras.bin", 12, struct.pack("<i", 99))
-        refuses(path, "unknown camera model number 99", "1 PINHOLE")
+        refuses(path, "the camera model number 99 is unknown", "1 PINHOLE")
 
     def test_an_image_without_camera_is_refused(self, make):
         path = make()
@@ -500,7 +503,9 @@ class TestModels:
         path = make()
         record = struct.pack("<QIiQQ2d", 1, 1, 17, 48, 32, 48.0, 32.0)
         (model(path) / "cameras.bin").write_bytes(record)
-        refuses(path, "EQUIRECTANGULAR have no pinhole camera", "0000.png")
+        refuses(
+            path, "camera model EQUIRECTANGULAR cannot be converted to a pinhole camera", "0000.png"
+        )
 
     @pytest.mark.parametrize(
         ("params", "words"),
@@ -561,7 +566,7 @@ class TestModels:
         patch(model(path) / "points3D.bin", 16, struct.pack("<d", np.nan))
         scene = read(path)
         assert len(scene.points) == 199
-        assert "1 point left out: not finite" in notes(scene)
+        assert "1 point left out (not finite)" in notes(scene)
         assert all(view.seen.max() < 199 for view in scene.views)
         assert color_error(scene.views[1], scene) < 8
 

@@ -109,7 +109,7 @@ def test_cameras_without_a_pose_and_of_other_components_are_left_out(path):
     assert [view.name for view in scene.views] == ["0000.png", "0001.png"]
     notes = "\n".join(scene.notes)
     assert "1 camera without a pose" in notes
-    assert "component 0 is taken, 1 camera of others left out" in notes
+    assert "component 0 is used, 1 camera of other components left out" in notes
 
 
 @pytest.mark.parametrize(("old", "new"), [(r'(\d{4})\.png"', r'\1"'), (r'"(\d{4})', r'"gone/\1')])

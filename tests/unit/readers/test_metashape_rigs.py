@@ -106,7 +106,7 @@ def test_slave_cameras_are_placed_by_their_master_and_the_offset(order, path):
         np.testing.assert_allclose(
             view.camera.world_to_camera[:3, :3].numpy(), pose[:3, :3].T, atol=1e-9
         )
-    assert any("2 slave cameras posed by their masters" in note for note in scene.notes)
+    assert any("2 slave cameras with poses from their masters" in note for note in scene.notes)
 
 
 def test_offsets_may_refer_to_another_sensor_than_the_masters(path):
@@ -135,7 +135,7 @@ def test_slaves_without_an_offset_are_left_out_as_without_a_pose(path):
     file.write_text(re.sub(r"<(location|rotation)>[^<]*</\1>", "", file.read_text()))
     scene = read(path)
     assert [view.name for view in scene.views] == ["0000.png", "0001.png"]
-    assert any("have no pose" in note for note in scene.notes)
+    assert any("without a pose" in note for note in scene.notes)
 
 
 def test_an_offset_that_is_no_rotation_is_refused(path):

@@ -124,7 +124,7 @@ def test_the_reconstruction_with_most_photos_is_taken(tmp_path):
     (path / "reconstruction.json").write_text(json.dumps([few, models[0]]))
     scene = OpenSfmReader().read(path, SceneOptions())
     assert len(scene.views) == 2
-    assert "left out are those with 1" in "\n".join(scene.notes)
+    assert "reconstructions left out have 1" in "\n".join(scene.notes)
 
 
 @pytest.mark.parametrize("vector", [[0, 0, 0], [1e-13, 0, 0], [0, np.pi, 0], [0.3, -2.0, 7.0]])

@@ -241,7 +241,7 @@ def test_a_list_comes_before_the_photos_and_a_bad_one_is_left_out_with_a_note(sc
     found = read(scene)
     assert "GPS of the photos" in found.georeference.note
     assert any(
-        "geo.txt tells no places: the list of photo positions cannot be read" in n
+        "geo.txt contains no positions: the list of photo positions cannot be read" in n
         for n in found.notes
     )
     with pytest.raises(UserError, match="line 2") as caught:
@@ -298,7 +298,7 @@ def test_priors_that_are_no_gps_tell_nothing(scene):
 def test_a_file_that_is_no_database_is_named(scene, tmp_path):
     (scene / "database.db").write_bytes(b"no database" * 100)
     found = read(scene)
-    assert "database.db tells no places" in found.georeference.why
+    assert "database.db contains no positions" in found.georeference.why
     (tmp_path / "empty.db").write_bytes(b"")
     assert not of_priors(tmp_path / "empty.db", ["0001.jpg"]).places
 
@@ -486,7 +486,7 @@ def test_a_list_of_other_suffixes_and_case_is_of_these_photos(scene):
 def test_a_list_of_other_photos_is_reported(scene):
     (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
     found = read(scene)
-    assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note
+    assert "geo.txt: 1 name without a photo, such as DJI_1.jpg" in found.georeference.note
 
 
 def test_the_row_of_a_photo_comes_before_one_that_only_looks_like_it(scene):

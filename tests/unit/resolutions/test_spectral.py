@@ -286,7 +286,7 @@ def test_octaves_are_a_quarter_then_a_half_then_all():
     assert scales == [0.25] * 20 + [0.5] * 30 + [1.0] * 50
     assert resolution.messages(schedule) == (
         "resolution: 1/4 to step 20, 1/2 from step 21, full size from step 51; "
-        "no side is below 96 pixels",
+        "no side has fewer than 96 pixels",
     )
 
 
@@ -300,7 +300,7 @@ def test_octaves_are_a_quarter_then_a_half_then_all():
 )
 def test_a_size_may_be_left_out(options, text):
     (told,) = Octaves(**options).messages(Schedule.for_run(100))
-    assert told == f"resolution: {text}; no side is below 96 pixels"
+    assert told == f"resolution: {text}; no side has fewer than 96 pixels"
 
 
 def test_sizes_out_of_order_are_refused():

@@ -48,7 +48,7 @@ def test_a_training_photo_masked_as_a_whole_is_left_out_and_named(scene):
     after = read(scene)
     assert names(after, after.train) == [n for n in names(before, before.train) if n != "0001.png"]
     assert names(after, after.test) == names(before, before.test)
-    (note,) = [note for note in after.notes if "because all of their pixels are masked" in note]
+    (note,) = [note for note in after.notes if "all pixels are masked" in note]
     assert "1 training photo left out" in note and "0001.png" in note
     assert all(view.photo.mask() is None or view.photo.mask().any() for view in after.train_views)
 

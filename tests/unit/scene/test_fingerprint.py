@@ -112,7 +112,7 @@ def test_masks(scene, change):
 @pytest.mark.parametrize(
     ("other", "text"),
     [
-        ({"scale": 2.0}, "its unit is 5.46405 input units instead of 2.73202"),
+        ({"scale": 2.0}, "its unit is 5.46405 input units (before: 2.73202)"),
         ({"offset": (1.0, 0.0, 0.0)}, "its origin moved by 1"),
         ({"width": 24, "height": 16}, "photos with another size, camera or pose: 10 (0000.png"),
         ({"points": 150}, "other SfM points (150; before: 200)"),

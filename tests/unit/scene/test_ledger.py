@@ -80,8 +80,8 @@ def test_masks_of_no_photo_and_photos_without_a_mask_are_named(scene):
     copy(scene, "masks")
     (scene / "masks" / "0001.png").rename(scene / "masks" / "other.png")
     notes = read(scene).notes
-    assert "masks: 1 of 3 have none, all of their pixels count: 0001.png" in notes
-    assert "unused: 1 file in masks/ (other.png), masks of no photo that is used" in notes
+    assert "masks: 1 of 3 have none, and all their pixels are used: 0001.png" in notes
+    assert "unused: 1 file in masks/ (other.png), masks without a used photo" in notes
 
 
 def test_what_is_used_is_not_listed(scene):

@@ -134,7 +134,8 @@ def test_a_fisheye_of_190_degrees_says_what_undistortion_loses() -> None:
     assert cost.lost == pytest.approx(1.0 - shown.mean(), abs=0.01)
     notes = note_undistortion({"a.png": source(Path("a.png"), calibration)})
     assert any(
-        "1 photo sees 191 degrees across; undistortion keeps 118 of these and loses 62 %" in note
+        "1 photo has a field of view of 191 degrees; undistortion keeps 118 degrees and loses 62 %"
+        in note
         for note in notes
     )
 

@@ -240,9 +240,9 @@ def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
     odd = replace(model, photos=photos, seen=seen, points=points, colors=colors)
     scene = checked(odd.posed(rotations, centers).scene(), Path("scene"), cache_mib=1280)
     notes = " | ".join(note for note in scene.notes if note.startswith("check:"))
-    assert "1 photo with the pose of another one: 0002.png" in notes
+    assert "1 photo with the same pose as another photo: 0002.png" in notes
     assert "almost equal: 0001.png and 0002.png" in notes
-    assert "1 point practically at infinity" in notes
+    assert "1 point extremely far away" in notes
 
 
 def test_dark_and_blurred_photos_are_noted(model):

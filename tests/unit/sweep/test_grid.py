@@ -86,9 +86,9 @@ def test_other_scenes_keep_the_settings_of_those_with_their_name(tmp_path):
 #: Grid, what the error says of it.
 WRONG = {
     "sceens: [a]": "did you mean 'scenes'?",
-    "steps: 30": "settings go below base",
+    "steps: 30": "put settings below base",
     "method: bayes": "method: ",
-    "parameters: {rate: {min: 0, max: 1}}": "nothing is drawn from distributions (max, min)",
+    "parameters: {rate: {min: 0, max: 1}}": "distributions (max, min) are not supported",
     "parameters: {rate: [1, 2]}": "must be `values: [...]`",
     "parameters: {rate: {values: []}}": "parameters.rate.values: should not be empty, not []",
     "parameters: {rate: {values: sum}}": "parameters.rate.values: should be a list, not 'sum'",
@@ -102,10 +102,10 @@ WRONG = {
     "arms: [{name: a, settings: {seed: 1}}]": "list it in seeds",
     "base: {scene: x}": "list it in scenes",
     "arms: [{settings: {}}]": "arms.0.name",
-    "arms: [{name: a}, {name: a}]": "two are named 'a'",
+    "arms: [{name: a}, {name: a}]": "two entries have the name 'a'",
     "seeds: [1, 1]": "twice",
     "seeds: [-1]": "seeds.0",
-    "scenes: [x/a, y/a]": "two are named 'a'",
+    "scenes: [x/a, y/a]": "two entries have the name 'a'",
     "scenes: [town]\narms: [{name: a, by_scene: {towm: {}}}]": "did you mean 'town'?",
     "seeds: [1]\nparameters: {seed: {values: [1]}}": "may be given only once",
 }
@@ -127,7 +127,7 @@ def test_a_list_that_is_empty_without_its_wrong_parts_is_wrong_once(tmp_path):
 
 def test_all_errors_of_a_grid_are_reported_at_once(tmp_path):
     text = "base: {out: x, threads: 1}\nseeds: [1, 1]\narms: [{name: a}, {name: a}]"
-    with pytest.raises(UserError, match="4 things are wrong"):
+    with pytest.raises(UserError, match="the grid has 4 errors"):
         read_grid(written(tmp_path, text))
 
 
@@ -153,8 +153,8 @@ def test_of_lpips_less_is_better_by_default(tmp_path, metric, goal):
         (("--set", " threads =2"), "use --threads"),
         (("--set", "out=there"), "--set out"),
         (("--seed", "3", "--seed", "3"), "a seed is listed twice"),
-        (("--list", "--best", "best.yaml"), "--list and --best do not go together"),
-        (("--dry-run", "--list"), "--dry-run and --list do not go together"),
+        (("--list", "--best", "best.yaml"), "--list and --best cannot be combined"),
+        (("--dry-run", "--list"), "--dry-run and --list cannot be combined"),
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )

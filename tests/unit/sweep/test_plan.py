@@ -116,7 +116,7 @@ def test_everything_that_is_wrong_is_said_at_once(scene, tmp_path):
     assert "opertor" in text and "'epoc'" in text and "cagrad" in text and "'vanila'" in text
     assert "tiny, pair: " in text and "tiny, nothing: " in text and "nowhere" in text
     assert "name; two: there is no sampler" in text
-    assert "8 things are wrong" in text and "99 different views" in text
+    assert "the grid has 8 errors" in text and "99 different views" in text
 
 
 def test_a_fault_of_all_configurations_is_said_once(scene, tmp_path):

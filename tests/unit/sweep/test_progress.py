@@ -84,7 +84,7 @@ def test_times_are_those_of_like_runs(sweep):
     assert [each.seconds for each in found] == [20.0, 20.0, 50.0, 0.0, 72.0]
     assert [each.unknown for each in found] == [0, 0, 0, 1, 0]
     total = estimated(jobs, of, records)
-    assert total.text(2) == "about 81 s and 1 run of which nothing is known yet"
+    assert total.text(2) == "about 81 s; the time of 1 run is not known yet"
 
 
 def test_no_sweep_is_shorter_than_its_longest_run(sweep):

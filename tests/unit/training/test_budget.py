@@ -328,7 +328,7 @@ def test_a_note_reports_that_a_shorter_length_leaves_density_control_out():
 def test_the_note_on_density_control_names_no_step_after_the_end():
     run = noted(setup(steps=550, mode="absolute"))
     Planned(((20, 700),)).revised(run, reached(20))
-    assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
+    assert run.hook.texts[0].endswith("in a run of 700 steps it acts from step 500 to step 700")
 
 
 #: Scales that grow, as far as a budget sees them: photos large enough for all of them.
@@ -423,4 +423,4 @@ def test_the_note_on_scales_is_that_of_the_length_that_holds():
 
 def octaves_note(quarter, half):
     scales = f"1/4 to step {quarter}, 1/2 from step {quarter + 1}, full size from step {half + 1}"
-    return f"resolution: {scales}; no side is below 96 pixels"
+    return f"resolution: {scales}; no side has fewer than 96 pixels"

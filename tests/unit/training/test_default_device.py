@@ -102,9 +102,12 @@ def test_a_rasterizer_that_does_not_work_leaves_the_cpu(on_a_gpu, error, why):
     [
         ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on it"),
         ({"rasterizer": {"name": "gsplat"}}, "pip install 'crossgrad[gsplat]'"),
-        ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count what a GPU does"),
-        ({"backbone": {"name": "analytic"}}, "rasterizer gswarp left out: this run needs analytic"),
-        ({"densifier": {"name": "absgrad"}}, "gswarp left out: this run needs abs_gradient"),
+        ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count the time of a GPU"),
+        (
+            {"backbone": {"name": "analytic"}},
+            "rasterizer gswarp is not used: this run needs analytic",
+        ),
+        ({"densifier": {"name": "absgrad"}}, "gswarp is not used: this run needs abs_gradient"),
     ],
     ids=str,
 )

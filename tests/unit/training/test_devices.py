@@ -24,8 +24,8 @@ def build(monkeypatch):
     ("cuda", "devices", "name", "found", "todo"),
     [
         (None, 0, "cuda", "a build without CUDA", "install a CUDA build of torch"),
-        ("12.4", 0, "cuda", "a build for CUDA 12.4, but no GPU", "nvidia-smi"),
-        ("12.4", 0, "cuda:1", "a build for CUDA 12.4, but no GPU", "nvidia-smi"),
+        ("12.4", 0, "cuda", "a build for CUDA 12.4, but no usable GPU", "nvidia-smi"),
+        ("12.4", 0, "cuda:1", "a build for CUDA 12.4, but no usable GPU", "nvidia-smi"),
         ("12.4", 2, "cuda:2", "devices cuda:0 to cuda:1", "choose one of these devices"),
     ],
 )

@@ -162,7 +162,7 @@ def test_asking_leaves_the_step_alone():
 
 
 def test_weights_that_are_not_finite_are_refused_by_name():
-    with pytest.raises(UserError, match="Broken gave weights that are not finite"):
+    with pytest.raises(UserError, match="Broken returned weights that are not finite"):
         scale_of(Broken(), 2)
 
 

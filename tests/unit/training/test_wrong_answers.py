@@ -94,7 +94,7 @@ def test_what_a_backbone_creates_are_tensors(answer):
 @pytest.mark.parametrize("answer", [{}, {"moans": torch.zeros(3, 3)}, {"means": None}])
 def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
-    assert "Wrong.create makes other tensors than its blocks name" in error.what
+    assert "Wrong.create returned tensors with other names than its blocks use" in error.what
     assert error.expected == "means"
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
 
@@ -102,7 +102,7 @@ def test_what_a_backbone_creates_is_what_its_blocks_name(answer):
 def test_prepare_must_return_all_tensors_of_the_blocks():
     backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
     error = refused(setup_of({"backbone": backbone}))
-    assert "Wrong.prepare makes other tensors" in error.what
+    assert "Wrong.prepare returned tensors with other names" in error.what
     assert error.expected.startswith("means, scales, quats")
 
 
@@ -167,7 +167,7 @@ def test_weights_of_another_shape_say_which(shape):
     setup = setup_of({"operator": Own()})
     assert len(setup.trained_blocks) == 6
     error = refused(setup)
-    assert error.what == "operator Own gave an array of a wrong shape"
+    assert error.what == "operator Own returned an array of a wrong shape"
     assert error.expected.startswith("[6, 1] weights")
     assert error.found == str(list(shape))
 
@@ -261,8 +261,8 @@ def test_the_names_of_the_core_are_those_that_it_uses():
 @pytest.mark.parametrize(
     ("edit", "found"),
     [
-        (Edit(source=torch.arange(41)), "source leaves 0 to 39"),
-        (Edit(source=torch.tensor([-1])), "source leaves 0 to 39"),
+        (Edit(source=torch.arange(41)), "source contains indices outside 0 to 39"),
+        (Edit(source=torch.tensor([-1])), "source contains indices outside 0 to 39"),
         (Edit(source=torch.arange(40).int()), "not [M] of torch.int64"),
         (Edit(source=torch.tensor(3)), "[] of torch.int64, not [M]"),
         (Edit(source=[0, 1]), "builtins.list, not a tensor"),
@@ -270,8 +270,14 @@ def test_the_names_of_the_core_are_those_that_it_uses():
         (Edit(source=torch.arange(3), fresh=torch.ones(3)), "fresh is [3] of torch.float32"),
         (Edit(values={"means": torch.zeros(40, 3)}), "Tensor, not Rows"),
         (Edit(values={"means": Rows(np.zeros((40, 3)))}), "not Rows of a tensor"),
-        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([40]))}), "rows leave 0 to 39"),
-        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([-1]))}), "rows leave 0 to 39"),
+        (
+            Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([40]))}),
+            "rows contain indices outside 0 to 39",
+        ),
+        (
+            Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([-1]))}),
+            "rows contain indices outside 0 to 39",
+        ),
         (Edit(values={"means": Rows(torch.zeros(3), torch.ones(40).bool())}), "rows are [40] of"),
         (Edit(source=torch.arange(3), fresh=torch.ones(4).bool()), "fresh has 4 rows of 3"),
         (Edit(values={"mean": Rows(torch.zeros(40, 3))}), "no tensor 'mean'"),
@@ -453,7 +459,7 @@ def more_points(**changed):
 def test_what_a_start_adds_can_be_points(changed, found):
     start = of_slot("initializers", "points", "more_points", more_points(**changed))
     error = refused(setup_of({"initializer": start}))
-    assert error.what == "initializer points adds what cannot be points"
+    assert error.what == "initializer points returned invalid points"
     assert "Wrong.more_points" in error.where
     assert found in error.found
 
@@ -476,7 +482,7 @@ def test_good_points_of_a_start_are_taken_and_its_own_errors_come_through():
 def test_a_form_that_formats_no_numbers_is_refused_before_the_run(monkeypatch, form):
     psnr = type(build("metrics", "psnr", {}))
     monkeypatch.setattr(psnr, "figure", replace(psnr.figure, form=form))
-    with pytest.raises(UserError, match="metric psnr has a figure that cannot be shown") as caught:
+    with pytest.raises(UserError, match="a value of metric psnr cannot be formatted") as caught:
         assemble(RunConfig(steps=10), sample_scene(), "none")
     assert caught.value.found == repr(form)
 

@@ -60,9 +60,7 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
                 notes.append(f"{measured.source}: {count(measured.flat, 'photo')} without altitude")
             elif measured.strangers:
                 names, first = count(len(measured.strangers), "name"), measured.strangers[0]
-                notes.append(
-                    f"{measured.source}: {names}, such as {first}, which belong to no photo"
-                )
+                notes.append(f"{measured.source}: {names} without a photo, such as {first}")
             elif named is not None:
                 notes.append(f"{measured.source}: it contains no position for a photo of the scene")
             continue
