@@ -112,7 +112,7 @@ _OPEN_ROWS: Final = 12
 #: Series colours on a dark page: the same hues, lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
 _WORST_NAMED: Final = 8
-#: Field of a run's environment (machine, code) -> the text before its value.
+#: Field of a run's environment (machine, code) -> text that precedes its value.
 _MACHINE: Final = {
     "cpu": "",
     "cpu_cores": "cores: ",

@@ -15,7 +15,7 @@ from crossgrad_plugins.compare.quantity import (
 )
 from crossgrad_plugins.compare.run import Run
 
-#: The note on the photos' sizes that every run writes.
+#: Pattern of the note on the photos' sizes that every run writes.
 _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
 #: The definition that applies to every metric: how renders are compared.
@@ -26,7 +26,7 @@ _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of thr
 #: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU
 #: time varies more, because other processes share the caches and cores.
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
-#: A machine whose mean load exceeds its number of cores by this amount is busy.
+#: A machine counts as busy if its mean load exceeds its number of cores by this amount.
 _BUSY: Final = 0.5
 #: Wall-clock seconds in notes; CPU seconds may still be compared.
 _CLOCK: Final = "wall-clock seconds"

@@ -174,7 +174,8 @@ def _check_whole(results: "RunResults") -> None:
         UserError: metrics.csv ends before the run did or has a number that is too large, held-out
             views have no figures, or scene.json cannot be read.
     """
-    views = (results.scene_marks or {}).get("views") or {}  # Raises if scene.json is malformed.
+    # This raises an error if scene.json is malformed.
+    views = (results.scene_marks or {}).get("views") or {}
     if not all(isinstance(view, Mapping) for view in views.values()):
         raise UserError(
             "scene.json cannot be read",

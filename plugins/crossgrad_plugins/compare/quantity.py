@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-#: From this many seconds on, amounts are shown without decimals.
+#: Amounts of at least this many seconds are shown without decimals.
 _WHOLE: Final = 10.0
 
 

@@ -25,7 +25,7 @@ from crossgrad_core.plugin import (
 MARKED, ERROR, VISITS = "marked", "error", "visits"
 #: Number of rendered views of each regime.
 DRAWN = "drawn"
-#: The power of the visits in the rank of a primitive: between a sum (0) and a mean (1).
+#: Power of the number of renders in the rank of a primitive: between a sum (0) and a mean (1).
 VISITS_POWER = 0.75
 
 

@@ -24,7 +24,8 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Prefix of the names in the gate's state; names of the other densifier do not have it.
+#: Prefix of the names in the gate's state, which keeps them apart from the names of the other
+#: densifier.
 OWN = "gate/"
 #: Hooks of the other densifier that the gate implements for it.
 _ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})

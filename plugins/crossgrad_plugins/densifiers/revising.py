@@ -172,7 +172,7 @@ class RevisingDensification(CloneSplit):
 
 def halved_logits(logits: Tensor) -> Tensor:
     """Return logits [R] of o' = 1 - sqrt(1 - o); two copies with o' are as opaque as one."""
-    transparency = logsigmoid(-logits) / 2  # log of sqrt(1 - o)
+    transparency = logsigmoid(-logits) / 2  # This is the log of sqrt(1 - o).
     shared = torch.log(-torch.expm1(transparency)) - transparency
     return torch.where(logits < _FAINT, logits - log(2.0), shared)
 

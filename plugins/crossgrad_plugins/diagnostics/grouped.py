@@ -100,7 +100,8 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        # A view's part in the mean would correlate its length with its position along the gap.
+        # Leave the view out of the mean: otherwise its length would correlate with its position
+        # along the gap.
         own = np.diag(deviations) / np.concatenate([np.full(n, n - 1.0), np.full(m, 1.0 - m)])
         along = centring @ (ordered @ difference - own)
         return cls(

@@ -26,7 +26,7 @@ class Auto(Exposure):
     def fitted_to(self, scene: Scene) -> Fitted:
         gains = deciding_gains(scene)
         if gains.differ:
-            # Imported late, because a run without exposure does not need it.
+            # Import it here, because a run without exposure does not need it.
             from crossgrad_plugins.exposures.gain import Gain
 
             # The messages of `Gain` contain the evidence.

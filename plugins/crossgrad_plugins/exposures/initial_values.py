@@ -25,9 +25,10 @@ _FAR = 4.0
 _NAMED = 3
 #: Maximum number of neighbours that predict a photo.
 TELLING = 4
-#: Up to this number of photos, neighbours and regimes predict each photo alike.
+#: Up to this number of photos, neighbours and regimes predict every photo equally well.
 _SAME = 2
-#: Smaller distances count as this one, so that a photo taken twice does not outweigh all others.
+#: Smaller distances are set to this distance, so that a photo taken twice does not outweigh all
+#: others.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
 # Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
@@ -197,7 +198,7 @@ class Neighbours:
         """The other photos [P, N] that predict each photo, and their weights."""
         count = min(TELLING + 1, len(self._places))
         rows, weights = self._told(self._places, count)
-        # Photos at the same position come in any order, so a photo is excluded wherever it appears.
+        # Photos at the same position can be in any order, so exclude the photo wherever it appears.
         weights[rows == np.arange(len(rows))[:, None]] = 0.0
         return rows, weights / weights.sum(axis=1, keepdims=True)
 

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum deviation of a rotation with rounded digits; it is made orthonormal again.
+#: Maximum deviation of a rotation whose digits were rounded; the rotation is made orthonormal
+#: again.
 _ROUNDED: Final = 1e-3
 _EXACT: Final = 1e-12
 _LAST_ROW: Final = np.array([0.0, 0.0, 0.0, 1.0])
@@ -19,8 +20,8 @@ FEWEST, _FEWEST_TO_REJECT = 3, 8
 #: Number of triples that are tried, maximum number of points per trial, and maximum number of
 #: rejection passes.
 _TRIPLES, _MOST_TRIED, _PASSES = 500, 100, 50
-#: Residuals beyond this many medians are outliers. Of normal errors, one in 10^5 is beyond it if
-#: two axes have equal errors, and fewer if three have.
+#: Residuals beyond this many medians are outliers. One of 10^5 normal errors exceeds it if two axes
+#: have equal errors, and fewer exceed it if three axes have equal errors.
 _FAR: Final = 4.0
 #: Residuals below this share of the extent are rounding errors.
 _ROUNDING: Final = 1e-9
@@ -155,7 +156,8 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
-    # The residuals are computed again with other rounding; half of the points must remain.
+    # The residuals are computed again with other rounding, but at least half of the points must
+    # remain.
     half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
     kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half
     for _ in range(_PASSES):

@@ -20,7 +20,7 @@ _SHOWN: Final = 80
 GEOCENTRIC: Final = "epsg:4978"
 #: Distance in metres on both sides of a place between which a projection is linearized.
 _NEAR: Final = 10.0
-#: Accuracy in metres that needs no message.
+#: Accuracy in metres for which no message is needed.
 _KNOWN_WELL: Final = 1.0
 #: Maximum relative difference of scale between directions; a UTM zone has 0.001.
 _UNEVEN: Final = 0.005

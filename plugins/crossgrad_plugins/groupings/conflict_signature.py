@@ -94,7 +94,7 @@ class ConflictSignature(Regrouping):
         try:
             return self.fit(model.scene, rng, ModelProbe(model, rng))
         except UserError as error:
-            # Gradients that all agree form one group; the run then keeps its present groups.
+            # If all gradients agree, they form one group, and the run keeps its present groups.
             early = Radial().fit(model.scene, rng)
             return GroupingRule(early.labels, (f"the groups do not change: {error.what}",))
 
@@ -123,11 +123,12 @@ def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     root = np.sqrt(similarity.sum(axis=1))
     # The second smallest eigenvalue of I - S is the second largest of S. The largest eigenvalue of
     # S is 1, with a known eigenvector. Two groups without any similarity have the eigenvalue 1
-    # twice; removing the known eigenvector leaves the other one.
+    # twice, so the known eigenvector is removed to find the other one.
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
-    # The known eigenvalue is -1 now, and no other is smaller. For two identical cameras 0 remains.
+    # The known eigenvalue is now -1, and no other eigenvalue is smaller. For two identical cameras
+    # the other eigenvalue is 0.
     if len(values) == 1 or min(values[-1], values[-1] - values[-2]) <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
     return (vectors[:, -1] > 0.0).astype(np.int64)

@@ -22,17 +22,17 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
-#: Cosine of the largest angle between the axes of two cameras that are compared.
+#: Cosine of the largest angle between the axes of two cameras whose photos are matched.
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
 _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: Results per scene; they are dropped with the scene.
+#: Cache of the results per scene; they are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
 #: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
 #: (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Smallest and largest angle between two rays. At smaller angles the intersection is not well
-#: defined; at larger angles the features are not the same.
+#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate; at
+#: larger angles the features show different surfaces.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 

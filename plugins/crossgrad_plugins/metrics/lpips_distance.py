@@ -16,7 +16,7 @@ from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
 #: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as in LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Keeps the length of a feature vector above 0.
+#: Value that keeps the length of a feature vector above 0.
 _LEAST = 1e-8
 #: Packages that contain the published heads, and the folders of the heads in them.
 _PACKAGES = (

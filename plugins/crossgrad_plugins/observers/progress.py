@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counts that most steps report, so they are not shown.
+#: Counts that most steps report and that are therefore not shown.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 
@@ -155,5 +155,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar, which would otherwise be broken.
+            # `tqdm` writes the line above the bar; otherwise the line would break the bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

@@ -29,7 +29,7 @@ _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
 #: Widths of the columns of a wide table; the evidence gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
-#: Basis of a choice -> text after the choice.
+#: Basis of a choice -> text that follows the choice.
 _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 

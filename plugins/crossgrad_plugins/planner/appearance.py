@@ -6,11 +6,13 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: Minimum share of the variance of tracks that view dependence must explain to be worth its cost.
+#: View dependence is worth its cost only if it explains at least this share of the variance of
+#: tracks.
 LEAST_SHARE: Final = 0.02
 #: Numbers per Gaussian without higher bands: position, shape, opacity, colour.
 _OTHER_NUMBERS: Final = 14
-#: If the footprints range over less than this factor, all photos show the scene at one scale.
+#: If the largest footprint is less than this many times the smallest, all photos show the scene at
+#: one scale.
 ONE_SCALE: Final = 2.0
 
 

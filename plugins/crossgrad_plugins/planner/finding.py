@@ -7,14 +7,14 @@ from typing import Literal, TypeAlias
 
 from crossgrad_core.plugin import Decision, Json
 
-#: Name -> figure of a finding.
+#: Name -> value of the evidence.
 Figures: TypeAlias = Mapping[str, float]
 #: Setting, or option of a component -> value.
 Settings: TypeAlias = Mapping[str, Json]
-#: The origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or
-#: undecided, so the default is kept. `given`: the user set it.
+#: Origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or not
+#: conclusive, so the default is used. `given`: the user set it.
 Basis: TypeAlias = Literal["decided", "default", "given"]
-#: The saving of a choice that a run without a plan makes, too.
+#: Text for the saving of a choice that a run without a planner also makes.
 NOTHING = "-"
 
 

@@ -13,7 +13,7 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: Minimum sigma_b^2 / sigma_w^2 for pairs: they remove its share of a step's gradient variance.
+#: Minimum sigma_b^2 / sigma_w^2 for pairs: pairs remove this share of a step's gradient variance.
 LEAST_RHO: Final = 0.1
 #: Minimum share of views in the smaller mode for pairs. Pairs weight both modes equally, so with a
 #: smaller share, training would optimize another objective.

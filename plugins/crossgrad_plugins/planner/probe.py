@@ -16,7 +16,7 @@ from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
 #: The optimizer sees gradients in Adam's metric.
 _METRIC: Final = "adam"
-#: Standard errors in half of a 95 % interval.
+#: Half of a 95 % interval in standard errors.
 _WIDE: Final = 1.96
 
 

@@ -15,8 +15,8 @@ from crossgrad_plugins.planner.length import most_views
 
 #: Far views per near view in the first part of a run; sampler `horizon` defines that part.
 FAR_TO_NEAR: Final = 5
-#: Limits, in degrees from the far views' mean direction: maximum for far views, minimum for near
-#: views.
+#: Maximum angle of far views and minimum angle of near views, in degrees from the mean direction of
+#: the far views.
 WITHIN, BEYOND = 45.0, 60.0
 
 

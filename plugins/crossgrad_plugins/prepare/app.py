@@ -46,7 +46,7 @@ _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
 #: Points beyond these percentiles are not drawn.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
-#: Titles of both panels for a scene without a place on Earth, whose vertical is unknown.
+#: Titles of both panels for a scene that is not georeferenced, so its vertical is unknown.
 _TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
@@ -168,7 +168,8 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     _check_lens(settings.lens)
     # A finished scene no longer needs its photos.
     plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
-    if layout.is_ready:  # Write nothing: others may read it, and the disk may be read-only.
+    # Write nothing, because others may read the folder, and the disk may be read-only.
+    if layout.is_ready:
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
     with disk_errors(layout.work):

@@ -177,7 +177,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
         except (
             RuntimeError,
             ValueError,
-        ):  # Pillow read it and pycolmap cannot: it has no features.
+        ):  # Pillow can read the photo but pycolmap cannot, so the photo has no features.
             continue
     width, height = photos[0].width, photos[0].height
     focal = reading.default_focal_length_factor * max(width, height)

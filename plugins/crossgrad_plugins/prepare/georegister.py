@@ -19,8 +19,8 @@ FEWEST: Final = 3
 #: with which most photos agree is used.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: Photos have to be this many GPS errors apart across their main direction. Along it this is
-#: enough only if the photos tell which way is up.
+#: Photos must be this many GPS errors apart across their main direction. A spread along the main
+#: direction is enough only if the photos show the upward direction.
 _SPREAD: Final = 3.0
 #: Cameras are on a line if their spread across it is below this share of the spread along it.
 _STRAIGHT: Final = 0.05

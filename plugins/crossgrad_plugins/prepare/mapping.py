@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Least number of points for a pose, as in COLMAP's incremental mapping, and least number of points
+#: Minimum number of points for a pose, as in COLMAP's incremental mapping. Minimum number of points
 #: that two photos of a model share, directly or through other photos, as for a verified pair.
 _POINTS, _SHARED = 30, 15
 
@@ -76,8 +76,8 @@ def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.R
     return alone
 
 
-#: Least number of photos for global mapping: for one folder, and for several folders. Folders may
-#: be joined by few matches, and global mapping misplaces such parts (docs/prepare.md).
+#: Minimum number of photos for global mapping: for one folder, and for several folders. Few matches
+#: may join folders, and global mapping then misplaces such parts (docs/prepare.md).
 _MANY, _MANY_OF_FOLDERS = 100, 1000
 #: Least number of photos in a model.
 _SMALLEST: Final = 3
@@ -194,7 +194,7 @@ def _options(threads: int) -> "pycolmap.IncrementalPipelineOptions":
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
     options.min_model_size = _SMALLEST
-    # The fallback also places photos by pairs, but does not check how many pairs agree.
+    # The fallback also estimates poses from pairs, but it does not check how many pairs agree.
     options.structure_less_registration_fallback = False
     return options
 

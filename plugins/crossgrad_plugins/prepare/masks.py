@@ -19,7 +19,8 @@ from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 
-#: Folders with this name contain masks, and so do files next to photos whose stem ends like this.
+#: Folders with this name contain masks. Files next to photos are masks if their stem ends like
+#: this.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
 #: The level of a mask or of transparency below which a pixel does not count.

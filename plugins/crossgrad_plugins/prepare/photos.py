@@ -77,7 +77,8 @@ _REDUCIBLE: Final = 2
 #: Approximate longest side in pixels of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-#: Lock that makes large photos (a fixed share of the greatest size) be decoded one at a time.
+#: Lock for large photos (a fixed share of the maximum size), so that they are decoded one at a
+#: time.
 _LARGE: Final = Lock()
 Tell = Callable[[int, int], None]
 

@@ -190,7 +190,7 @@ def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
         some: True if photos may be missing from the new plan.
     """
     was, now = known.settings.model_dump(), plan.settings.model_dump()
-    # Only the content of masks is compared, not their folder.
+    # Compare only the content of masks, not their folder.
     told = [f"{key} was {was[key]}, now {now[key]}" for key in was
             if was[key] != now[key] and key != "masks"]  # fmt: skip
     after = {photo.name: photo for photo in plan.used}

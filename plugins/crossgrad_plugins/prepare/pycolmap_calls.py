@@ -103,7 +103,12 @@ def rows_of(database: Path, table: str) -> int:
     try:
         done = subprocess.run(program, capture_output=True, timeout=_PATIENCE, check=True)
         return int(done.stdout)
-    except (OSError, ValueError, subprocess.SubprocessError):  # It is busy, or not made yet.
+    except (
+        # The database is busy, or does not exist yet.
+        OSError,
+        ValueError,
+        subprocess.SubprocessError,
+    ):
         return 0
 
 
@@ -116,7 +121,7 @@ def write_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
     try:
         with quiet():
             model.write(folder)
-    except (RuntimeError, ValueError) as error:  # A file could not even be made.
+    except (RuntimeError, ValueError) as error:  # The file could not be created.
         raise disk_full(folder, None) from error
     check_written(folder)
 

@@ -99,7 +99,7 @@ def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
 
 
 def _moved(here: Path, there: Path) -> None:
-    if not _is_written(here):  # Pycolmap does not say why.
+    if not _is_written(here):  # Pycolmap does not report the reason.
         raise UserError(
             "an undistorted photo could not be written",
             where=there,

@@ -24,7 +24,7 @@ from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn, empty
 from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-#: gswarp does not render Gaussians up to this depth, in the units of its input.
+#: gswarp does not render Gaussians that are nearer than this depth, in the units of its input.
 _NEAR = 0.2
 
 

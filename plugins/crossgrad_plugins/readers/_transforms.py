@@ -150,7 +150,7 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
               if any(key in frame for key in way)]  # fmt: skip
     own = _says_fisheye(frame)
     if own is not None and own != bool(_says_fisheye(whole)):
-        others += _WAYS[1]  # Distortion of another kind of lens.
+        others += _WAYS[1]  # These are distortion parameters of another kind of lens.
     hidden = frozenset[str]().union(*others)
     return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})
 

@@ -26,7 +26,7 @@ from crossgrad_plugins.readers.colmap_files.folder import (
 from crossgrad_plugins.readers.colmap_files.model import model_files, read_model
 from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
-#: The file with the place on Earth, in the model's folder or in the scene's folder.
+#: Name of the file with the georeference, in the model's folder or in the scene's folder.
 _GEOREF = "georef.json"
 #: Below this length, or above its inverse, the square of a quaternion's length is not accurate.
 _SHORTEST = 1e-100

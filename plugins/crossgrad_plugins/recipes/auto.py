@@ -22,10 +22,10 @@ MANY_PHOTOS: Final = 100
 #: `REFERENCE` / steps to this power. The power is below 1: the sum of the rates falls with the
 #: length, but not as fast.
 SHORTNESS: Final = 0.45
-#: The largest factor, which runs of about 1,000 steps use.
+#: Largest factor, which runs of about 1,000 steps use.
 MOST: Final = 4.5
-#: A run that renders each training photo fewer times than this, on average, has few passes. It ends
-#: long before it overfits.
+#: A run has few passes if it renders each training photo fewer times than this, on average. Such a
+#: run ends long before it overfits.
 FEW_PASSES: Final = 40
 #: Power and largest factor of the learning rates in runs with few passes.
 FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
@@ -41,19 +41,19 @@ SCALE_RATIO: Final = 0.5
 #: Share of a short run with few passes before SH bands above the first are rendered. Earlier, these
 #: bands cost time and improve little.
 SH_START: Final = 0.5
-#: The highest SH degree.
+#: Highest SH degree.
 MOST_DEGREES: Final = 3
-#: Share of the run, at its end, over which constant learning rates decay.
+#: Share of the run, at its end, in which constant learning rates decay.
 LR_TAIL: Final = 0.25
 #: Share of the Gaussians that a view omits, if the median point is seen by at most `FEW_PHOTOS`
 #: photos.
 DROPOUT, FEW_PHOTOS = 0.3, 5
-#: Smallest number of edits of budgeted growth, in runs of at least this many views. In shorter
-#: runs, new primitives have no time to converge and can cost 1 dB.
+#: Minimum number of edits of budgeted growth, in runs of at least this many views. In shorter runs,
+#: new Gaussians have no time to converge and can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
-#: The reason that the table shows while only the duration of a run in seconds is known.
+#: Reason that the table shows while only the duration of the run in seconds is known.
 UNKNOWN: Final = "decided when the length is planned"
-#: The page that shows how these values were measured.
+#: Page that shows how these values were measured.
 SCHEDULES: Final = "docs/schedules.md"
 
 
@@ -125,7 +125,7 @@ class Choice:
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # A bound that the user sets is a limit, not a target.
+        # A limit that the user sets is not a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"
@@ -377,7 +377,7 @@ def _sh_start(choice: Choice) -> float:
     if not choice.few_passes or facts.unit != "views" or facts.published:
         return 0.0
     schedule = facts.schedule(facts.unit)
-    # The length of a custom schedule may exceed the length of the run.
+    # A custom schedule may be longer than the run.
     length = min(schedule.length, schedule.counted(schedule.total))
     return int(SH_START * shortness(schedule.length) * length) / length
 

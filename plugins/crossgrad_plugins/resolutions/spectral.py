@@ -121,7 +121,8 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        ahead = np.searchsorted(ends, parts, side="right")  # The level that the run leaves next.
+        # This is the level that the run leaves next.
+        ahead = np.searchsorted(ends, parts, side="right")
         behind = np.maximum(ahead - 1, 0)
         # Before the first level is left, there is no level to interpolate from.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
@@ -208,8 +209,8 @@ def amplitudes_within(grey: Floats) -> Floats:
     """
     height, width = grey.shape
     amplitudes = np.abs(np.fft.rfft2(grey))
-    # For a real image, the other half of the columns is the same. Exceptions are the first column
-    # and, if their number is even, the last column.
+    # For a real image, the other half of the columns is equal. Exceptions are the first column and,
+    # if their number is even, the last column.
     amplitudes[:, 1 : (width + 1) // 2] *= 2.0
     cells = np.maximum.outer(_cells(np.fft.fftfreq(height)), _cells(np.fft.rfftfreq(width)))
     return np.cumsum(np.bincount(cells.ravel(), amplitudes.ravel(), GRID + 1))

@@ -48,7 +48,7 @@ class Strided(CoarseToFine):
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
-        # This is called in each step, so do not examine all photos again.
+        # This function is called in each step, so do not examine all photos again.
         return self if self.coarsest is not None else self.fitted_to(scene)
 
     @override

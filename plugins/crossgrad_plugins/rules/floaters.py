@@ -26,8 +26,8 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The percentile of the depths of a camera's SfM points that counts as nearest. Single points are
-#: often wrong.
+#: Percentile of the depths of a camera's SfM points that is used as the nearest depth, because
+#: single points are often wrong.
 NEAREST: Final = 1.0
 #: A camera that observes fewer points than this does not show which space is empty.
 FEWEST_SEEN: Final = 8
@@ -40,8 +40,8 @@ class Floaters(Rule):
         0.3,
         gt=0,
         le=1,
-        # The ground below a level camera is farther away, because the camera sees it only from a
-        # distance.
+        # The ground below a level camera is farther away, because the camera sees the ground only
+        # at a distance.
         description="depth range that counts as empty, as a share of the distance from a camera "
         "to the nearest point that it observes",
     )
@@ -97,8 +97,8 @@ def floaters(model: Model, empty: float) -> Tensor:
     for view in model.scene.train_views:
         if len(rows) == 0:
             break
-        # Rendered alone, the candidates take little time, and it does not matter what would hide
-        # them.
+        # Render only the candidates: this takes little time, and Gaussians that hide them do not
+        # matter.
         alone = apply_to_parameters(Edit(rows), backbone.blocks(), parameters)
         with torch.no_grad():
             gaussians = backbone.decode(alone, view.camera, model.phase)
@@ -123,7 +123,7 @@ def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -
         scene: The scene; its training cameras and their SfM points are used.
         empty: Share of the distance from a camera to the nearest point that it sees.
     """
-    from scipy.spatial import cKDTree  # Slow to import.
+    from scipy.spatial import cKDTree  # Import it here, because the import is slow.
 
     views = cameras_that_tell(scene)
     if not views:

@@ -30,8 +30,8 @@ from crossgrad_core.plugin import (
 
 #: Steps between two checks of the sizes.
 EVERY: Final = 50
-#: Smaller Gaussians are not checked, in scene extents. Most are smaller, and hardly any of them
-#: exceeds the bound.
+#: Gaussians with a smaller size, in scene extents, are not checked. Most Gaussians are smaller, and
+#: hardly any of them exceeds the bound.
 LEAST: Final = 0.01
 #: Maximum number of distances that are computed at once.
 _AT_ONCE: Final = 2**20

@@ -22,7 +22,7 @@ _GIB = 2**30
 PAUSE = 0.1
 #: The command that trains a run; core numbers and the arguments of `crossgrad` follow.
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
-#: Environment variables that limit the threads of a library.
+#: Environment variables that limit the threads of libraries.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 #: Exit status of a run that was refused.
 _REFUSED = 2
@@ -191,7 +191,7 @@ class Attempt:
             stderr=subprocess.STDOUT,
             cwd=worker.folder,
             env={**os.environ, **dict.fromkeys(_THREADS, str(worker.threads))},
-            # Ctrl-C in the terminal is for the sweep, which then stops its runs.
+            # Ctrl-C in the terminal is meant for the sweep, which then stops its runs.
             start_new_session=True,
         )
 
@@ -217,7 +217,7 @@ class Attempt:
     def _reason(self, folder: Path, code: int) -> str:
         """Return why the run failed: its own error, or the end of its process's output."""
         error = (summary_of(folder) or {}).get("error")
-        # A refused run does not write the summary, which may be from an earlier attempt.
+        # A refused run writes no summary, so an existing summary may be from an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:

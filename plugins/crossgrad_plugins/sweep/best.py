@@ -55,10 +55,11 @@ def best_grid(
     for arm in grid.arms:
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         if len(own) == 1:
-            # Nothing varies in this arm, so it is a reference for the rest.
+            # Nothing varies in this arm, so it is the reference for the other arms.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
-            # Written as parameters, because parameters can override settings and settings cannot.
+            # Write them as parameters, because parameters can override settings and settings
+            # cannot.
             fixed = {name: {"values": [value]} for name, value in own[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})

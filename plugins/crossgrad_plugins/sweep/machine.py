@@ -69,7 +69,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
     """Return the cores, idle cores first, because another sweep may use some cores."""
-    with suppress(OSError, ValueError):  # Not Linux, or another format of the counts.
+    with suppress(OSError, ValueError):  # The system is not Linux, or the file has another format.
         before = _counts()
         time.sleep(_LOOK)
         after = _counts()

@@ -63,7 +63,7 @@ def test_a_folder_without_the_list_gets_none(tmp_path):
 @pytest.mark.parametrize("line", ["0123  a.txt", "no line", "g" * 64 + "  a.txt"])
 def test_a_damaged_list_is_an_error(folder, line):
     (folder / SUMS).write_text(f"{line}\n")
-    with pytest.raises(UserError, match=f"SHA256SUMS cannot be read"):
+    with pytest.raises(UserError, match="SHA256SUMS cannot be read"):
         changed_files(folder)
 
 

@@ -16,7 +16,7 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     meetings,
 )
 
-#: Returns True if a combination of these slots can work.
+#: Return True if a combination of these slots can work.
 Admits = Callable[[Row, tuple[str, ...]], bool]
 
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Quantile of the figures at which the axis begins; the first, much lower evaluations are cut off.
+#: Quantile of the values at which the axis begins, so that the first, much lower evaluations are
+#: cut off.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
 #: Width of the markers of all arms together, relative to the distance between two groups.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of rows that fit on a page.
 _MOST_ROWS: Final = 24
-#: Intervals are this far above the middle of their row; the markers of pairs are below it.
+#: Intervals are drawn this far above the middle of their row, and the markers of pairs below it.
 _ABOVE: Final = 0.12
 #: Letters per line of a heading, and the height of each further line in rows.
 _LETTERS, _LINE = 70, 0.6

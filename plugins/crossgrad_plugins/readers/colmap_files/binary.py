@@ -247,7 +247,8 @@ def _read_points(file: _Walk) -> NDArray[np.void]:
         for _ in range(number):
             starts.append(at)
             at += fixed + _TRACK_ELEMENT * track_length(data, at + _POINT.itemsize)[0]
-    except (struct.error, OverflowError):  # past the end, or too large an offset
+    except (struct.error, OverflowError):
+        # The track is longer than the file, or the offset is too large.
         at += fixed
     file.skip(at - file.at)
     file.end()

@@ -115,7 +115,7 @@ def _number(word: bytes) -> float:
     Raises:
         ValueError: The word is not a number.
     """
-    if b"_" in word:  # Python's digit groups
+    if b"_" in word:  # Python would accept digit groups with underscores.
         raise ValueError(word)
     return float(word)
 

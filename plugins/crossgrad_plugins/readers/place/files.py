@@ -173,7 +173,8 @@ def _positions(
     """
     found = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(found, most)}
-    if not {"images", "pose_priors"} <= tables:  # Views may compute without an end.
+    # A view of the database may compute without an end.
+    if not {"images", "pose_priors"} <= tables:
         return
     there = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
     column = next((name for name in _COLUMNS if name in there), None)

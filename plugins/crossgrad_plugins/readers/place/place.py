@@ -24,13 +24,13 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers.place.headers import Measured, of_headers
 
-# Most scenes have no place, so modules that compute with places are imported only when needed.
+# Most scenes are not georeferenced, so modules for positions are imported only when needed.
 if TYPE_CHECKING:
     from crossgrad_plugins.georeference.ellipsoid import Place
     from crossgrad_plugins.georeference.frames import Fit
     from crossgrad_plugins.georeference.on_earth import OnEarth
 
-#: Files in the scene's folder: OpenDroneMap's list of photo places, and COLMAP's databases.
+#: Files in the scene's folder: OpenDroneMap's list of photo positions, and COLMAP's databases.
 _LIST: Final = "geo.txt"
 _DATABASES: Final = ("database.db", "colmap/database.db")
 
@@ -85,7 +85,8 @@ def _sources(
         if is_file(path):
             try:
                 yield _listed(path, names)
-            except UserError as error:  # A run does not need it.
+            except UserError as error:
+                # A run does not need the georeference, so the error becomes a note.
                 notes.append(f"{path.name} contains no positions: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
 
@@ -105,7 +106,7 @@ def _file_of(view: View, raw: RawScene) -> Path:
     """Return the photo's own file, because a smaller copy may lack the EXIF header."""
     path = raw.images / view.name
     if isinstance(view.photo, FilePhoto) and not is_file(path):
-        return view.photo.source.path  # Found by another suffix.
+        return view.photo.source.path  # The file was found with another suffix.
     return path
 
 

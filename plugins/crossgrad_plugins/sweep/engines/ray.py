@@ -116,7 +116,7 @@ def _connected(work: Work) -> ModuleType:
             found=" ".join(str(error).split()),
             todo="start it with `ray start --head`, and give the address that it prints",
         ) from error
-    for number, handler in handlers.items():  # Ray installs its own handlers.
+    for number, handler in handlers.items():  # Ray installs its own signal handlers.
         signal.signal(number, handler)
     found: ModuleType = ray
     return found
