@@ -25,10 +25,9 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Least distance, local units: a camera at the mean centre has no logarithmic distance.
+#: Minimum distance in local units, because a camera at the mean centre has no logarithmic distance.
 NEAREST = 1e-3
-#: If the logarithms of all distances have a smaller standard deviation, all distances count as
-#: equal.
+#: All distances count as equal if the standard deviation of their logarithms is below this value.
 LEAST_SPREAD = 1e-6
 
 

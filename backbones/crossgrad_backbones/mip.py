@@ -89,7 +89,7 @@ class _Smoothed(torch.autograd.Function):
         kept = scales.div_(smooth)
         opacities = sigmoid(logits)
         drawn = opacities * kept.prod(1)
-        # In place: at this size, new memory costs more than the arithmetic.
+        # Compute in place, because at this size new memory costs more than the arithmetic.
         shares = kept.square_(), filters.div_(smooth).square_()
         ctx.save_for_backward(smooth, *shares, opacities, drawn)
         return smooth, drawn

@@ -74,7 +74,7 @@ class Vanilla(Backbone):
         return (*rows, rest)
 
     def _scales_lr(self) -> LearningRate:
-        # Measured for crossgrad (docs/schedules.md).
+        # Value measured for crossgrad (docs/schedules.md).
         return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:

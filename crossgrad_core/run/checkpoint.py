@@ -238,7 +238,7 @@ def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
         raise damaged(folder, f"{STATE} has changed since it was written (its SHA-256 differs)")
     wrong = [name for name, holds in _PARTS.items() if not holds(state.get(name))]
     if wrong:
-        raise damaged(folder, f"{STATE} has no valid value for {', '.join(wrong)}")
+        raise damaged(folder, f"{STATE} has no valid {', '.join(wrong)}")
 
 
 def _is_count(value: object) -> bool:

@@ -31,7 +31,7 @@ def label_objections(
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists reads its labels from the scene and declares none.
+        # A grouping by folders or lists takes its labels from the scene and declares none.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:

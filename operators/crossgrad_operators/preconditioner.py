@@ -7,7 +7,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState, diagonals
 
-#: Bounds of r / r_ref, so that a camera at the centroid keeps some weight.
+#: Limits of r / r_ref, so that a camera at the centroid keeps some weight.
 _BOUNDS = (1e-2, 1e2)
 
 

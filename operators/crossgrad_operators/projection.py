@@ -10,7 +10,8 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 
-#: For a unit roundoff of the gradients below this, float64 Gramians are not finer than gradients.
+#: If the unit roundoff of the gradients is below this, float64 Gramians are not more precise than
+#: the gradients.
 NARROW = 1e-12
 
 

@@ -59,7 +59,7 @@ class TorchJD(GramianOperator):
 
         weights = np.zeros(gramians.shape[:2])
         rule = self._built()
-        # TorchJD draws from the global generator, which must be restored afterwards.
+        # TorchJD draws from the global generator, so restore the generator afterwards.
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             torch.manual_seed(int(rng.integers(2**63)))
             for block, present in enumerate(context.present):

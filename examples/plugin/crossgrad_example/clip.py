@@ -15,7 +15,7 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Name of the state, which is kept from step to step and in checkpoints.
+#: Name of the state, which is kept between steps and in checkpoints.
 STATE = "clip"
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from crossgrad_operators.stress.runner import Cell
     from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Elements of the largest gradients.
+#: Default number of elements of the largest gradients.
 LARGE = 10_000_000
 #: Option -> the kinds of run that use it. "" means the fixed cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {

@@ -20,14 +20,15 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: Above this kappa u only finiteness is promised, as the input does not determine the result.
+#: Above this kappa u only finiteness is guaranteed, because the input does not determine the
+#: result.
 UNDETERMINED: Final = 0.1
 #: Failure reason of a result that contains a NaN or an infinity.
 NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
-#: Distance of a result from the nearest result that a rule for elements allows.
+#: Maximum distance of a result from the nearest result that a rule for elements allows.
 ElementRule = Callable[[Case, Tensor], float]
 
 

@@ -103,12 +103,8 @@ def rows_of(database: Path, table: str) -> int:
     try:
         done = subprocess.run(program, capture_output=True, timeout=_PATIENCE, check=True)
         return int(done.stdout)
-    except (
+    except (OSError, ValueError, subprocess.SubprocessError):
         # The database is busy, or does not exist yet.
-        OSError,
-        ValueError,
-        subprocess.SubprocessError,
-    ):
         return 0
 
 

@@ -27,7 +27,7 @@ def test_no_rate_fades_to_nothing():
 def test_a_block_has_a_known_kind_names_and_a_rate():
     rate = LearningRate(1e-3)
     assert not Block("means", ("means",), True, "geometry", rate).frozen
-    with pytest.raises(ValueError, match="the kind 'colour' is none of"):
+    with pytest.raises(ValueError, match="found 'colour'"):
         Block("means", ("means",), True, "colour", rate)
     with pytest.raises(TypeError, match="a tuple of names"):
         Block("means", "means", True, "geometry", rate)

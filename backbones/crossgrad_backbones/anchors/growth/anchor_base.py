@@ -193,7 +193,7 @@ class AnchorDensifier(Densifier):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
-        # Published: statistics from step 500, edits from step 1500 on.
+        # The published schedule collects statistics from step 500 on and edits from step 1500 on.
         if context.schedule.counted(context.step) > context.schedule.densify_from // 3:
             state = observed(context, state)
         if not (state.per_primitive and context.schedule.densifies(context.step)):
