@@ -282,7 +282,7 @@ def test_a_component_that_comes_twice_with_other_options_is_refused(tmp_path):
     twice = [{"name": "diagnostics", "every": 5}, {"name": "diagnostics", "every": 6}]
     path = written(tmp_path, "observers: [{name: diagnostics, every: 5}, diagnostics]")
     for given in ((None, {"observe": twice}, []), (path, {}, [])):
-        with pytest.raises(UserError, match="diagnostics comes twice"):
+        with pytest.raises(UserError, match="diagnostics is named twice"):
             parsed(merged(*given))
     assert len(settled(observe=["diagnostics", "diagnostics"]).observers) == 1
 

@@ -92,7 +92,9 @@ def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
             look(killed)
     with (
         locked(killed, "training"),
-        pytest.raises(UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first one"),
+        pytest.raises(
+            UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first checkpoint"
+        ),
     ):
         evaluate.evaluate(killed)
 

@@ -139,7 +139,7 @@ def test_what_cannot_be_compared_is_refused(trained, scene, tmp_path):
         evaluate.evaluate(trained, on=only)
     away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
-    with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
+    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of its points"):
         evaluate.evaluate(trained, on=far_away)
     with pytest.raises(UserError):
         evaluate.evaluate(trained, on=tmp_path / "nothing")

@@ -162,7 +162,7 @@ def test_too_few_photos_are_refused_as_such(tmp_path, photos):
     with pytest.raises(UserError) as told:
         diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
     assert told.value.what == "too few training photos for a probe"
-    assert "4 at least" in told.value.expected and "sampler" not in told.value.todo
+    assert "at least 4" in told.value.expected and "sampler" not in told.value.todo
 
 
 @pytest.mark.parametrize("name", sorted(FILES - {"diagnostics.csv"}))

@@ -94,7 +94,7 @@ def test_a_length_in_views_is_one_in_steps(views, length, steps, drawn):
 
 
 def test_a_run_shorter_than_a_step_is_refused():
-    with pytest.raises(UserError, match="at least 4, the views of a step"):
+    with pytest.raises(UserError, match="at least 4, the number of views of the first step"):
         assembled(views=4, max_views=3)
 
 
@@ -115,7 +115,7 @@ def test_views_within_seconds_end_a_run_before_its_time_is_over(scene, tmp_path)
 def test_a_run_in_seconds_notes_options_of_resets_that_it_has_none_for(scene, tmp_path):
     out, densifier = tmp_path / "run", {"name": "adc", "prune_scale": 0.3}
     run(scene, out, seconds=60.0, max_views=9, densifier=densifier)
-    line = "densifier.prune_scale does nothing: the run has no opacity resets"
+    line = "densifier.prune_scale has no effect: the run has no opacity resets"
     assert line in (out / "log.txt").read_text()
     given = {"seconds": 60.0, "max_views": 9, "reset_every": 4, "densifier": densifier}
     run(scene, tmp_path / "resets", **given)
@@ -161,7 +161,7 @@ def test_a_dry_run_refuses_more_different_views_than_there_are(scene, views):
 
 
 def test_views_within_seconds_are_at_least_a_step():
-    with pytest.raises(UserError, match="at least 4, the views of a step"):
+    with pytest.raises(UserError, match="at least 4, the number of views of the first step"):
         assembled(views=4, max_views=3, seconds=1.0)
 
 

@@ -129,7 +129,10 @@ def test_another_version_of_crossgrad_is_one_of_a_package(stopped, capsys):
 def test_eval_reports_a_changed_package_version(stopped, install, capsys):
     install("1.1")
     assert ended("eval", stopped) == 0
-    words = "the run was trained with versioned-package 1.0; installed is versioned-package 1.1"
+    words = (
+        "the run was trained with versioned-package 1.0; "
+        "the installed version is versioned-package 1.1"
+    )
     assert words in capsys.readouterr().err
 
 

@@ -263,7 +263,7 @@ def _require_properties(names: Collection[str], path: Path) -> None:
         else "export the Gaussians, not the sparse points or a mesh"
     )
     raise UserError(
-        "the PLY file is compressed" if packed else "the PLY file does not contain Gaussians",
+        "the PLY file is compressed" if packed else "the PLY file contains no Gaussians",
         where=path,
         expected="the properties of a standard 3DGS PLY file",
         found=f"no {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}",  # noqa: PLR2004

@@ -324,7 +324,10 @@ DAMAGES = {
     "cut short": (cut, "SHA-256 differs"),
     "no tensors": (lambda folder: (folder / "tensors.safetensors").unlink(), "no tensors"),
     "no state": (lambda folder: (folder / "state.json").unlink(), "no state.json"),
-    "half a state": (lambda folder: (folder / "state.json").write_text('{"format'), "not valid JSON"),
+    "half a state": (
+        lambda folder: (folder / "state.json").write_text('{"format'),
+        "not valid JSON",
+    ),
     "other JSON": (
         lambda folder: (folder / "state.json").write_text("[1]"),
         "does not contain the state",

@@ -228,9 +228,9 @@ def test_the_command_runs_very_many_matrices(monkeypatch):
     ("arguments", "message"),
     [
         (["--search", "1", "--rows", "[[1]]"], "--search and --rows cannot be combined"),
-        (["--search", "1", "--case", "plain"], "--case does nothing with --search"),
-        (["--rows", "[[1]]", "--seed", "1"], "--seed does nothing with --rows"),
-        (["--type", "float32"], "--type does nothing with the fixed cases"),
+        (["--search", "1", "--case", "plain"], "--case has no effect with --search"),
+        (["--rows", "[[1]]", "--seed", "1"], "--seed has no effect with --rows"),
+        (["--type", "float32"], "--type has no effect with the fixed cases"),
     ],
 )
 def test_options_that_would_do_nothing_are_refused(arguments, message):

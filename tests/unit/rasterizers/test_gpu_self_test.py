@@ -86,8 +86,8 @@ def test_gsplat_passes_on_its_reference(monkeypatch):
     [
         (Dark(), "pixels differ by up to"),
         (Unwritten(), "pixels differ by up to nan off"),
-        (HalfGradients(), "the gradient of the means is 0.5"),
-        (NoGradients(), "the gradient of the quats is 1 "),
+        (HalfGradients(), "the gradient of the means differs by 0.5"),
+        (NoGradients(), "the gradient of the quats differs by 1 "),
         (Broken(), "RuntimeError: Ninja is required"),
         (WrongFirst(), "pixels differ by up to"),
     ],

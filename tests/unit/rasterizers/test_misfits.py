@@ -56,7 +56,7 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
 def test_giving_both_or_neither_of_colors_and_sh_is_refused():
     some = complete(harmonics=True)
     for wrong in (replace(some, colors=some.means), replace(some, sh_dc=None)):
-        with pytest.raises(UserError, match="colors and sh_dc"):
+        with pytest.raises(UserError, match="colors or sh_dc"):
             drawn(wrong)
 
 

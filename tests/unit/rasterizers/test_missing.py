@@ -111,7 +111,10 @@ def test_torch_looks_for_nvcc_where_cuda_home_points_and_nowhere_else(monkeypatc
     monkeypatch.setenv("CUDA_PATH", str(tmp_path / "gone"))
     assert missing.find_nvcc() is None
     monkeypatch.setattr(missing, "find_spec", lambda _name: None)
-    assert f"no nvcc in {tmp_path / 'gone'}, where CUDA_HOME" in missing.compiler_missing("gsplat")
+    assert (
+        f"nvcc was not found in {tmp_path / 'gone'}, where CUDA_HOME"
+        in missing.compiler_missing("gsplat")
+    )
 
 
 def test_an_nvcc_without_a_readable_version_is_accepted(machine, tmp_path):

@@ -435,7 +435,7 @@ class TestCsv:
         [
             (b"#name,x,y\n", "a column alt"),
             (b"", "a column #name"),
-            (b"#name,x,y,alt,heading,pitch,roll,f,f\n", "two columns f"),
+            (b"#name,x,y,alt,heading,pitch,roll,f,f\n", "the column f twice"),
             (b"#name,x,y,alt,heading,pitch,roll,f\na.png,1\n", "8 cells in line 2"),
             (b"\xff\n", "cannot be read"),
             (b"#name,x,y,alt,heading,pitch,roll,f\n", "no image with a pose"),

@@ -23,7 +23,7 @@ def test_two_readers_for_one_folder_are_an_error_that_names_the_option(forms):
     shutil.copytree(forms["colmap"] / "sparse", path / "colmap" / "sparse")
     with pytest.raises(UserError, match="files of several formats") as caught:
         read_scene(RunConfig(scene=path), path)
-    assert caught.value.found == "files of the readers colmap, nerfstudio"
+    assert caught.value.found == "files for the readers colmap, nerfstudio"
     assert "--reader colmap" in caught.value.todo
     for name in ("colmap", "nerfstudio"):
         assert read_scene(RunConfig(scene=path, reader={"name": name}), path)[1] == name

@@ -312,7 +312,7 @@ class TestPhotos:
         (path / "images").rename(path / "images_4")
         rewrite_camera(path, 192, 128, (230.4, 230.4, 102.0, 60.0))
         scene = read(path)
-        assert "8 of another size than their camera, which was scaled" in notes(scene)
+        assert "8 with another size than their camera, which was scaled" in notes(scene)
         assert scene.views[0].camera.fx == pytest.approx(57.6)
         assert color_error(scene.views[1], scene) < 8
 

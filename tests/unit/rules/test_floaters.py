@@ -167,7 +167,7 @@ def test_a_state_that_cannot_lose_its_rows_stays_as_it_was():
     take_step(setup, state)
     state.commit({"wrong": PluginState(per_primitive={"rows": torch.zeros(3)})})
     tensors, moments, before = state.tensors, state.moments, state.primitives(setup)
-    with pytest.raises(UserError, match="state of plugin wrong does not fit"):
+    with pytest.raises(UserError, match="state of plugin wrong does not match"):
         cleaned(setup, state)
     assert state.tensors is tensors and state.moments is moments
     assert {len(t) for t in moments.exp_avg.values()} == {before}

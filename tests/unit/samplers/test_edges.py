@@ -117,7 +117,7 @@ def test_independent_draws_may_repeat_the_only_camera():
 
 
 def test_random_halves_need_two_cameras():
-    with pytest.raises(UserError, match="two training views"):
+    with pytest.raises(UserError, match="at least two training views"):
         SamplerRun(build("samplers", "random-split", {}), scene(1)).draw()
 
 

@@ -66,8 +66,8 @@ def test_the_best_grid_contains_each_arm_as_given_and_at_its_best_value(swept, t
     }
     assert yaml.safe_load(path.read_text())["base"] == {"steps": 9}
     assert notes == [
-        "beach, one: the best rate_factor is 2, at the end of its values",
-        "town, two: the best rate_factor is 0.5, at the end of its values",
+        "beach, one: the best rate_factor is 2, the smallest or largest of its values",
+        "town, two: the best rate_factor is 0.5, the smallest or largest of its values",
     ]
 
 

@@ -120,7 +120,7 @@ def test_a_metric_that_no_run_has_is_reported_with_those_they_have():
     jobs, overall = JOBS[:2], {"psnr": 20.0, "lpips": None, "ssim": 0.5}
     found = [Standing(job, "finished", summary={"overall": overall}) for job in jobs]
     told = list(table(jobs, found, Metric(name="psnr_street")))[-1]
-    assert told.startswith("no finished run has psnr_street; they have psnr, ssim")
+    assert told.startswith("no finished run has psnr_street; the runs have psnr, ssim")
     waiting = [Standing(job, "waiting") for job in jobs]
     assert "no finished run" not in "".join(table(jobs, waiting, Metric(name="psnr_street")))
 

@@ -98,7 +98,7 @@ def test_the_option_of_pytest_adds_the_combinations_to_the_tests(tmp_path):
 def test_the_option_of_pytest_names_a_package_that_is_not_there(tmp_path):
     ended = run_pytest(tmp_path, "--crossgrad-matrix", "no-such-package")
     assert ended.returncode == pytest.ExitCode.USAGE_ERROR
-    assert "no installed package 'no-such-package'" in ended.stderr + ended.stdout
+    assert "no package named 'no-such-package' is installed" in ended.stderr + ended.stdout
 
 
 def test_pytest_without_the_option_imports_nothing_of_ours():

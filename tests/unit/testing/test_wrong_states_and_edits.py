@@ -99,8 +99,8 @@ class RepeatsOne(NoDensification):
             "that aggregate returns grows without limit",
         ),
         (operators.views_that_are_alike_count_alike, FirstCountsTwice, r"weights \[2.0, 1.0\]"),
-        (densifiers.most_primitives_survive, LeavesOne, "keeps 1 of 40 primitives"),
-        (densifiers.most_primitives_survive, RepeatsOne, "keeps 1 of 40 primitives"),
+        (densifiers.most_primitives_survive, LeavesOne, "keeps 1 of 40 Gaussians"),
+        (densifiers.most_primitives_survive, RepeatsOne, "keeps 1 of 40 Gaussians"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )

@@ -237,7 +237,7 @@ def test_a_rasterizer_with_one_dilation_is_refused():
     gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
     selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
     told = gswarp.crossgrad_validate_selection(selection)
-    assert any("resolution strided by less" in each for each in told)
+    assert any("resolution strided needs less" in each for each in told)
 
 
 def assembled(**settings):

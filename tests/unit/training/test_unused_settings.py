@@ -230,13 +230,13 @@ def test_listed_splits_leave_test_every_nothing_to_do(tmp_path):
 
 LABELS = [
     ({"operator": {"name": "anchors"}, "sampler": {"name": "near-far"}}, "near (operator.near)"),
-    ({"operator": {"name": "anchors"}, "sampler": {"name": "random"}}, "gives aerial, street"),
+    ({"operator": {"name": "anchors"}, "sampler": {"name": "random"}}, "makes aerial, street"),
     (
         {
             "operator": {"name": "dispatch", "rules": {"geometry": "anchors"}},
             "sampler": {"name": "near-far"},
         },
-        "operator anchors looks for",
+        "operator anchors needs views",
     ),
     ({"sampler": {"name": "three-way"}}, "3 groups"),
     ({"sampler": {"name": "anchors-30"}}, "near and far"),

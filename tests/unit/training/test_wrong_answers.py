@@ -209,7 +209,7 @@ class Answers:
 )
 def test_a_wrong_hook_result_names_the_plugin(plugin):
     error = refused(setup_of(stranger=plugin))
-    assert "answers crossgrad_" in error.what
+    assert "for the hook crossgrad_" in error.what
     assert "stranger" in error.where
 
 
@@ -279,7 +279,10 @@ def test_the_names_of_the_core_are_those_that_it_uses():
             "rows contain indices outside 0 to 39",
         ),
         (Edit(values={"means": Rows(torch.zeros(3), torch.ones(40).bool())}), "rows are [40] of"),
-        (Edit(source=torch.arange(3), fresh=torch.ones(4).bool()), "fresh has 4 rows of 3"),
+        (
+            Edit(source=torch.arange(3), fresh=torch.ones(4).bool()),
+            "fresh has 4 rows, but there are 3",
+        ),
         (Edit(values={"mean": Rows(torch.zeros(40, 3))}), "no tensor 'mean'"),
         (Edit(values={"means": Rows(torch.zeros(40, 2))}), "[40, 2], not [40, 3]"),
         (Edit(values={"means": Rows(torch.zeros(39, 3))}), "[39, 3], not [40, 3]"),
@@ -491,7 +494,7 @@ def test_groups_of_any_labels_are_counted_in_words():
     setup = setup_of({"sampler": build("samplers", "near-far", {})})
     names = {**setup.selection.names, "grouping": "odd"}
     selection = replace(setup.selection, names=names, labels=(0, 1, 2))
-    assert "gives 3: 0, 1, 2" in " ".join(objections_to(selection))
+    assert "makes 3: 0, 1, 2" in " ".join(objections_to(selection))
 
 
 def test_groups_are_named_by_their_kind_whatever_blocks_are_called():
