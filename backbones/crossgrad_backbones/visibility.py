@@ -8,9 +8,9 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera
 
 #: A centre counts as seen if it is inside the image enlarged by this share of its size on each
-#: side,
+#: side.
 MARGIN = 0.15
-#: and if it is farther from the camera than this, in local units (the rasterizers' default).
+#: Minimum distance of a seen centre from the camera, in local units (the rasterizers' default).
 NEAR = 1e-3
 
 

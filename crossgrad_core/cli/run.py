@@ -79,8 +79,8 @@ def _own(
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
-#: Options that are not settings: shown before the settings, after the first result setting, and
-#: last.
+#: Options that are not settings. The help shows them before the settings, after the first setting
+#: of the results, or last.
 _FRONT: Final = (
     _own(
         "config",

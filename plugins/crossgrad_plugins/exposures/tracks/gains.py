@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 #: Minimum number of usable observations for the gain of a photo.
 LEAST = 8
-#: The rule by which photos differ in exposure: minimum standard deviation of the gains in stops,
-#: minimum ratio of that deviation to its own standard error, and minimum share of the deviation of
-#: observations from their points that the gains remove. Results: docs/exposure.md.
+#: Photos count as differing in exposure if three conditions hold. The standard deviation of the
+#: gains is at least the first value, in stops. It is at least this many times its own standard
+#: error. The gains reduce the deviation of observations by at least this share (docs/exposure.md).
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
 #: If there are at least this many photos, the photo farthest from the mean is ignored, because all
 #: its points may be on an object that the other photos hide.
