@@ -272,8 +272,8 @@ class RunConfig(BaseModel):
     decided: dict[str, str] = Field({}, description="decisions of the recipe -> their reasons")
     plan: Annotated[Literal["auto", "off"], Flag("auto|off", CONFIGURATION, common=True)] = Field(
         "auto",
-        description="auto: leave out components that the scene does not need, and print the "
-        "evidence; your own settings have priority. Default: auto.",
+        description="auto: leave out components that the scene does not need, unless you set "
+        "them. Default: auto.",
     )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",

@@ -106,7 +106,7 @@ _RESUMING: Final = (
         Path | None,
         "--resume",
         metavar="RUN",
-        help="Continue the stopped run in this folder; the result has the same bits.",
+        help="Continue the stopped run in this folder, with bitwise equal results.",
     ),
     _own(
         "accept_scene",
