@@ -184,7 +184,9 @@ def _of_the_best(comparison: Comparison) -> list[Sentence]:
     ahead = [c for c in groups[Verdict.DIFFERENT] if c.favours == leader]
     behind = [c for c in groups[Verdict.DIFFERENT] if c.favours != leader]
     support = f"better than {_against(ahead)}" if ahead else _NONE_BEATEN
-    found = [Sentence(f"{leader} {'has the best mean' if behind else 'ends best'}", support)]
+    found = [
+        Sentence(f"{leader} {'has the best mean' if behind else 'is best at the end'}", support)
+    ]
     if behind:
         found.append(Sentence(f"It is worse than {_against(behind)}", "pair by pair"))
     for verdict, words in (

@@ -46,7 +46,7 @@ def length(evidence: Evidence) -> Finding:
     views = views_of_steps(evidence).paced(DEFAULT_STEPS).views(DEFAULT_STEPS)
     if seconds is None and most >= views:
         return plain.found(shown, decided=True, figures={"views": most})
-    saved = f"the rest of {usual}"
+    saved = f"the remaining part of {usual}"
     if seconds is None:
         saved = f"{1.0 - most / views:.0%} of the views of {usual}"
     because = f"more than {most // photos:,} views of each photo gain little"

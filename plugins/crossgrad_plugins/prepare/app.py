@@ -174,7 +174,7 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     matching.check_gps(plan)
     with disk_errors(layout.work):
         layout.work.mkdir(parents=True, exist_ok=True)
-    with locked(scene, "preparing"), resume_hint("the same command goes on where this one ended"):
+    with locked(scene, "preparing"), resume_hint("run the same command again to continue"):
         clear_leftovers(layout)
         clear_damaged(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))

@@ -9,7 +9,7 @@ from crossgrad_core.commands import UserError, announce, argument, command_of, o
 
 _WHAT = "Runs"
 _WHERE = "Execution"
-_SHOW = "Information only"
+_SHOW = "Options that start no run"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ def test_an_arm_that_leads_only_by_the_mean_is_not_reported_as_winner(tmp_path):
     assert first.claim == "views=1 has the best mean"
     assert first.support.startswith("better than views=4 by 1.99 dB (+1.9")
     assert second.claim.startswith("It is worse than views=2 by 0.31 dB (-0.3")
-    assert not any("ends best" in each.claim for each in (first, second))
+    assert not any("is best at the end" in each.claim for each in (first, second))
 
 
 def test_different_lengths_of_arms_are_reported(tmp_path):
