@@ -6,7 +6,7 @@ from crossgrad_plugins.compare.options import Command
 
 @command_of(Command)
 def compare(options: Command) -> None:
-    """Compare runs: quality differences with confidence intervals, and costs.
+    """Compare runs: quality with confidence intervals, and costs.
 
     Groups runs into arms by the settings that differ, pairs them by scene and seed, and writes one
     page, figures for a paper and CSV tables. Runs that cannot be compared are refused.

@@ -81,7 +81,7 @@ class Given:
 
 @command_of(Given)
 def diagnose(given: Given) -> None:
-    """Measure a scene: camera regimes, gradient conflict and gradient variance.
+    """Measure camera regimes, gradient conflict and gradient variance.
 
     Trains a short vanilla run, or uses the run of --run. Then it measures the gradients of single
     views at fixed parameters, and writes CSV files and a figure. The variance is split into the

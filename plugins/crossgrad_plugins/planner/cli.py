@@ -51,7 +51,7 @@ class Options:
 
 @command_of(Options)
 def plan(given: Options) -> None:
-    """Decide which components a run on a scene needs, and show the evidence.
+    """Decide which components a run needs, and show the evidence.
 
     Reads cameras, photos, SfM points and tracks; trains only with --probe. A table shows each
     decision, its evidence, what it saves, and the option that overrides it. If evidence is missing,

@@ -81,7 +81,7 @@ class Options:
 
 @command_of(Options)
 def prepare(given: Options) -> None:
-    """Estimate the camera poses of photos and make a scene for `crossgrad run`.
+    """Estimate camera poses of photos and make a scene for training.
 
     The command finds features, matches and poses, and writes undistorted photos. If photos have
     GPS, it also georeferences the scene. A report (report.md, report.png) lists the photos in the

@@ -80,7 +80,7 @@ class Options:
 
 @command_of(Options)
 def sweep(given: Options) -> None:
-    """Run a grid of configurations, scenes and seeds; the same command resumes it.
+    """Run a grid of configurations, scenes and seeds, or resume it.
 
     Every run is a run of `crossgrad run` in its own folder. The name of the folder is a hash of
     configuration, scene and seed, so that finished runs are never repeated.
