@@ -321,7 +321,9 @@ def read_scene(config: "RunConfig") -> "tuple[Scene, str]":
 
     configure_threads(config.threads)
     if config.scene is None:
-        raise UserError("no scene is named", where="scene", todo="name its folder")
+        raise UserError(
+            "the command needs a scene", where="scene", todo="name the folder of a scene"
+        )
     return assembling.read_and_check(config, config.scene)
 
 

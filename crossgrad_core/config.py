@@ -49,7 +49,7 @@ class ComponentChoice(BaseModel):
     def _choice(cls, value: object) -> object:
         if isinstance(value, Mapping | ComponentChoice):
             return value
-        raise ValueError("the name of a component, or a mapping with its name and options")
+        raise ValueError("must be the name of a component, or a mapping with its name and options")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -71,151 +71,164 @@ class RunConfig(BaseModel):
         "scene.",
     )
     out: Annotated[Path | None, Flag("DIR", RESULTS, common=True)] = Field(
-        None, description="Output folder, a new or an empty one. Default: below runs/."
+        None, description="Output folder, new or empty. Default: a folder below runs/."
     )
 
     backbone: Annotated[ComponentChoice, Flag("NAME", PARTS, common=True)] = Field(
         ComponentChoice(name=defaults.BACKBONE),
-        description=f"What is trained. Default: {defaults.BACKBONE}.",
+        description=f"Scene representation to train. Default: {defaults.BACKBONE}.",
     )
     sampler: Annotated[ComponentChoice, Flag("NAME", PARTS, common=True)] = Field(
         ComponentChoice(name=defaults.SAMPLER),
-        description=f"Which views a step renders. Default: {defaults.SAMPLER}.",
+        description=f"Chooses the views of each step. Default: {defaults.SAMPLER}.",
     )
     grouping: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
-        None, description="How views are labelled near or far. Default: auto."
+        None, description="Assigns views to groups, such as near and far. Default: auto."
     )
     operator: Annotated[
         ComponentChoice | tuple[ComponentChoice, ...], Flag("NAME[+NAME]", PARTS, common=True)
     ] = Field(
         ComponentChoice(name=defaults.OPERATOR),
-        description="How the views' gradients become one; a chain is written "
+        description="Combines the views' gradients into one; write a chain as "
         f"{defaults.EXAMPLE_CHAIN}. Default: {defaults.OPERATOR}.",
     )
     densifier: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
-        description=f"How primitives are added and removed; {defaults.NO_DENSIFIER} keeps them. "
+        description=f"Adds and removes Gaussians; {defaults.NO_DENSIFIER} keeps their number. "
         "Default: auto.",
     )
     rasterizer: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
-        description="What draws. Default: auto, the fastest one for the device.",
+        description="Renders the views. Default: auto, the fastest one for the device.",
     )
     loss: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.LOSS),
-        description=f"How far a render is from its photo. Default: {defaults.LOSS}.",
+        description=f"Measures the difference between render and photo. Default: {defaults.LOSS}.",
     )
     exposure: Annotated[ComponentChoice | None, Flag("NAME", PARTS, common=True)] = Field(
         None,
-        description="What cameras do to light between render and photo. Default: auto.",
+        description="Models brightness and colour differences between photos. Default: auto.",
     )
     exposure_from: Annotated[Path | None, Flag("FILE", TRAINING)] = Field(
         None,
-        description="exposure.json of another run on these photos: the exposure starts from its "
+        description="exposure.json of another run on the same photos; training starts from its "
         "values.",
     )
     initializer: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
         None,
-        description="What is added to the points that a run starts from. Default: auto.",
+        description="Adds points to the points that a run starts from. Default: auto.",
     )
     resolution: Annotated[ComponentChoice | None, Flag("NAME", PARTS)] = Field(
-        None, description="At which scale a step renders its views. Default: auto."
+        None, description="Chooses the resolution of the rendered views. Default: auto."
     )
     exporter: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=defaults.EXPORTER),
-        description=f"What writes the trained scene to a file. Default: {defaults.EXPORTER}.",
+        description=f"Writes the trained scene to a file. Default: {defaults.EXPORTER}.",
     )
     reader: Annotated[ComponentChoice, Flag("NAME", PARTS)] = Field(
         ComponentChoice(name=AUTO),
-        description="What reads the scene. Default: auto, the one that accepts the folder.",
+        description="Reads the scene. Default: auto, the reader that detects the format of the "
+        "folder.",
     )
     metrics: Annotated[tuple[ComponentChoice, ...], Flag("NAME", PARTS)] = Field(
         tuple(ComponentChoice(name=name) for name in defaults.METRICS.split("+")),
-        description="Adds a figure that is measured of held-out views, repeatable. "
-        f"Default: {', '.join(defaults.METRICS.split('+'))}.",
+        description="Adds a metric, which is computed on held-out views. Repeatable. Default: "
+        f"{', '.join(defaults.METRICS.split('+'))}.",
     )
     observers: Annotated[tuple[ComponentChoice, ...], Flag("NAME", PARTS, "observe")] = Field(
-        (), description="Adds an observer, repeatable."
+        (), description="Adds an observer. Repeatable."
     )
 
     views_per_step: Annotated[int | str | None, Flag("K", TRAINING, "views")] = Field(
         None,
-        description="Views per step, K; 1..2@0.5 changes it after that share of the steps. "
+        description="Number of views per step, K; 1..2@0.5 changes it after half of the steps. "
         "Default: auto.",
     )
     steps: Annotated[int | None, Flag("N", TRAINING, common=True)] = Field(
-        None, ge=1, description="Optimizer steps; schedules stretch with them. Default: 30000."
+        None,
+        ge=1,
+        description="Number of optimizer steps; schedules scale with it. Default: 30000.",
     )
     max_views: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None,
         ge=1,
-        description="Length of the run in views: as many steps as draw them. With --seconds the "
-        "shorter of both.",
+        description="Length of the run in rendered views. With --seconds, the run ends at the "
+        "limit that it reaches first.",
     )
     seconds: Annotated[float | None, Flag("S", TRAINING, common=True)] = Field(
-        None, gt=0, description="Training seconds; the number of steps follows the clock."
+        None, gt=0, description="Training time in seconds; it determines the number of steps."
     )
     clock: Annotated[Literal["wall", "cpu"], Flag("wall|cpu", TRAINING)] = Field(
         "wall",
-        description="What --seconds counts: the clock on the wall, or CPU time of the process, "
-        "with --threads 1 where a machine is not quiet. Default: wall.",
+        description="Clock of --seconds: wall time, or CPU time of the process; cpu needs "
+        "--threads 1 and suits a busy machine. Default: wall.",
     )
     revisions: tuple[tuple[PositiveInt, PositiveInt], ...] = Field(
-        (), description="(step, steps in all from there on) of a run that followed the clock"
+        (),
+        description="(step, planned number of steps from that step on) of a run with a time budget",
     )
     revised: tuple[dict[str, int | float | str], ...] = Field(
-        (), description="the settings that changed with each of these"
+        (), description="settings that changed with each of these plans"
     )
     planned_seconds: float | None = Field(
-        None, gt=0, description="the seconds that a run with a time budget was given"
+        None, gt=0, description="seconds of a run with a time budget"
     )
     planned_views: int | None = Field(
-        None, ge=1, description="the views that it was given at most within these seconds"
+        None, ge=1, description="maximum number of views within these seconds"
     )
     seed: Annotated[int, Flag("N", TRAINING, common=True)] = Field(
-        0, ge=0, description="Seed of every random number. Default: 0."
+        0, ge=0, description="Seed of all random numbers. Default: 0."
     )
     schedule: Annotated[ScheduleMode, Flag("scaled|absolute", TRAINING)] = Field(
         "scaled",
-        description="Stretch the published schedule to the run, or keep its numbers. "
-        "Default: scaled.",
+        description="scaled: scale the published schedule to the length of the run; absolute: "
+        "keep its step numbers. Default: scaled.",
     )
     schedule_length: Annotated[int | None, Flag("N", TRAINING)] = Field(
         None,
         ge=1,
-        description="With --schedule absolute: have the schedule of a run of that length. "
+        description="With --schedule absolute: use the schedule of a run of this length. "
         "Default: 30000.",
     )
     schedule_unit: Annotated[Unit | None, Flag("views|steps", TRAINING)] = Field(
         None,
-        description="What schedules count. Default: auto.",
+        description="Unit of the schedules: steps or views. Default: auto.",
     )
     densify_from: int | None = Field(
-        None, ge=0, description="density control after this, counted in --schedule-unit ..."
+        None, ge=0, description="first step of density control, in units of --schedule-unit"
     )
-    densify_until: int | None = Field(None, ge=0, description="... and before this")
-    densify_every: int | None = Field(None, ge=1, description="interval of its edits, likewise")
+    densify_until: int | None = Field(
+        None, ge=0, description="last step of density control, in units of --schedule-unit"
+    )
+    densify_every: int | None = Field(
+        None, ge=1, description="interval between edits, in units of --schedule-unit"
+    )
     min_refinements: int | None = Field(
         None,
         ge=0,
-        description="edits that any run has, for which warm-up and interval are shortened",
+        description="minimum number of edits; short runs start earlier and edit more often to "
+        "reach it",
     )
     reset_every: int | None = Field(
         None,
         ge=0,
-        description="interval of opacity resets, counted in --schedule-unit; 0 for no resets",
+        description="interval between opacity resets, in units of --schedule-unit; 0 turns "
+        "resets off",
     )
     sh_from: int | None = Field(
-        None, ge=0, le=3, description="SH degree at the first step; that of an --init file, else 0"
+        None,
+        ge=0,
+        le=3,
+        description="SH degree at the first step; default 0, or the degree of an --init file",
     )
     sh_start: float | None = Field(
-        None, ge=0, le=1, description="share of the run before the SH degree grows"
+        None, ge=0, le=1, description="share of the run before the SH degree increases"
     )
     densify_views: Annotated[Literal["all", "one", "extra"], Flag("all|one|extra", TRAINING)] = (
         Field(
             "all",
-            description="Whose statistics density control gets: of all views of a step, of one of "
-            "them, or of all and an extra one that trains nothing. Default: all.",
+            description="Views whose statistics density control uses: all views of a step, only "
+            "one of them, or all plus one extra view that is not trained on. Default: all.",
         )
     )
     rate_factor: Annotated[float | None, Flag("F", TRAINING)] = Field(
@@ -228,41 +241,44 @@ class RunConfig(BaseModel):
         None,
         ge=0.9,
         lt=1,
-        description="decay of Adam's second moment; if it is set, rates are those of runs that "
-        "show photos often",
+        description="decay of Adam's second moment; if it is set, the learning rates for many "
+        "passes over the photos are used",
     )
     few_pass_rates: bool | None = Field(
-        None, description="blocks learn at the rates for runs that show each photo a few times"
+        None, description="blocks that use the learning rates for few passes over the photos"
     )
     step_order: Literal["optimize-first", "densify-first"] | None = Field(
-        None, description="optimizer before density control, or after it as published"
+        None,
+        description="order of the optimizer and density control in a step; the published order "
+        "is density control first",
     )
     position_lr: Annotated[
         Literal["extent", "per-axis"] | None, Flag("extent|per-axis", TRAINING)
     ] = Field(
         None,
-        description="How far positions step: by a share of the scene's extent, as published, "
-        "or along the axes of each Gaussian, by a share of their lengths. Default: auto.",
+        description="Size of position steps: a share of the scene extent, as published, or a "
+        "share of each Gaussian's axis lengths. Default: auto.",
     )
     batch_rule: Annotated[Literal["none", "sqrt"], Flag("none|sqrt", TRAINING)] = Field(
         "none",
-        description="sqrt: with K views per step learning rates times sqrt(K), and Adam averages "
-        "over as many views as with one. Default: none.",
+        description="sqrt: with K views per step, multiply learning rates by sqrt(K) and let "
+        "Adam average over the same number of views as with K = 1. Default: none.",
     )
     recipe: Annotated[ComponentChoice, Flag("NAME", CONFIGURATION, common=True)] = Field(
         ComponentChoice(name=defaults.RECIPE),
-        description="Decides all settings that are not set; `crossgrad recipes` lists them. "
-        f"Default: {defaults.RECIPE}.",
+        description="Chooses every setting that you do not set; `crossgrad recipes` lists the "
+        f"recipes. Default: {defaults.RECIPE}.",
     )
-    decided: dict[str, str] = Field({}, description="what the recipe decided -> why")
+    decided: dict[str, str] = Field({}, description="decisions of the recipe -> their reasons")
     plan: Annotated[Literal["auto", "off"], Flag("auto|off", CONFIGURATION, common=True)] = Field(
         "auto",
-        description="auto: leaves out what the scene does not need, on evidence that is shown; "
-        "what is set here wins. Default: auto.",
+        description="auto: leave out components that the scene does not need, unless you set "
+        "them. Default: auto.",
     )
     backward: Annotated[Literal["separate", "joint"], Flag("separate|joint", TRAINING)] = Field(
         "separate",
-        description="One backward pass per view, or one for all views. Default: separate.",
+        description="One backward pass per view, or one joint pass for all views. Default: "
+        "separate.",
     )
     rules: Annotated[
         dict[str, dict[str, Any] | Literal[False]],
@@ -270,33 +286,34 @@ class RunConfig(BaseModel):
         Flag("NAME", TRAINING, "no_rule"),
     ] = Field(
         {},
-        description="--rule adds a rule that acts during training, --no-rule leaves one out, both "
-        "repeatable. Default: auto.",
+        description="--rule adds a training rule, --no-rule removes a rule. Repeatable. Default: "
+        "auto.",
     )
     device: Annotated[str, Flag("auto|cpu|cuda|cuda:N", MACHINE, common=True)] = Field(
         AUTO,
-        description="Where tensors live; auto: on a GPU if a rasterizer for it works, else on the "
+        description="Device of the tensors; auto: a GPU if a rasterizer works on it, else the "
         "CPU. Default: auto.",
     )
     threads: Annotated[int | None, Flag("N", MACHINE)] = Field(
-        None, ge=1, description="CPU threads. Default: all there are."
+        None, ge=1, description="Number of CPU threads. Default: all."
     )
     data: SceneOptions = SceneOptions()
     background: Annotated[str, Flag("COLOR", TRAINING)] = Field(
         "black",
-        description="black, white, random or r,g,b with numbers from 0 to 1. Default: black.",
+        description="Background colour: black, white, random, or r,g,b with numbers from 0 to 1. "
+        "Default: black.",
     )
     max_gaussians: Annotated[
         NonNegativeInt | Literal["auto"] | None, Flag("N|auto", TRAINING, common=True)
     ] = Field(
         None,
-        description="At most N primitives, 0 for no bound; auto: as suits the length of the run. "
-        "Default: auto.",
+        description="Maximum number of Gaussians, 0 for no limit; auto: depends on the length of "
+        "the run. Default: auto.",
     )
     growth: Annotated[Growth | None, Flag("unbounded|budget", TRAINING)] = Field(
         None,
-        description="Growth up to --max-gaussians: unbounded, or along a budget that reaches it "
-        "with the last edit. Default: auto.",
+        description="Growth up to --max-gaussians: unbounded, or along a budget that reaches the "
+        "limit at the last edit. Default: auto.",
     )
     eval_every: Annotated[int | None, Flag("N", RESULTS)] = Field(
         None,
@@ -308,10 +325,12 @@ class RunConfig(BaseModel):
         None, ge=1, description="Steps between checkpoints. Default: a fifth of the run."
     )
     stop_after: Annotated[int | None, Flag("STEP", RESULTS)] = Field(
-        None, ge=1, description="Stops after this step with a checkpoint; --resume continues."
+        None, ge=1, description="Stop after this step and write a checkpoint; --resume continues."
     )
     max_nonfinite_blocks: int = Field(
-        100, ge=1, description="stop after so many blocks were dropped as non-finite"
+        100,
+        ge=1,
+        description="stop the run after this many blocks were dropped because they were not finite",
     )
 
     @model_validator(mode="before")
@@ -332,7 +351,10 @@ class RunConfig(BaseModel):
         names = [choice.name for choice in value]
         twice = dict.fromkeys(name for name in names if names.count(name) > 1)
         if twice:
-            raise ValueError(f"each one once, with all its options; {', '.join(twice)} comes twice")
+            raise ValueError(
+                f"must name each component once, with all its options; {', '.join(twice)} is "
+                "named twice"
+            )
         return value
 
     @field_validator("rules", mode="before")

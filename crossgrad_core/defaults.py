@@ -5,32 +5,32 @@ No other file of the core names a plugin.
 
 from typing import Final
 
-#: The component of a slot if the user names none.
+#: Default component of each slot.
 BACKBONE: Final = "vanilla"
 SAMPLER: Final = "epoch"
 OPERATOR: Final = "sum"
 LOSS: Final = "l1-ssim"
-#: The initializer of published runs, and of runs whose points come from a file: it adds nothing.
+#: Initializer that adds no points, for published runs and for runs whose points come from a file.
 PLAIN_INITIALIZER: Final = "points"
-#: The initializer that finds points for a scene without any; messages name it.
+#: Initializer that finds points for a scene without points; messages name it.
 INITIALIZER_WITHOUT_POINTS: Final = "triangulated"
 RESOLUTION: Final = "full"
-#: Also reads the file of `--init FILE.ply`.
+#: The exporter also reads the file of `--init FILE.ply`.
 EXPORTER: Final = "ply"
 METRICS: Final = "psnr+ssim+ssim-skimage+psnr-track+psnr-cc+lpips"
-#: The densifier of a backbone that names none.
+#: Densifier for a backbone that names no default.
 DENSIFIER: Final = "adc"
-#: The reader whose error says what is missing if no reader accepts a folder.
+#: If no reader accepts a folder, the error message of this reader explains what is missing.
 READER: Final = "colmap"
-#: The reader of `--prepare`, which finds the cameras of a folder of photos.
+#: Reader of `--prepare`, which estimates the camera poses of a folder of photos.
 PREPARING_READER: Final = "photos-alone"
-#: The operator that runs the links of `--operator a+b`.
+#: Operator that runs the operators of a chain, `--operator a+b`.
 CHAIN: Final = "chain"
-#: The recipe that decides what the user does not set.
+#: Recipe that decides the settings that the user does not set.
 RECIPE: Final = "auto"
-#: The planner of `--plan`.
+#: Planner of `--plan`.
 PLANNER: Final = "scene"
-#: The observer of every run.
+#: Observer of every run.
 PROGRESS: Final = "progress"
 
 #: The rasterizer of contract checks, and the densifier that makes no edits.

@@ -5,7 +5,8 @@ from typing import Final
 
 from crossgrad_core.wording import one_line, showable
 
-#: Longest part and longest place of a message; the middle of a longer text is left out.
+#: Maximum length of one part of a message, and of its `where`; the middle of a longer text is left
+#: out.
 LONGEST: Final = 500
 LONGEST_PLACE: Final = 1000
 
@@ -68,4 +69,4 @@ class RunFailedError(Exception):
 
     def __init__(self, folder: Path, error: str) -> None:
         self.folder = folder
-        super().__init__(f"{error}\nwhat there is is kept in {folder}")
+        super().__init__(f"{error}\nthe files that the run wrote are in {folder}")

@@ -25,10 +25,9 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Least distance, local units: a camera at the mean centre has no logarithmic distance.
+#: Minimum distance in local units, because a camera at the mean centre has no logarithmic distance.
 NEAREST = 1e-3
-#: If the logarithms of all distances have a smaller standard deviation, all distances count as
-#: equal.
+#: All distances count as equal if the standard deviation of their logarithms is below this value.
 LEAST_SPREAD = 1e-6
 
 
@@ -141,22 +140,29 @@ class DistanceConditioned(Vanilla):
     passthrough: ClassVar[Mapping[str, str]] = {"sh_rest": "f_rest"}
     axes: ClassVar[tuple[str, str] | tuple[()]] = Vanilla.axes
 
-    condition_scales: bool = Field(True, description="scales depend on the distance")
-    condition_opacities: bool = Field(True, description="opacities depend on the distance")
-    condition_colors: bool = Field(True, description="SH band 0 depends on the distance")
+    condition_scales: bool = Field(True, description="whether scales depend on the distance")
+    condition_opacities: bool = Field(True, description="whether opacities depend on the distance")
+    condition_colors: bool = Field(True, description="whether SH band 0 depends on the distance")
     lr_share: float = Field(
-        0.1, gt=0, description="learning rates of the weights, shares of those of what they add to"
+        0.1,
+        gt=0,
+        description="learning rates of the weights, as shares of the learning rates of the "
+        "tensors that they modify",
     )
-    l2_weight: float = Field(0.01, ge=0, description="final weight of the squared weights' mean")
+    l2_weight: float = Field(
+        0.01, ge=0, description="final weight of the mean squared weight in the loss"
+    )
     smoothness_weight: float = Field(
-        0.01, ge=0, description="final weight of the squared derivative by the log distance"
+        0.01,
+        ge=0,
+        description="final weight of the mean squared derivative by the log distance in the loss",
     )
 
     @override
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         if self._conditioned():
             return super().unused_options(selection)
-        why = "nothing depends on the distance (condition_* = false); leave it out"
+        why = "nothing depends on the distance (condition_* = false); leave the option out"
         names = ("lr_share", "l2_weight", "smoothness_weight")
         return {**super().unused_options(selection), **dict.fromkeys(names, why)}
 

@@ -89,7 +89,7 @@ class _Smoothed(torch.autograd.Function):
         kept = scales.div_(smooth)
         opacities = sigmoid(logits)
         drawn = opacities * kept.prod(1)
-        # In place: at this size, new memory costs more than the arithmetic.
+        # Compute in place, because at this size new memory costs more than the arithmetic.
         shares = kept.square_(), filters.div_(smooth).square_()
         ctx.save_for_backward(smooth, *shares, opacities, drawn)
         return smooth, drawn
@@ -135,7 +135,7 @@ class MipSplatting(Vanilla):
 
     near: float = Field(NEAR, gt=0, description="near plane of the filter, local units")
     parity: bool = Field(
-        False, description="one focal length, the longest, for all cameras, as published"
+        False, description="use the longest focal length for all cameras, as published"
     )
 
     @override

@@ -137,39 +137,51 @@ class Octree(AnchorBackbone):
 
     default_densifier: ClassVar[str] = "octree"
 
-    fork: int = Field(2, ge=2, le=8, description="cells of the next level along an edge")
+    fork: int = Field(2, ge=2, le=8, description="number of cells of the next level along an edge")
     dist_ratio: float = Field(
-        0.999, gt=0.5, le=1, description="quantile of distances that counts as the largest"
+        0.999,
+        gt=0.5,
+        le=1,
+        description="quantile of the distances that is used as the largest distance",
     )
     base_layer: int = Field(
-        -1, ge=-1, le=40, description="halvings of the scene's cube to the root cell; -1: automatic"
+        -1,
+        ge=-1,
+        le=40,
+        description="number of halvings from the scene's cube to the root cell; -1: automatic",
     )
     middle_cell: float | None = Field(
         None,
         gt=0,
-        description="cell below the middle level where base_layer is -1, extents; "
-        "None: the root cell is four median distances between points",
+        description="edge of the cells below the middle level if base_layer is -1, extents; "
+        "null: the root cell is four median point distances",
     )
     plant_everywhere: bool = Field(
-        default=False, description="start with anchors that repeat one of the coarser level, too"
+        default=False,
+        description="also create initial anchors that coincide with an anchor of the coarser level",
     )
     init_level: int = Field(
-        -1, ge=-1, description="finest level trained at first; -1: the middle one"
+        -1, ge=-1, description="finest level that is trained at first; -1: the middle one"
     )
     visible_threshold: float = Field(
-        0.01, ge=-1, lt=1, description="share of cameras that must see an anchor; -1: the mean"
+        0.01,
+        ge=-1,
+        lt=1,
+        description="share of the cameras that must see an anchor; -1: the mean share",
     )
-    rounding: Rounding = Field("round", description="how L* becomes a level")
+    rounding: Rounding = Field("round", description="rounding of L* to a level")
     progressive: bool = Field(default=True, description="open the fine levels one after the other")
-    coarse_factor: float = Field(1.5, ge=1, description="each opening comes faster by this factor")
+    coarse_factor: float = Field(
+        1.5, ge=1, description="factor by which the interval between openings shrinks"
+    )
 
     @override
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         idle = dict(super().unused_options(selection))
         if self.base_layer >= 0:
-            idle["middle_cell"] = "base_layer sets the cells; leave one of the two out"
+            idle["middle_cell"] = "base_layer sets the cells; leave out one of the two options"
         if not self.progressive:
-            why = "all levels are open at once (progressive = false); leave it out"
+            why = "all levels are open from the start (progressive = false); leave the option out"
             idle |= {"init_level": why, "coarse_factor": why}
         return idle
 
@@ -189,8 +201,8 @@ class Octree(AnchorBackbone):
         if self.plant_everywhere:
             return self, ()
         note = (
-            "anchors that would repeat one of a coarser level are left out; "
-            "--set backbone.plant_everywhere=true plants them"
+            "anchors that coincide with an anchor of the coarser level are left out; "
+            "--set backbone.plant_everywhere=true keeps them"
         )
         return self, (note,)
 

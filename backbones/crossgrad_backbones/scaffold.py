@@ -17,7 +17,9 @@ class Scaffold(AnchorBackbone):
     """Anchors in the voxels that contain SfM points; a camera uses all anchors in its frustum."""
 
     voxel_size: float | None = Field(
-        None, gt=0, description="edge of a voxel, extents; None: twice the points' median distance"
+        None,
+        gt=0,
+        description="edge of a voxel, extents; null: twice the median distance between points",
     )
 
     @override

@@ -38,10 +38,14 @@ class Vanilla(Backbone):
     positions: ClassVar[str] = "means"
     axes: ClassVar[tuple[str, str] | tuple[()]] = ("scales", "quats")
 
-    initial_opacity: float = Field(0.1, gt=0.0, lt=1.0, description="of a Gaussian of a point")
+    initial_opacity: float = Field(0.1, gt=0.0, lt=1.0, description="initial opacity of a Gaussian")
     sh_degree: int = Field(3, ge=0, le=3, description="highest spherical-harmonics degree")
-    lr_means: float = Field(1.6e-4, gt=0, description="initial, per scene extent")
-    lr_means_final: float = Field(1.6e-6, gt=0, description="final, per scene extent")
+    lr_means: float = Field(
+        1.6e-4, gt=0, description="initial learning rate of the positions, per scene extent"
+    )
+    lr_means_final: float = Field(
+        1.6e-6, gt=0, description="final learning rate of the positions, per scene extent"
+    )
     lr_scales: float = Field(5e-3, ge=0, description="learning rate of the log scales")
     lr_quats: float = Field(1e-3, ge=0, description="learning rate of the rotations")
     lr_opacities: float = Field(0.05, ge=0, description="learning rate of the opacity logits")
@@ -52,7 +56,7 @@ class Vanilla(Backbone):
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.sh_degree > 0:
             return {}
-        return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave it out"}
+        return {"lr_f_rest": "there are no higher SH bands (sh_degree = 0); leave the option out"}
 
     @override
     def blocks(self) -> tuple[Block, ...]:
@@ -70,7 +74,7 @@ class Vanilla(Backbone):
         return (*rows, rest)
 
     def _scales_lr(self) -> LearningRate:
-        # Measured for crossgrad (docs/schedules.md).
+        # Value measured for crossgrad (docs/schedules.md).
         return LearningRate(self.lr_scales, few_passes=2.0)
 
     def _means_lr(self) -> LearningRate:
@@ -90,9 +94,9 @@ class Vanilla(Backbone):
         if degree == self.sh_degree:
             return self, ()
         note = (
-            f"spherical harmonics limited to degree {degree}: {views} training views give fewer "
-            f"directions than degree {degree + 1} has coefficients ({COEFFICIENTS[degree + 1]}); "
-            "--set backbone.sh_degree=3 forces all bands"
+            f"spherical harmonics are limited to degree {degree}: {views} training views "
+            f"give fewer directions than degree {degree + 1} has coefficients "
+            f"({COEFFICIENTS[degree + 1]}); --set backbone.sh_degree=3 forces all bands"
         )
         return self.model_copy(update={"sh_degree": degree}), (note,)
 
@@ -124,7 +128,10 @@ class Vanilla(Backbone):
     @override
     def adopt(self, gaussians: Gaussians, scene: Scene, rng: np.random.Generator) -> Parameters:
         if gaussians.sh_dc is None:
-            raise ValueError("only spherical-harmonics Gaussians can be adopted")
+            raise ValueError(
+                "only a backbone with spherical-harmonics Gaussians can start from Gaussians "
+                "of a file"
+            )
         opacities = gaussians.opacities.clamp(1e-6, 1.0 - 1e-6)
         tensors = {
             "means": gaussians.means.clone(),

@@ -7,9 +7,10 @@ from torch import Tensor
 
 from crossgrad_core.plugin import Camera
 
-#: A centre counts as seen inside the image and this share of its size beyond each border,
+#: A centre counts as seen if it is inside the image enlarged by this share of its size on each
+#: side.
 MARGIN = 0.15
-#: and only if it is farther from the camera than this, local units: the rasterizers' default.
+#: Minimum distance of a seen centre from the camera, in local units (the rasterizers' default).
 NEAR = 1e-3
 
 

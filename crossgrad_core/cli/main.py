@@ -105,7 +105,8 @@ BAD_INPUT = 2
 app = typer.Typer(
     name="crossgrad",
     cls=WithPlugins,
-    help="Train 3D Gaussian Splatting from hybrid captures, with exchangeable parts.",
+    help="Train 3D Gaussian Splatting from photos of hybrid captures, with "
+    "exchangeable components.",
     epilog=f"Example: crossgrad run SCENE --sampler {GROUP_SAMPLER} --operator {EXAMPLE_OPERATOR}",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -147,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The words after `crossgrad`; `sys.argv[1:]` by default.
     """
-    if arguments is None:  # This process belongs to the command.
+    if arguments is None:  # If this function runs, the process belongs to the command.
         outlast_readers()
     try:
         # Not `app()`, which would replace `sys.excepthook`.

@@ -36,10 +36,10 @@ def refuse_beside_resume(run: Path, given: Mapping[str, object]) -> None:
     typed = list(_typed(given))
     if typed:
         raise UserError(
-            "a resumed run keeps its settings and its scene",
+            "settings and the scene cannot be changed when a run is resumed",
             where=listed(typed),
             expected="--device, --threads, --stop-after, --accept-scene, --accept-plugins, "
-            "--check, -q and -v, and nothing else",
+            "--check, -q and -vonly",
             todo=f"leave {'it' if len(typed) == 1 else 'them'} out to continue {run}, or leave "
             "--resume out to start a new run",
         )
@@ -80,7 +80,8 @@ def _own(
     return _parameter(name, kind, info, default=False if kind is bool else None)
 
 
-#: Options that are not settings: before the settings, after the first result setting, and last.
+#: Options that are not settings. The help shows them before the settings, after the first setting
+#: of the results, or last.
 _FRONT: Final = (
     _own(
         "config",
@@ -88,8 +89,8 @@ _FRONT: Final = (
         "--config",
         heading=CONFIGURATION,
         metavar="FILE",
-        help="YAML file with settings, such as the config.yaml of a run. Options given here "
-        "win over the file.",
+        help="YAML file of settings, such as the config.yaml of a run. Options on the "
+        "command line override the file.",
     ),
     _own(
         "assignments",
@@ -97,8 +98,7 @@ _FRONT: Final = (
         "--set",
         heading=CONFIGURATION,
         metavar="KEY=VALUE",
-        help="One setting, repeatable: operator.c=0.4, rasterizer.max_alpha=0.999. Wins over "
-        "everything else.",
+        help="Set one setting, such as operator.c=0.4. Repeatable. Overrides all other sources.",
     ),
 )
 _RESUMING: Final = (
@@ -107,22 +107,22 @@ _RESUMING: Final = (
         Path | None,
         "--resume",
         metavar="RUN",
-        help="Continues the stopped run in that folder, bit for bit.",
+        help="Continue the stopped run in this folder, with bitwise equal results.",
     ),
     _own(
         "accept_scene",
         bool,
         "--accept-scene",
         common=False,
-        help="Go on although points, poses and photos of the scene contradict each other; with "
-        "--resume, although photos, masks or points have changed.",
+        help="Train although points, poses and photos of the scene do not match. With "
+        "--resume: although photos, masks or points have changed.",
     ),
     _own(
         "accept_plugins",
         bool,
         "--accept-plugins",
         common=False,
-        help="With --resume: go on with other versions of the packages that train the run.",
+        help="With --resume: continue with other versions of the packages that train the run.",
     ),
 )
 _LAST: Final = (
@@ -131,25 +131,25 @@ _LAST: Final = (
         bool,
         "--prepare",
         heading=SCENE,
-        help="SCENE is a folder of photos alone: finds their cameras first, as `crossgrad prepare` "
-        "does, into SCENE-scene.",
+        help="SCENE is a folder of photos without poses: first estimate the poses, as "
+        "`crossgrad prepare` does, into SCENE-scene.",
     ),
     _own(
         "dry_run",
         bool,
         "--dry-run",
-        help="Checks everything and prints the resolved settings; trains nothing. Photos of "
-        "--prepare are prepared.",
+        help="Check everything and print the resolved settings without training. With "
+        "--prepare, the photos are prepared.",
     ),
     _own(
         "check",
         bool,
         "--check",
         common=False,
-        help="Decodes all photos before training, so that no damaged one is found later.",
+        help="Decode all photos before training, to find damaged photos early.",
     ),
-    _own("quiet", bool, "--quiet", "-q", help="Prints errors and the result only."),
-    _own("verbose", bool, "--verbose", "-v", help="Prints every decision and event."),
+    _own("quiet", bool, "--quiet", "-q", help="Print only errors and the result."),
+    _own("verbose", bool, "--verbose", "-v", help="Print every decision and event."),
     _parameter(
         "help_all",
         bool,

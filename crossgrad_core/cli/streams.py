@@ -35,7 +35,7 @@ class _LastingFile(io.FileIO):
         """Write as much as possible, and report that everything was written."""
         try:
             written = super().write(content)
-            if written is None:  # Another process set the terminal to non-blocking.
+            if written is None:  # Another process changed the terminal to non-blocking mode.
                 os.set_blocking(self.fileno(), True)
                 written = super().write(content)
         except OSError:

@@ -13,15 +13,15 @@ Ply = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Evaluate the Gaussians of this PLY instead, drawn on black as viewers draw them.",
+        help="Evaluate the Gaussians of this PLY file instead, rendered on black as viewers do.",
     ),
 ]
 On = Annotated[
     Path | None,
     typer.Option(
         metavar="SCENE",
-        help="Evaluate on another capture of the place, in the same coordinates: on those of its "
-        "views that the run was not trained on.",
+        help="Evaluate on another capture of the same place, in the same coordinates. "
+        "Views that the run was trained on are left out.",
     ),
 ]
 RunFolder = Annotated[
@@ -29,16 +29,19 @@ RunFolder = Annotated[
 ]
 Device = Annotated[
     str | None,
-    typer.Option(metavar="auto|cpu|cuda|cuda:N", help="Where tensors live. Default: the run's."),
+    typer.Option(
+        metavar="auto|cpu|cuda|cuda:N",
+        help="Device of the tensors. Default: the device of the run.",
+    ),
 ]
 Threads = Annotated[
-    int | None, typer.Option(metavar="N", help="CPU threads. Default: all there are.")
+    int | None, typer.Option(metavar="N", help="Number of CPU threads. Default: all.")
 ]
 AcceptScene = Annotated[
     bool,
     typer.Option(
         "--accept-scene",
-        help="Take the scene although photos, masks, points or held-out views have changed.",
+        help="Continue although photos, masks, points or held-out views of the scene have changed.",
     ),
 ]
 
@@ -67,35 +70,36 @@ def export(  # noqa: PLR0913, PLR0917 - one parameter per option of the command 
         typer.Option(
             "--format",
             metavar="NAME",
-            help="File format, an exporter; ply is the usual 3DGS file. Default: the run's.",
+            help="Name of the exporter; ply writes the standard 3DGS file. Default: the "
+            "exporter of the run.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The file to write. Default: RUN/point_cloud.ply."),
+        typer.Option(metavar="FILE", help="Path of the output file. Default: RUN/point_cloud.ply."),
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option(
             metavar="VIEW",
-            help="Bake what depends on the view for this one, into RUN/point_cloud_VIEW.ply. "
-            "Default: mean of the training views.",
+            help="Bake view-dependent values for this view, into RUN/point_cloud_VIEW.ply. "
+            "Default: the mean of the training views.",
         ),
     ] = None,
     coordinates: Annotated[
         str,
         typer.Option(
             metavar="input|local|enu|utm|epsg:N",
-            help="Coordinates of the file: the scene's, those that are trained in, metres east, "
-            "north and up, or projected ones; others than input go into "
-            "RUN/point_cloud_COORDINATES.ply.",
+            help="Coordinates of the file: those of the scene files, those of the training, "
+            "metres east, north and up, or projected coordinates. Except for input, the "
+            "default path is RUN/point_cloud_COORDINATES.ply.",
         ),
     ] = "input",
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
-    """Write the trained scene to a file that viewers open."""
+    """Write the trained scene to a file for viewers."""
     announce()
     from crossgrad_core.run.postprocess import export
     from crossgrad_core.run.postprocess.open_options import How
@@ -116,46 +120,48 @@ class Split(StrEnum):
 
 def render(  # noqa: PLR0913, PLR0917 - one parameter per option of the command line
     run: RunFolder,
-    split: Annotated[
-        Split | None, typer.Option(help="Which views are drawn. Default: test.")
-    ] = None,
+    split: Annotated[Split | None, typer.Option(help="Views to render. Default: test.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where the PNG files go. Default: RUN/renders/<step>."),
+        typer.Option(
+            metavar="DIR", help="Output folder of the PNG files. Default: RUN/renders/<step>."
+        ),
     ] = None,
     on: Annotated[
         Path | None,
         typer.Option(
             metavar="SCENE",
-            help="ViewSample the views of another capture of the place, as eval does.",
+            help="Render the views of another capture of the place, as `crossgrad eval --on` does.",
         ),
     ] = None,
     path: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|zoom",
-            help="Draw a video instead: along the cameras of a file, or from the farthest photos "
-            "down to the nearest.",
+            help="Render a video along the cameras of a file, or a zoom from the farthest to "
+            "the nearest photos.",
         ),
     ] = None,
     frames: Annotated[
         int | None,
-        typer.Option(metavar="N", min=2, max=100_000, help="Frames of a zoom path. Default: 120."),
+        typer.Option(
+            metavar="N", min=2, max=100_000, help="Number of frames of a zoom path. Default: 120."
+        ),
     ] = None,
     device: Device = None,
     threads: Threads = None,
     accept_scene: AcceptScene = False,
 ) -> None:
-    """Draw the views of a run as PNG files."""
-    alone = "a video shows what the cameras of its path see"
+    """Render the views of a run as PNG files."""
+    alone = "a video shows the views of the cameras on its path"
     _check_together(("--on", on), ("--path", path), alone)
     _check_together(("--split", split), ("--path", path), alone)
-    _check_together(("--split", split), ("--on", on), "all views of the other capture are drawn")
+    _check_together(("--split", split), ("--on", on), "all views of the other capture are rendered")
     if frames is not None and path is None:
         raise UserError(
-            "--frames does nothing without --path zoom",
+            "--frames has no effect without --path zoom",
             where="--frames",
-            todo="leave out --frames, or draw a zoom path",
+            todo="leave out --frames, or add --path zoom",
         )
     announce()
     from crossgrad_core.run.postprocess import render
@@ -172,7 +178,7 @@ def _check_together(option: tuple[str, object], other: tuple[str, object], why: 
     """Refuse an option that would have no effect together with another option."""
     if option[1] is not None and other[1] is not None:
         raise UserError(
-            f"{option[0]} does nothing beside {other[0]}: {why}",
+            f"{option[0]} has no effect together with {other[0]}: {why}",
             where=option[0],
             todo=f"leave out {option[0]}, or {other[0]}",
         )

@@ -42,11 +42,13 @@ class LearningRate:
         """
         rates = [rate for rate in (self.initial, self.final) if rate is not None]
         if not all(0.0 <= rate < inf for rate in rates):
-            raise ValueError(f"learning rates are finite and not negative; found {rates}")
+            raise ValueError(f"learning rates must be finite and not negative; found {rates}")
         if self.initial > 0.0 and self.final == 0.0:
-            raise ValueError("a learning rate cannot fade to 0 log-linearly; name a small one")
+            raise ValueError(
+                "a learning rate cannot decay log-linearly to 0; choose a small positive final rate"
+            )
         if not 0.0 < self.few_passes < inf:
-            raise ValueError(f"`few_passes` is a positive number; found {self.few_passes}")
+            raise ValueError(f"`few_passes` must be a positive number; found {self.few_passes}")
 
     @property
     def decays(self) -> bool:
@@ -93,9 +95,13 @@ class Block:
         """
         if self.kind not in get_args(BlockKind):
             kinds = get_args(BlockKind)
-            raise ValueError(f"block {self.name}: the kind {self.kind!r} is none of {kinds}")
+            raise ValueError(
+                f"block {self.name}: the kind must be one of {kinds}; found {self.kind!r}"
+            )
         if not isinstance(self.tensors, tuple) or not isinstance(self.lr, LearningRate):
-            raise TypeError(f"block {self.name}: tensors is a tuple of names, lr a LearningRate")
+            raise TypeError(
+                f"block {self.name}: `tensors` must be a tuple of names, and `lr` a LearningRate"
+            )
 
     @property
     def frozen(self) -> bool:
@@ -138,7 +144,8 @@ class PluginState:
     per_primitive: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "PluginState":
-        # By hand, because the read-only mappings of `EMPTY_STATE` cannot be copied deeply.
+        # Copy the fields one by one, because `deepcopy` fails for the read-only mappings of
+        # `EMPTY_STATE`.
         values = deepcopy(dict(self.values), memo)
         tensors, rows = (deepcopy(dict(part), memo) for part in (self.tensors, self.per_primitive))
         return PluginState(values, tensors, rows)
@@ -237,7 +244,7 @@ def misfit_of(edit: Edit, blocks: tuple[Block, ...], parameters: Mapping[str, Te
     rows = {name for block in blocks if block.per_primitive for name in block.tensors}
     for name, new in edit.values.items():
         if name not in rows:
-            return f"there is no tensor {name!r} with a row for each primitive"
+            return f"there is no tensor {name!r} with one row per Gaussian"
         if wrong := _no_values(new, after, parameters[name].shape[1:]):
             return f"values of {name}: {wrong}"
     return ""
@@ -250,11 +257,11 @@ def _no_set(edit: Edit, before: int) -> str:
         return f"source is {wrong}"
     after = before if source is None else len(source)
     if source is not None and after and not 0 <= int(source.min()) <= int(source.max()) < before:
-        return f"source leaves 0 to {before - 1}"
+        return f"source contains indices outside 0 to {before - 1}"
     if fresh is not None and (wrong := _no_list(fresh, torch.bool)):
         return f"fresh is {wrong}"
     if fresh is not None and len(fresh) != after:
-        return f"fresh has {len(fresh)} rows of {after}"
+        return f"fresh has {len(fresh)} rows, but there are {after} Gaussians"
     return ""
 
 
@@ -275,7 +282,7 @@ def _no_values(new: object, count: int, width: torch.Size) -> str:
             return f"rows are {wrong}"
         # On a GPU this check would wait for the device.
         if new.rows.is_cpu and ((new.rows < 0) | (new.rows >= count)).any():
-            return f"rows leave 0 to {count - 1}"
+            return f"rows contain indices outside 0 to {count - 1}"
         count = len(new.rows)
     shape = (count, *width)
     return "" if _fits(new.values, shape) else f"{list(new.values.shape)}, not {list(shape)}"
@@ -342,7 +349,7 @@ def apply_to_moment(edit: Edit, name: str, old: Tensor) -> Tensor:
     return new
 
 
-#: Added to the root of the second moment (3DGS).
+#: Epsilon that is added to the root of the second moment (3DGS).
 EPS: Final = 1e-15
 #: Decay of the first and of the second moment (3DGS).
 BETAS: Final = (0.9, 0.999)

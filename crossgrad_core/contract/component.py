@@ -71,11 +71,11 @@ def _wrong_answer(component: Component, method: str, expected: str, answer: obje
     own = type(component)
     parts = [type(each).__name__ for each in answer] if isinstance(answer, tuple) else []
     return UserError(
-        f"{own.__name__}.{method} gave a wrong answer",
+        f"{own.__name__}.{method} returned a value of a wrong type",
         where=f"{own.__module__}:{own.__qualname__}.{method}",
         expected=expected,
         found=f"a tuple: {', '.join(parts)}" if parts else type(answer).__name__,
-        todo="repair the plugin, or choose another one",
+        todo="repair the plugin, or choose another component",
     )
 
 

@@ -172,7 +172,7 @@ class RenderOnRequest(Protocol):
 
 def no_renders(*_asked: object, **_named: object) -> RequestedRender:
     """Raise a RuntimeError; this is the default for contexts that cannot render views."""
-    raise RuntimeError("this context belongs to no run: there is nothing to render views with")
+    raise RuntimeError("views cannot be rendered: this context does not belong to a run")
 
 
 #: A view and its render [H, W, 3] -> the image as the camera of the view would have recorded it.
@@ -298,8 +298,9 @@ class AggregateContext(StepContext):
         if isinstance(self.gradients, SeparateGradients):
             return self.gradients
         raise TypeError(
-            "the views' gradients were accumulated and only their sum is known; an operator or "
-            "plugin that looks at single views must say so with `separate = True`"
+            "the gradients of the views were summed during accumulation, so the gradient "
+            "of a single view is not available; an operator or plugin that reads single "
+            "views must declare `separate = True`"
         )
 
 

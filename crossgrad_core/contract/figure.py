@@ -25,7 +25,7 @@ class Figure:
     form: str = ".4f"
     per_regime: bool = False
     definition: str = ""
-    undefined: str = "not defined for these views"
+    undefined: str = "the metric is not defined for these views"
     falls: bool = False
 
     def column(self, regime: str) -> str:

@@ -92,7 +92,7 @@ class Gaussians:
     def misfit(self) -> str | None:
         """Return the first mismatch, such as `colors is [5, 1], not [5, 3]`; None if all fit."""
         if (self.colors is None) == (self.sh_dc is None):
-            return "both or none of colors and sh_dc are given"
+            return "either colors or sh_dc must be given, not both or neither"
         number, rest, degree = len(self), self.sh_rest, self.sh_degree
         degrees = range(1 if rest is None else len(COEFFICIENTS))
         if self.sh_dc is not None and degree not in degrees:

@@ -68,7 +68,7 @@ class GramianOperator(MatrixOperator):
 
     sparse_rows: ClassVar[bool] = True
 
-    granularity: Granularity = Field("block", description="what one Gramian covers")
+    granularity: Granularity = Field("block", description="tensors that one Gramian covers")
 
     def reads_gramians(self) -> bool:
         """Return True if the result depends on the Gramians; if not, granularity has no effect."""
@@ -257,7 +257,7 @@ def _misfit(
 ) -> UserError:
     blocks, views = gramians.shape[:2]
     return UserError(
-        f"operator {type(operator).__name__} gave an array of a wrong shape",
+        f"operator {type(operator).__name__} returned an array of a wrong shape",
         where=f"{blocks} blocks, {views} views",
         expected=f"[{blocks}, {views}] weights, or [{blocks}, R, {views}] matrices",
         found=f"{list(found.shape)}",
@@ -270,7 +270,7 @@ def _not_finite(
 ) -> UserError:
     block = context.blocks[int(np.argmax(~np.isfinite(weights).all(axis=1)))]
     return UserError(
-        f"operator {type(operator).__name__} gave weights that are not finite",
+        f"operator {type(operator).__name__} returned weights that are not finite",
         where=f"block {block}, step {context.step}",
         expected="finite weights for finite gradients",
         todo="use another operator, or report this to the operator's author",

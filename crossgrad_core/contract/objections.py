@@ -44,8 +44,9 @@ def _of_the_sampler(selection: Selection) -> Iterator[str]:
             yield f"sampler {name} needs {sampler.view_counts} (--views); K is {views}"
     if sampler.groups is not None and labels is not None and len(labels) != sampler.groups:
         yield (
-            f"sampler {name} draws from {sampler.groups} groups; grouping "
-            f"{selection.names['grouping']} gives {len(labels)}: {', '.join(map(str, labels))}"
+            f"sampler {name} needs {sampler.groups} groups of views; grouping "
+            f"{selection.names['grouping']} makes {len(labels)}: "
+            f"{', '.join(map(str, labels))}"
         )
 
 
@@ -70,7 +71,7 @@ def _of_the_rasterizer(selection: Selection) -> Iterator[str]:
         yield f"rasterizer {names['rasterizer']} does not run on device {selection.device}"
     if backbone.response not in rasterizer.responses:
         yield (
-            f"rasterizer {names['rasterizer']} does not draw the pixel response "
+            f"rasterizer {names['rasterizer']} does not support the pixel response "
             f"{backbone.response} of backbone {names['backbone']}"
         )
 
@@ -79,8 +80,9 @@ def _of_the_resolution(selection: Selection) -> Iterator[str]:
     backbone, names = selection.backbone, selection.names
     if selection.resolution.strided and backbone.response == "analytic":
         yield (
-            f"resolution {names['resolution']} draws some of the pixels; the pixel response "
-            f"analytic of backbone {names['backbone']} is a mean over all of them"
+            f"resolution {names['resolution']} renders only a part of the pixels, but "
+            f"backbone {names['backbone']} has the pixel response analytic, which is a "
+            "mean over all pixels"
         )
 
 
@@ -88,10 +90,10 @@ def unused_options(component: Component, selection: Selection) -> Mapping[str, s
     """Return the options of a component that would have no effect: name -> reason and remedy."""
     idle: dict[str, str] = {}
     if isinstance(component, GramianOperator) and not component.reads_gramians():
-        idle["granularity"] = "this operator looks at no Gramians; leave it out"
+        idle["granularity"] = "this operator uses no Gramians; leave the option out"
     if isinstance(component, Rasterizer) and selection.backbone.sets_dilation:
         name = selection.names["backbone"]
-        idle["dilation"] = f"backbone {name} has a dilation of its own; leave it out"
+        idle["dilation"] = f"backbone {name} sets its own dilation; leave the option out"
     if isinstance(component, HasUnusedOptions):
         idle |= component.unused_options(selection)
     return idle

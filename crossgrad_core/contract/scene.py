@@ -93,7 +93,7 @@ class Unplaced:
         why: The reason why the location is not known.
     """
 
-    why: str = "neither its files nor its photos tell where on Earth it is"
+    why: str = "neither the scene files nor the photos contain a position on Earth"
 
     @property
     def note(self) -> str:
@@ -107,11 +107,11 @@ class Unplaced:
         if coordinates == LOCAL:
             return Placed(gaussians, Similarity(np.zeros(3), 1.0), {"coordinates": LOCAL})
         raise UserError(
-            "the scene is not georeferenced",
+            "the scene cannot be exported in these coordinates: it is not georeferenced",
             where=f"--coordinates {coordinates}",
             found=self.why,
-            todo="export in input or local coordinates, or see docs/coordinates.md for what tells "
-            "a scene's place",
+            todo="export in input or local coordinates; docs/coordinates.md explains how to "
+            "georeference a scene",
         )
 
 
@@ -127,11 +127,11 @@ def check_coordinates(name: str) -> None:
     """
     if not _KNOWN.fullmatch(name):
         raise UserError(
-            "there are no such coordinates",
+            "the coordinate system is unknown",
             where=f"--coordinates {name}",
             expected="input, local, enu (metres east, north, up), utm, or epsg:N such as "
             "epsg:32633",
-            todo="choose one of these",
+            todo="choose one of the listed systems",
         )
 
 

@@ -21,39 +21,42 @@ class SceneOptions(BaseModel):
         Flag("auto|every|stratified|none", SCENE),
     ] = Field(
         "auto",
-        description="every: hold out each n-th image of each folder; stratified: each n-th of each "
-        "regime; none: train on all; auto: train_list.txt and test_list.txt where present, else "
-        "every, or stratified where only that holds out two of a regime. Default: auto.",
+        description="Held-out views. every: each N-th image of each folder; stratified: each "
+        "N-th of each regime; none: hold out no view; auto: train_list.txt and "
+        "test_list.txt if present, else every, or stratified if only that holds out "
+        "two views of a regime. Default: auto.",
     )
     test_every: Annotated[int, Flag("N", SCENE)] = Field(
         8,
         ge=2,
-        description="Each N-th image of a folder or regime, by name, is held out. Default: 8.",
+        description="Hold out each N-th image of a folder or regime, in the order of names. "
+        "Default: 8.",
     )
     init: Annotated[str, Flag("points|random|PLY", SCENE)] = Field(
         "points",
-        description="Where training starts: the scene's points, random ones, or a PLY of "
+        description="Start of training: the scene's points, random points, or a PLY of "
         "Gaussians. Default: points.",
     )
     points: Annotated[Path | None, Flag("FILE", SCENE)] = Field(
         None,
-        description="Point cloud (PLY, LAS, LAZ) in place of the scene's points, in the "
+        description="Point cloud (PLY, LAS, LAZ) that replaces the scene's points, in the "
         "coordinates of its cameras.",
     )
     max_points: int | None = Field(
         None,
         ge=1,
-        description="most points that are taken of a point cloud, which is thinned evenly; default "
+        description="maximum number of points of a point cloud, which is thinned evenly; default "
         "1,000 per photo, at least 100,000",
     )
-    cache_mib: int = Field(1280, ge=16, description="memory for decoded photos, MiB")
+    cache_mib: int = Field(1280, ge=16, description="memory limit of decoded photos, MiB")
     disk_mib: int = Field(
-        20480, ge=0, description="disk space for large photos in the size as trained, MiB; 0: none"
+        20480, ge=0, description="disk space for resized copies of large photos, MiB; 0: none"
     )
     accept_scene: bool = Field(
-        False, description="go on although the scene contradicts itself, as --accept-scene does"
+        False,
+        description="train although points, poses and photos do not match, as with --accept-scene",
     )
-    masks: Path | None = Field(None, description="mask folder; default <scene>/masks if present")
+    masks: Path | None = Field(None, description="mask folder; default <scene>/masks if it exists")
 
     @property
     def init_file(self) -> Path | None:

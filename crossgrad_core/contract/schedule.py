@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from typing_extensions import override
 
-_FORM: Final = "must be a number from 1 on, or A..B@SHARE[..C@SHARE], such as 1..2@0.5"
+_FORM: Final = "must be a number of at least 1, or A..B@SHARE[..C@SHARE], such as 1..2@0.5"
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ class ViewsPerStepSpec:
             raise ValueError(_FORM) from error
         inside = (0.0, *shares, 1.0)
         if not all(a < b for a, b in pairwise(inside)):
-            raise ValueError("must have ascending shares above 0 and below 1")
+            raise ValueError("must list shares in ascending order, each above 0 and below 1")
         if min(counts) < 1:
             raise ValueError(_FORM)
         if any(a == b for a, b in pairwise(counts)):
-            raise ValueError("must change from one number to another one")
+            raise ValueError("must have two different numbers")
         return cls(counts, shares)
 
     @override
@@ -132,19 +132,19 @@ SHORT = 3_000
 #: transient always takes some hundred steps. Gradients are large everywhere during the transient.
 #: Growth in this time would copy Gaussians that only need to converge.
 SHORTEST_WARM_UP = 500
-#: Shortest interval over which statistics for growth are collected (the published interval).
+#: Shortest interval over which growth statistics are collected (the published interval).
 SHORTEST_INTERVAL = 100
-#: The same for anchors, which count per offset and keep counts of offsets that were seen too
-#: rarely. Half the published interval, because short runs grow too few anchors
+#: Shortest interval for anchors, whose counts of rarely rendered offsets carry over to the next
+#: interval. It is half the published interval, because short runs grow too few anchors
 #: (docs/benchmarks.md).
 SHORTEST_ANCHOR_INTERVAL = 50
-#: Shorter runs have no opacity reset: they could not recover from one.
+#: Shorter runs make no opacity reset, because they are too short to recover from it.
 SHORTEST_RUN_WITH_RESET = 10_000
-#: If edits are counted in views, an interval is one pass over the training photos, unless the run
-#: would then have fewer edits than this.
+#: If edits are counted in views, an interval is one pass over the training photos. The interval is
+#: shorter if the run would otherwise make fewer edits than this number.
 USUAL_EDITS = 6
-#: Shortest interval of a run that must have a minimum number of edits. With statistics of fewer
-#: views, nearly every Gaussian would grow.
+#: Shortest interval of a run with a minimum number of edits. With statistics of fewer views, nearly
+#: every Gaussian would grow.
 LEAST_INTERVAL = 8
 
 
@@ -246,7 +246,7 @@ class Schedule:
             length=length,
             lr_until=length,
             sh_interval=max(100, length // 30),
-            densify_from=0,  # `with_edits` plans the edits below.
+            densify_from=0,  # `with_edits` plans these edits.
             densify_until=0,
             densify_every=1,
             reset_every=length // 10 if length >= SHORTEST_RUN_WITH_RESET else None,
@@ -280,7 +280,8 @@ class Schedule:
         if self.counting.unit == "views" and not self.published:
             every = max(every, min(photos, (last - start) // USUAL_EDITS))
         if self.min_refinements:
-            # If one pass over the photos does not fit, it does not shorten the warm-up.
+            # The warm-up is not shortened to one pass over the photos if one pass is longer than
+            # the warm-up.
             whole = max(every, photos) if photos <= last // self.min_refinements else every
             start, every = _fitted(start, last, whole, photos, self.min_refinements)
         return replace(self, densify_from=start, densify_until=until, densify_every=every)
@@ -415,7 +416,7 @@ def _with_edits_ahead(schedule: Schedule, wanted: Schedule, step: int) -> Schedu
         start = wanted.densify_from if wanted.next_edit(0) > now else now
     needed = start + missing * every + 1
     if missing and needed > until:
-        # A run that becomes far shorter than planned still gets its edits.
+        # A run that becomes far shorter than planned still makes its edits.
         until = max(until, min(needed, (now + schedule.counted(schedule.total)) // 2))
         every = max(LEAST_INTERVAL, (until - 1 - start) // missing)
     return replace(

@@ -92,7 +92,7 @@ def seen(record: RenderedView) -> Tensor | None:
 
 def _present(statistic: Tensor | None) -> Tensor:
     if statistic is None:
-        raise RuntimeError("densification statistics were read before the backward pass")
+        raise RuntimeError("densification statistics are available only after the backward pass")
     return statistic
 
 

@@ -19,9 +19,9 @@ from crossgrad_core.contract.scene import View, to_uint8
 from crossgrad_core.contract.slots.metric import Compared, Metric
 from crossgrad_core.evaluation.result import EvaluationResult, ViewMetrics, summarised
 
-#: PSNR of identical images, in dB. It is finite, because JSON has no infinity and a mean over views
-#: must stay finite. Different images reach it only if fewer than one value in 150,000 differs, by
-#: one 8-bit step.
+#: PSNR of identical images, in dB. The value is finite, because JSON has no infinity and the mean
+#: over views must stay finite. Different images reach it only if fewer than one value in 150,000
+#: differs, by one 8-bit step.
 PSNR_LIMIT = 100.0
 #: Number of pixels whose differences stay in the cache until they are summed.
 _AT_ONCE = 2**15
@@ -72,7 +72,7 @@ def compare(view: View, render: Tensor, points: NDArray[np.float64] | None = Non
 
 def _measured(compared: Compared, metrics: Sequence[Metric]) -> ViewMetrics:
     found = {metric.figure.name: metric.measure(compared) for metric in metrics}
-    # Convert to float: of a tensor, for example, files would contain the text form.
+    # Convert to float, because a tensor would be written to files in its text form.
     values = {name: None if value is None else float(value) for name, value in found.items()}
     view, mask = compared.view, compared.mask
     masked = mask is not None and not bool(mask.any())

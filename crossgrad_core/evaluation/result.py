@@ -6,7 +6,7 @@ from math import fsum
 
 from crossgrad_core.contract.figure import Figure
 
-NO_VIEWS = "no held-out views: the split keeps every view for training"
+NO_VIEWS = "no held-out views: all views are used for training"
 ALL_MASKED = "every pixel is masked"
 
 

@@ -45,7 +45,9 @@ class DeferredSums(Gradients):
             RuntimeError: All expected views were already added.
         """
         if len(self._largest) == self._expected:
-            raise RuntimeError(f"one view more than the {self._expected} that were to come")
+            raise RuntimeError(
+                f"more views were rendered than the {self._expected} views that were announced"
+            )
         if self._largest:
             self._fold({name: self._kept(name) for name in self._last})
         given = {name: view.get(name) for name in self._names}

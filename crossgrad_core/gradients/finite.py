@@ -12,7 +12,7 @@ from crossgrad_core.gradients.columns import is_native
 from crossgrad_core.gradients.sparse_rows import values_of
 
 _INFINITY: Final = int(np.float32(np.inf).view(np.uint32))
-#: Up to this many parts are processed by a single thread.
+#: Up to this many parts are processed by one thread.
 _FEW: Final = 8
 
 
@@ -47,7 +47,8 @@ def all_finite_and_present(tensors: Sequence[Tensor | None]) -> list[tuple[bool,
             most = next(bits)
             found.append((most < _INFINITY, most > 0))
         elif not tensor.is_cpu and tensor.is_floating_point():
-            value = float(largest(tensor))  # One pass and one wait.
+            # Use one pass and one wait for the device.
+            value = float(largest(tensor))
             found.append((isfinite(value), value > 0.0))
         else:
             found.append((bool(torch.isfinite(tensor).all()), bool(tensor.any())))
@@ -70,7 +71,7 @@ def _largest_bits(tensors: Sequence[Tensor]) -> list[int]:
     from crossgrad_core.numerics.jobs import parallel, serial
 
     sizes = np.array([tensor.numel() for tensor in tensors], np.int64)
-    # An empty tensor also gets one part.
+    # An empty tensor also counts as one part.
     starts = np.array([0, *np.maximum(1, -(-sizes // PART)).cumsum()], np.int64)
     found = np.empty(starts[-1], np.uint32)
     call = parallel if len(found) > _FEW else serial

@@ -353,7 +353,10 @@ class DenseGradients(SeparateGradients):
 
     def _require_unspent(self) -> None:
         if self._spent:
-            raise RuntimeError("the gradients of the views were overwritten by their sum")
+            raise RuntimeError(
+                "the gradients of single views are no longer available: their sum has "
+                "overwritten them"
+            )
 
 
 def _prepared(gradient: Tensor | None) -> Tensor | None:

@@ -87,7 +87,7 @@ class SummedGradients(Gradients):
         self._last: dict[str, Tensor] = {}
         self._divisor = 0
         self._views = self._expected = views
-        #: Checked gradients and their versions at the time of the check.
+        #: Checked gradients, and their versions at the time of the check.
         self._looked: dict[str, tuple[Tensor, int]] = {}
         self._finite: list[NDArray[np.bool_]] = []
         self._present: list[NDArray[np.bool_]] = []
@@ -111,7 +111,9 @@ class SummedGradients(Gradients):
             RuntimeError: All expected views were already added.
         """
         if self._views == self._expected:
-            raise RuntimeError(f"one view more than the {self._expected} that were to come")
+            raise RuntimeError(
+                f"more views were rendered than the {self._expected} views that were announced"
+            )
         finite, present = self._judged(view)
         self._views += 1
         self._finite.append(finite)
@@ -145,7 +147,10 @@ class SummedGradients(Gradients):
             self._divisor = divisor
             return self._sum
         if self._divisor != 1:
-            raise RuntimeError("the sum of the views' gradients was overwritten by their mean")
+            raise RuntimeError(
+                "the sum of the views' gradients is no longer available: their mean has "
+                "overwritten it"
+            )
         columns = [[gradient] for gradient in self._sum.values()]
         return dict(zip(self._sum, plain_sums(columns, divisor, keep=True), strict=True))
 

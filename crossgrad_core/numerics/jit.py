@@ -12,8 +12,8 @@ R = TypeVar("R")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _COMPILE = cast("Callable[..., Any]", njit)
-#: Fused multiply-add is allowed and the sign of zero is free. Otherwise arithmetic is IEEE in the
-#: written order, so NaN and infinity stay visible.
+#: Allow fused multiply-add and ignore the sign of zero. All other arithmetic is IEEE in the written
+#: order, so NaN and infinity stay visible.
 _FLAGS = {"contract", "nsz"}
 
 
@@ -26,7 +26,8 @@ def compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noq
 
 def inlined(function: Callable[P, R], **options: Any) -> Callable[P, R]:  # noqa: ANN401
     """Compile a function that kernels call; it becomes part of the caller."""
-    # Entry points for Python and C are not needed; they would take a quarter of the compilation.
+    # Do not compile entry points for Python and C, which are not used and take a quarter of the
+    # compilation time.
     whole = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast("Callable[P, R]", _COMPILE(**whole, **options, **_OPTIONS)(function))
 

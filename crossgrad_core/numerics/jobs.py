@@ -52,7 +52,7 @@ def _add(typing: Any, jobs: Any, place: Any) -> Any:
     return types.int64(jobs, types.intp), generate
 
 
-#: Adds 1 to a shared number atomically; returns the former value.
+#: Add 1 to a shared number atomically, and return the former value.
 _next = cast("Callable[[Jobs, int], int]", intrinsic(_add))
 
 
@@ -124,7 +124,8 @@ class Begun:
         try:
             self._own()
         finally:
-            # Even after an error, no thread uses the arrays after this method returns.
+            # Wait for all threads even after an error, so that none uses the arrays after this
+            # method returns.
             self.leave()
         for call in self._calls:
             if call.error is not None:
@@ -183,7 +184,7 @@ class _Helpers:
     def __init__(self) -> None:
         self._threads: list[int] = []
         self._core: int | None = None
-        # One queue per thread, so that the same jobs go to the same core.
+        # Each thread has its own queue, so that equal jobs go to the same core.
         self._helpers: list[tuple[SimpleQueue[_Call | None], threading.Thread]] = []
         # A thread inside a library at interpreter exit would abort the process.
         atexit.register(self._dismiss)
@@ -210,7 +211,7 @@ class _Helpers:
         keep_off(self._core, self._threads[-1:])
         while (call := queue.get()) is not None:
             call.make()
-            del call  # This frees the call's arrays before the next call arrives.
+            del call  # Release the arrays of the call before the next call arrives.
 
     def _dismiss(self) -> None:
         """Stop the helper threads."""

@@ -28,7 +28,7 @@ _FOLDERS = "numba_kernels"
 _CORE = __name__.partition(".")[0]
 _DUMPS = cast("Callable[[object], bytes]", dumps)
 _LOG = logging.getLogger(__name__)
-#: Log messages before and after the compilation of a kernel; `system/startup.py` relies on them.
+#: Log messages before and after the compilation of a kernel; `system/startup.py` reads them.
 _COMPILING, _COMPILED = "compiling %s", "compiled %s"
 
 
@@ -70,8 +70,9 @@ def cache_for(function: Callable[..., Any]) -> Any:  # noqa: ANN401 - Numba's ca
 def _tell_uncached(folder: str) -> None:
     """Warn once per folder that its kernels cannot be stored."""
     _LOG.warning(
-        "compiled kernels cannot be kept, every start compiles them again: neither %s nor the "
-        "user's cache folder can be written to; NUMBA_CACHE_DIR=FOLDER names another one",
+        "compiled kernels cannot be saved and are compiled again at every start: "
+        "neither %s nor the user's cache folder is writable; set "
+        "NUMBA_CACHE_DIR=FOLDER to use another folder",
         folder,
     )
 
@@ -141,7 +142,7 @@ class _DiskCache(cast("Any", FunctionCache)):  # type: ignore[misc]
 
 @cache
 def _tell_unwritten(folder: str, error: str) -> None:
-    _LOG.warning("a compiled kernel could not be kept in %s: %s", folder, error)
+    _LOG.warning("a compiled kernel could not be saved in %s: %s", folder, error)
 
 
 class _Files:
@@ -198,7 +199,8 @@ class _Files:
     def _drop_older(self) -> None:
         for path in self._folder.glob(f"{self._base}.*"):
             if not path.name.startswith(self._generation) and path.suffix != ".tmp":
-                with suppress(OSError):  # Another process may be faster, or hold it open.
+                # Another process may have removed it first, or may hold it open.
+                with suppress(OSError):
                     path.unlink()
 
 

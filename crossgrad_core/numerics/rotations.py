@@ -5,7 +5,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-#: Numbers, arrays or tensors of one shape.
+#: Numbers, arrays or tensors of equal shape.
 T = TypeVar("T", float, Tensor)
 
 

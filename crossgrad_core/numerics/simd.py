@@ -131,7 +131,7 @@ def emitted(emit: Callable[..., Any], result: Any, *operands: Any) -> Any:
 
         return typed(result, None)(*kinds), generate
 
-    # Numba reads the number of operands from the function's signature.
+    # Numba reads the number of operands from the signature of the function.
     by_count: dict[int, Callable[..., Any]] = {
         0: lambda typing: define(),
         1: lambda typing, a: define(a),
@@ -335,58 +335,58 @@ _Array = NDArray[Any]
 _Three = tuple[Lanes, Lanes, Lanes]
 _Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
-#: Returns a float32 number in all lanes.
+#: Return a float32 number in all lanes.
 splat: Callable[[np.float32], Lanes] = emitted(_splat(LANES), _eight, types.float32)
-#: Returns (0, 1, ..., 7).
+#: Return (0, 1, ..., 7).
 ramp: Callable[[], Lanes] = emitted(_ramp(LANES), _eight)
-#: Returns eight consecutive numbers of a flat float32 array, from an index on.
+#: Return eight consecutive numbers of a flat float32 array, starting at an index.
 load: Callable[[_Array, int], Lanes] = emitted(_load(LANES), _eight, None, types.intp)
-#: Returns one number of a flat float32 array in all lanes.
+#: Return one number of a flat float32 array in all lanes.
 broadcast: Callable[[_Array, int], Lanes] = emitted(_broadcast(LANES), _eight, None, types.intp)
-#: Returns four consecutive numbers of a flat float32 array, twice.
+#: Return four consecutive numbers of a flat float32 array, twice.
 broadcast_four: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(LANES), _eight, None, types.intp
 )
-#: Returns a float32 number in sixteen lanes.
+#: Return a float32 number in sixteen lanes.
 splat_wide: Callable[[np.float32], Lanes] = emitted(_splat(WIDE), SIXTEEN, types.float32)
-#: Returns (0, 1, ..., 15).
+#: Return (0, 1, ..., 15).
 ramp_wide: Callable[[], Lanes] = emitted(_ramp(WIDE), SIXTEEN)
-#: Returns sixteen consecutive numbers of a flat float32 array, from an index on.
+#: Return sixteen consecutive numbers of a flat float32 array, starting at an index.
 load_wide: Callable[[_Array, int], Lanes] = emitted(_load(WIDE), SIXTEEN, None, types.intp)
-#: Returns one number of a flat float32 array in sixteen lanes.
+#: Return one number of a flat float32 array in sixteen lanes.
 broadcast_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast(WIDE), SIXTEEN, None, types.intp
 )
-#: Returns four consecutive numbers of a flat float32 array, four times.
+#: Return four consecutive numbers of a flat float32 array, four times.
 broadcast_four_wide: Callable[[_Array, int], Lanes] = emitted(
     _broadcast_four(WIDE), SIXTEEN, None, types.intp
 )
-#: Returns the lanes of two vectors of eight, one vector after the other.
+#: Return the lanes of two vectors of eight lanes, first one vector, then the other.
 joined: Callable[[Lanes, Lanes], Lanes] = emitted(
     lambda at, a, b: shuffled(at, a, b, range(WIDE)), SIXTEEN, _eight, _eight
 )
-#: Returns the first eight of sixteen lanes.
+#: Return the first eight of sixteen lanes.
 first_half: Callable[[Lanes], Lanes] = emitted(
     lambda at, a: shuffled(at, a, a, range(LANES)), _eight, SIXTEEN
 )
-#: Returns the last eight of sixteen lanes.
+#: Return the last eight of sixteen lanes.
 last_half: Callable[[Lanes], Lanes] = emitted(
     lambda at, a: shuffled(at, a, a, range(LANES, WIDE)), _eight, SIXTEEN
 )
-#: Returns the first eight of sixteen lanes plus the last eight.
+#: Return the sum of the first eight and the last eight of sixteen lanes.
 halves_added: Callable[[Lanes], Lanes] = emitted(_halves_added, _eight, SIXTEEN)
-#: Returns eight consecutive triples, such as pixels, of a contiguous float32 array as three
-#: vectors, from a flat index on.
+#: Return eight consecutive triples of a contiguous float32 array, such as pixels, as three vectors,
+#: starting at a flat index.
 load_triples: Callable[[_Array, int], _Three] = emitted(_load_triples, _triple, None, types.intp)
-#: Returns eight consecutive groups of four, such as quaternions, as four vectors.
+#: Return eight consecutive groups of four numbers, such as quaternions, as four vectors.
 load_fours: Callable[[_Array, int], _Four] = emitted(_load_fours, _four, None, types.intp)
-#: Writes eight consecutive triples from three vectors, from a flat index on.
+#: Write eight consecutive triples from three vectors, starting at a flat index.
 store_triples: Callable[[_Array, int, Lanes, Lanes, Lanes], None] = emitted(
     _store_triples, types.void, None, types.intp, _eight, _eight, _eight
 )
-#: Writes consecutive numbers to a flat float32 array, from an index on.
+#: Write consecutive numbers to a flat float32 array, starting at an index.
 store: Callable[[_Array, int, Lanes], None] = emitted(_store, types.void, None, types.intp, _lanes)
-#: Prefetches the cache line of an element of a contiguous array, given a flat index.
+#: Prefetch the cache line of an element of a contiguous array, given a flat index.
 prefetch: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=0), types.void, None, types.intp
 )
@@ -394,48 +394,48 @@ prefetch: Callable[[_Array, int], None] = emitted(
 prefetch_write: Callable[[_Array, int], None] = emitted(
     lambda at, array, index: _prefetch(at, array, index, write=1), types.void, None, types.intp
 )
-#: Returns a b + c, rounded once if the machine supports it.
+#: Return a b + c, rounded once if the machine supports it.
 fma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(
     _llvm("llvm.fmuladd"), _lanes, _lanes, _lanes, _lanes
 )
-#: Returns c - a b, rounded once if the machine supports it.
+#: Return c - a b, rounded once if the machine supports it.
 fnma: Callable[[Lanes, Lanes, Lanes], Lanes] = emitted(_negated_fma, _lanes, _lanes, _lanes, _lanes)
-#: Returns the square roots.
+#: Return the square roots.
 square_root: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.sqrt"), _lanes, _lanes)
-#: Rounds up to whole numbers.
+#: Round up to whole numbers.
 round_up: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.ceil"), _lanes, _lanes)
-#: Rounds down to whole numbers.
+#: Round down to whole numbers.
 round_down: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.floor"), _lanes, _lanes)
-#: Returns the absolute values.
+#: Return the absolute values.
 magnitude: Callable[[Lanes], Lanes] = emitted(_llvm("llvm.fabs"), _lanes, _lanes)
-#: Returns minus the absolute values.
+#: Return the negated absolute values.
 as_negative: Callable[[Lanes], Lanes] = emitted(_as_negative, _lanes, _lanes)
-#: Returns the smaller of each two numbers, the second number if one is NaN.
+#: Return the smaller number of each pair; if one is NaN, return the second number.
 smaller: Callable[[Lanes, Lanes], Lanes] = emitted(_pick("<"), _lanes, _lanes, _lanes)
-#: Returns the larger of each two numbers, the second number if one is NaN.
+#: Return the larger number of each pair; if one is NaN, return the second number.
 larger: Callable[[Lanes, Lanes], Lanes] = emitted(_pick(">"), _lanes, _lanes, _lanes)
-#: Returns the first number if the mask is true, else the second.
+#: Return the first number if the mask is true, else the second number.
 where: Callable[[Mask, Lanes, Lanes], Lanes] = emitted(
     lambda at, mask, a, b: at.builder.select(mask, a, b), _lanes, _mask, _lanes, _lanes
 )
-#: Returns the mask as a number, lane 0 in the lowest bit.
+#: Return the mask as a number, with lane 0 in the lowest bit.
 bits: Callable[[Mask], np.uint64] = emitted(_bits, types.uint64, _mask)
-#: Returns the position of the lowest set bit, 64 for zero.
+#: Return the position of the lowest set bit, or 64 for zero.
 lowest_bit: Callable[[np.uint64], int] = emitted(
     lambda at, number: _llvm("llvm.cttz.i64", _LONG)(at, number, ir.IntType(1)(0)),
     *(types.int64, types.uint64),
 )
-#: Returns the number of set bits.
+#: Return the number of set bits.
 count_bits: Callable[[np.uint64], int] = emitted(
     _llvm("llvm.ctpop.i64", _LONG), types.int64, types.uint64
 )
-#: Returns value * 2**n if the second vector is n + 1.5 * 2**23, whose lowest bits hold n.
+#: Return value * 2**n if the second vector is n + 1.5 * 2**23, whose lowest bits contain n.
 scale_by_power: Callable[[Lanes, Lanes], Lanes] = emitted(_scale_by_power, _lanes, _lanes, _lanes)
-#: Returns the sums over the lanes of eight vectors, in their order; added in pairs.
+#: Return the sums over the lanes of eight vectors, in their order. The lanes are added in pairs.
 sums: Callable[[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes], Lanes] = emitted(
     _sums, _eight, *([_eight] * LANES)
 )
-#: Returns the sum over the lanes, added in pairs.
+#: Return the sum over the lanes, which are added in pairs.
 total: Callable[[Lanes], np.float32] = emitted(_total, types.float32, _eight)
 
 

@@ -38,11 +38,12 @@ def configure_threads(n: int | None = None) -> int:
         n = min(_default_threads(), most)
     if not 1 <= n <= most:
         raise UserError(
-            "number of threads out of range",
+            "the number of threads is out of range",
             where="threads",
             expected=f"1 to {most}",
             found=str(n),
-            todo=f"say --threads {most}, or set NUMBA_NUM_THREADS={n} before the start",
+            todo=f"use --threads {most}, or set the environment variable NUMBA_NUM_THREADS={n} "
+            "before the start",
         )
     _prefer_openmp()
     keep_freed_memory()

@@ -15,7 +15,7 @@ from crossgrad_core.registry.slots import GROUPS
 from crossgrad_core.registry.validation import as_user_error
 from crossgrad_core.wording import listed, plural
 
-#: Settings without a default that training and assembly need: a recipe decides each of them.
+#: Settings that training and assembly need and that have no default: a recipe decides each of them.
 DECIDED: Final = (
     *(
         "views_per_step",
@@ -28,7 +28,8 @@ DECIDED: Final = (
     *("position_lr", "rate_factor", "few_pass_rates", "beta1", "beta2", "step_order"),
     *("eval_every", "save_every"),
 )
-#: The setting whose rows are rules: `rules.NAME`, with the options of the rule, or False for none.
+#: Setting whose rows in the table are rules: `rules.NAME` has the options of the rule as its value,
+#: or False if the rule is not used.
 RULES: Final = "rules"
 #: Largest number of decision lines in the terminal.
 LINES: Final = 12
@@ -78,7 +79,7 @@ def decide(config: RunConfig, facts: Facts) -> tuple[Decision, ...]:
     missing = [name for name in DECIDED if name not in table and not is_given(config, name)]
     if missing:
         raise UserError(
-            f"recipe {config.recipe.name} does not decide every setting",
+            f"recipe {config.recipe.name} does not decide every setting that it must decide",
             where=f"{type(recipe).__module__}:{type(recipe).__qualname__}.decide",
             expected=f"a row for each of {listed(DECIDED)}",
             found=f"no row for {listed(missing)}",
@@ -116,7 +117,7 @@ def applied(config: RunConfig, rows: Sequence[Decision], planner: str = "") -> R
         return RunConfig.model_validate(update)
     except ValidationError as error:
         subject = f"planner {planner}" if planner else f"recipe {config.recipe.name}"
-        todo = "repair the plugin, or choose another --recipe (--plan off leaves out the planner)"
+        todo = "repair the plugin, or choose another --recipe (--plan off turns the planner off)"
         raise as_user_error(error, RunConfig, subject=subject, todo=todo) from error
 
 
@@ -153,7 +154,8 @@ def without_decided(settings: dict[str, Any]) -> None:
 def rows_of(config: RunConfig) -> tuple[Decision, ...]:
     """Return the decisions recorded in a configuration, without their evidence."""
     values = ((name, _value(config, name), why) for name, why in config.decided.items())
-    # The bound on the views of a run within seconds has become a number of steps.
+    # The limit on views of a run with a time budget has already been converted to a number of
+    # steps.
     return tuple(Decision(*row) for row in values if row[1] is not None)
 
 

@@ -109,9 +109,10 @@ def find(slot: str, name: str) -> Entry:
             where=singular(slot),
             expected="one package per name",
             found=listed(f"{entry.distribution} {entry.version}" for entry in found),
-            todo=f"rename it in {listed(others)}, or uninstall that: the name is crossgrad's own"
+            todo=f"rename it in {listed(others)}, or uninstall that package: the name belongs "
+            "to crossgrad"
             if ours
-            else "uninstall all but one of them",
+            else "uninstall all of these packages except one",
         )
     return found[0]
 
@@ -158,7 +159,7 @@ def resolve_entry(entry: Entry) -> object:
             f"{singular(entry.slot)} {entry.name} cannot be imported",
             where=sentences(entry.origin, place),
             found=in_one_line(error),
-            todo=f"repair or uninstall {entry.distribution}; other {others} are not affected",
+            todo=f"repair or uninstall {entry.distribution}; other {others} still work",
         ) from error
 
 
@@ -171,7 +172,7 @@ def refuse_other_version(entry: Entry) -> None:
     """
     if required := unmet_requirement(entry.distribution):
         raise UserError(
-            f"{singular(entry.slot)} {entry.name} is written for another version of crossgrad",
+            f"{singular(entry.slot)} {entry.name} was written for another version of crossgrad",
             where=entry.origin,
             expected=f"{required}, which {entry.distribution} {entry.version} requires",
             found=f"{OURS} {VERSION}",
@@ -182,7 +183,7 @@ def refuse_other_version(entry: Entry) -> None:
 
 def notes_on(error: BaseException) -> list[str]:
     """Return the notes on the step, hook and plugin in which an exception was raised."""
-    # The hook adds its note first.
+    # Keep the order of the notes: the hook adds its note first.
     return list(reversed(getattr(error, "__notes__", ())))
 
 
@@ -210,7 +211,7 @@ def failed_plugin(error: Exception) -> UserError | None:
     # If two distributions share a package, prefer the one that contains the module.
     entry, place = next((one for one in found if one[1].startswith(f"{one[0].file}:")), found[0])
     return UserError(
-        f"a plugin of {entry.distribution} {entry.version} failed",
+        f"a plugin of package {entry.distribution} {entry.version} raised an error",
         where=sentences(*notes_on(error), place),
         found=in_one_line(error),
         todo=f"repair or uninstall {entry.distribution}, or choose other components",
@@ -271,7 +272,7 @@ def installed_as(kind: "type[Component]") -> Entry | None:
     package = kind.__module__.partition(".")[0]
     for entry in entries(kind.slot).values():
         module, _, attribute = entry.value.partition(":")
-        # Another package's module is not imported for a class of the same name.
+        # Do not import the module of another package to find a class with the same name.
         alike = attribute.strip() == kind.__qualname__ and entry.package == package
         if alike and (module.strip() == kind.__module__ or resolve_entry(entry) is kind):
             return entry
@@ -323,14 +324,18 @@ def _identity(distribution: "Distribution | None") -> tuple[str, str]:
 def _unknown(slot: str, name: str) -> UserError:
     names = list(entries(slot))
     elsewhere = [other for other in GROUPS if other != slot and name in entries(other)]
-    hint = f"{name} is a {singular(elsewhere[0])}" if elsewhere else did_you_mean(name, names)
+    hint = (
+        f"a component with the name {name} exists in the slot {singular(elsewhere[0])}"
+        if elsewhere
+        else did_you_mean(name, names)
+    )
     for stray in strays():
         if stray.name == name:
             hint = f"{stray.origin} offers {name}, but {stray.reason}"
     return UserError(
         f"there is no {singular(slot)} named {name!r}",
         where=singular(slot),
-        expected=f"one of {listed(names)}" if names else "an installed plugin; there is none",
+        expected=f"one of {listed(names)}" if names else "an installed plugin; none is installed",
         todo=sentences(hint, f"`crossgrad plugins list --slot {slot}` lists them"),
     )
 
@@ -354,7 +359,7 @@ def _checked(entry: Entry, found: object) -> "type[Component]":
         raise _wrong_kind(entry, base, f"{found.__name__} without the methods {listed(missing)}")
     for name, expected, given in wrong_signatures(found, base):
         raise UserError(
-            f"{word} {entry.name} has a method that takes other arguments",
+            f"{word} {entry.name} has a method with wrong arguments",
             where=sentences(entry.origin, defined_at(getattr(found, name))),
             expected=f"{name}{expected}",
             found=f"{name}{given}",

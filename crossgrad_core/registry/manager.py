@@ -96,12 +96,12 @@ def call_first_result(hook: pluggy.HookCaller, context: StepContext, answer: typ
     if isinstance(result, answer) and _complete(result):
         return result
     raise UserError(
-        f"the hook {hook.name} was not answered",
+        f"no plugin returned a result for the hook {hook.name}",
         where=f"plugins {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
-        expected=f"a value of type {answer.__name__}; a first-result hook must answer",
+        expected=f"a value of type {answer.__name__}; a first-result hook must return a value",
         found=repr(result),
-        todo="return an explicit answer, NO_EDIT where nothing changes; "
-        "a wrapper must return what `yield` gave it or a replacement",
+        todo="return a value, such as NO_EDIT for no change; a wrapper must return the "
+        "value that `yield` gave it, or a replacement",
     )
 
 
@@ -126,11 +126,11 @@ def call_all(hook: pluggy.HookCaller, context: StepContext, answer: type[A]) -> 
 def wrong_answer(hook: pluggy.HookCaller, expected: str, found: str) -> UserError:
     """Return the error for an answer to a hook that the run cannot use."""
     return UserError(
-        f"a plugin answers {hook.name} with something else",
+        f"a plugin returned a value of a wrong type for the hook {hook.name}",
         where=f"one of {listed(impl.plugin_name for impl in hook.get_hookimpls())}",
         expected=expected,
         found=found,
-        todo="repair the plugin (docs/hooks.md), or leave it out",
+        todo="repair the plugin (docs/hooks.md), or run without it",
     )
 
 
@@ -254,11 +254,11 @@ def _unmarked(name: str, plugin: object, attribute: str) -> UserError:
     if attribute not in _HOOKS:
         return _no_such_hook(name, plugin, attribute)
     return UserError(
-        f"plugin {name} has a method {attribute} that would never be called",
+        f"method {attribute} of plugin {name} would never be called",
         where=_class_of(plugin),
         expected="a hook marked with @hookimpl",
-        found="a method without the mark",
-        todo="forgot @hookimpl? `from crossgrad_core.plugin import hookimpl`",
+        found="a method without @hookimpl",
+        todo="add the decorator @hookimpl: `from crossgrad_core.plugin import hookimpl`",
     )
 
 
@@ -268,7 +268,7 @@ def _no_such_hook(name: str, plugin: object, hook: str) -> UserError:
         where=_class_of(plugin),
         expected=f"one of {listed(_HOOKS)}",
         todo=sentences(
-            did_you_mean(hook, _HOOKS), f"names that begin with {_PREFIX} are kept for hooks"
+            did_you_mean(hook, _HOOKS), f"names that begin with {_PREFIX} are reserved for hooks"
         ),
     )
 
@@ -285,9 +285,11 @@ def _refuse_second_answers(manager: pluggy.PluginManager) -> None:
         ]
         if spec is not None and spec.opts["firstresult"] and len(answering) > 1:
             raise UserError(
-                f"{len(answering)} plugins answer the hook {hook}: {listed(answering)}",
-                expected="one answer, from the component that fills the slot",
-                todo="let the others wrap it with @hookimpl(wrapper=True), or leave them out",
+                f"{len(answering)} plugins implement the first-result hook {hook}: "
+                f"{listed(answering)}",
+                expected="one implementation, by the component of the slot",
+                todo="mark the other implementations as wrappers, @hookimpl(wrapper=True), or run "
+                "without these plugins",
             )
 
 

@@ -34,7 +34,8 @@ def wrong_signatures(found: type, base: type) -> tuple[tuple[str, str, str], ...
         if name.startswith(("_", "crossgrad_")) or own is theirs:
             continue
         if isfunction(theirs) and isfunction(own):
-            # A decorator may pass arguments of its own; its own signature counts.
+            # A decorator may pass its own arguments, so use the signature of the decorated
+            # function.
             expected, given = signature(theirs), signature(own, follow_wrapped=False)
             if not _takes(given, expected, whole=True) or not _takes(given, expected, whole=False):
                 wrong.append((name, str(expected), str(given)))

@@ -51,7 +51,8 @@ QUICK: Final = {
 OWN_COMMANDS: Final = ("run", "eval", "render", "export")
 _KNOWN: Final = (*OFFERED.values(), *QUICK.values(), f"crossgrad.{PLANNERS}")
 _PREFIX: Final = "crossgrad"
-#: Similarity above which a group without the prefix `crossgrad` counts as misspelt.
+#: A group without the prefix `crossgrad` counts as misspelt if its similarity to a known group is
+#: above this value.
 _ALIKE: Final = 0.85
 
 
@@ -82,7 +83,7 @@ class Stray:
     def reason(self) -> str:
         """The reason why the entry point is not read, and a remedy."""
         right = f"write {self.meant}" if self.meant else f"the groups are {', '.join(_KNOWN)}"
-        return f"there is no entry-point group {self.group}: {right}"
+        return f"the entry-point group {self.group} does not exist: {right}"
 
 
 def strays() -> Iterator[Stray]:

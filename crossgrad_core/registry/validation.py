@@ -40,7 +40,7 @@ def as_user_error(
         return UserError(
             f"{subject} has no option {key!r}",
             where=where,
-            expected=f"one of {listed(options)}" if options else "no options; it has none",
+            expected=f"one of {listed(options)}" if options else "no options: it has none",
             todo=sentences(did_you_mean(place[-1], options), more, todo),
         )
     return UserError(
@@ -105,11 +105,11 @@ def _inside(annotation: object, part: str) -> tuple[type[BaseModel] | None, obje
 
 def _expected(detail: ErrorDetails) -> str:
     if detail["type"] == "missing":
-        return "a value; there is no default"
+        return "a value, because there is no default"
     if detail["type"] in {"model_type", "dict_type"}:
-        return "an object with names and values"
+        return "a mapping of names to values"
     if detail["type"] == "too_short":
-        return f"at least {detail.get('ctx', {}).get('min_length')} of them"
+        return f"at least {detail.get('ctx', {}).get('min_length')} entries"
     text = detail["msg"]
     for prefix in _PREFIXES:
         text = text.removeprefix(prefix)

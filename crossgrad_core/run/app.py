@@ -86,7 +86,7 @@ def check_clock(config: RunConfig) -> None:
         return
     if config.device != AUTO and torch.device(config.device).type != "cpu":
         raise UserError(
-            "CPU time does not tell what a GPU does",
+            "CPU time does not include the time of a GPU",
             where="--clock cpu",
             expected="--device cpu",
             found=f"--device {config.device}",
@@ -95,7 +95,7 @@ def check_clock(config: RunConfig) -> None:
     threads = torch.get_num_threads()
     if threads > 1:
         raise UserError(
-            "CPU time counts threads that wait for others, as they spin",
+            "CPU time would include threads that only wait for other threads",
             where="--clock cpu",
             expected="one thread",
             found=f"{threads} threads",
@@ -103,8 +103,8 @@ def check_clock(config: RunConfig) -> None:
         )
 
 
-#: The length of a run on the bundled scene if the user sets no length: it ends after this many
-#: training seconds, or after 100 views of each training photo. More views overfit
+#: Length of a run on the bundled scene if the user sets no length. The run ends after this many
+#: training seconds, or after 100 views of each training photo, because more views overfit
 #: (docs/few-photos.md).
 BUNDLED_SECONDS = 120.0
 
@@ -155,7 +155,8 @@ class Outcome:
         return 0 if self.signal is None else exit_code(self.signal)
 
 
-#: Receives the results (table, folder and exit messages) while signals are still only recorded.
+#: Function that receives the results (table, folder and exit messages) while signals are still only
+#: recorded.
 Tell = Callable[[str, Path, Sequence[str]], None]
 
 
@@ -194,9 +195,9 @@ def run(  # noqa: PLR0913 - one parameter per option of the command line
         return _end(resumed(resume, settings, way, **accepted), way)
     if accept_plugins:
         raise UserError(
-            "only a run that is continued has something to compare with",
+            "--accept-plugins has no effect on a new run",
             where="--accept-plugins",
-            todo="leave it out, or name the run with --resume",
+            todo="leave it out, or name a run to resume with --resume",
         )
     if accept_scene:
         settings = layered([settings, {"data.accept_scene": True}])
@@ -286,18 +287,19 @@ def with_defaults(config: RunConfig) -> RunConfig:
     given = {unit: length for unit, length in lengths.items() if length is not None}
     if "steps" in given and len(given) > 1:
         raise UserError(
-            "a run has one length: in steps, in views or in seconds, or views within seconds",
+            "more than one length of the run was given; a run has a length in steps, in "
+            "views or in seconds, or in views with a limit in seconds",
             where="--steps, --max-views, --seconds",
             found=listed(f"{length:g} {unit}" for unit, length in given.items()),
-            todo="leave --steps out, or all but it",
+            todo="leave --steps out, or give only --steps",
         )
     if config.scene is None and config.reader.name == PREPARING_READER:
         raise UserError(
-            "there are no photos to prepare",
+            "--prepare needs a folder of photos",
             where="--prepare",
             expected="a folder of photos",
-            found="no SCENE; the bundled scene is ready to train on",
-            todo="crossgrad run PHOTOS --prepare",
+            found="no SCENE; the bundled scene is used and needs no preparation",
+            todo="name the folder: crossgrad run PHOTOS --prepare",
         )
     if config.scene is None:
         config = config.model_copy(update={"scene": bundled_scene()})
@@ -319,9 +321,9 @@ def _tried_out() -> Iterator[None]:
         if isinstance(error, UserError) or failed_plugin(error):
             raise
         raise UserError(
-            "a step that was tried out before the training failed",
+            "a trial step failed before the training started",
             found=": ".join([*notes_on(error), reason_of(error)]),
-            todo="look at settings, such as --rate-factor and --loss, and at the photos",
+            todo="check the settings, such as --rate-factor and --loss, and the photos",
         ) from error
 
 
@@ -334,7 +336,7 @@ def _within(setup: Setup, seconds: float) -> Setup:
     setup = redecided(replace(setup, config=config, pixel_share=share), steps)
     schedule = schedule_of(setup.config, setup.densifier, steps, setup.schedule.counting)
     setup = replace(setup, schedule=schedule)
-    idle = [f"{name} does nothing: {why}" for name, why in without_resets(config, setup)]
+    idle = [f"{name} has no effect: {why}" for name, why in without_resets(config, setup)]
     told = (
         note,
         *notes_on_length(setup),
@@ -357,7 +359,7 @@ def _new_folder(setup: Setup, state: TrainState) -> Iterator[Path]:
     needed = expected_bytes(state.primitives(setup), 2)
     folder = create_run_folder(name, setup.config.out, needed=needed)
     with _held(folder):
-        # Another run may have begun and ended here meanwhile.
+        # Check again after taking the lock, because another run may have used the folder before.
         check_out(folder)
         yield folder
 
@@ -367,8 +369,8 @@ def _held(folder: Path) -> Iterator[None]:
     with locked(folder, "training") as held:
         if not held:
             _LOG.warning(
-                "the file system of %s has no locks; nothing keeps a second process from writing "
-                "into it",
+                "the file system of %s does not support locks, so that nothing prevents a "
+                "second process from writing to it",
                 folder,
             )
         clear_half_written(folder)
@@ -396,7 +398,7 @@ def _train(
 
 def _print_results(table: str, folder: Path, words: Sequence[str]) -> None:
     print(table)  # noqa: T201 - the result of the command
-    if folder.is_dir():  # Nobody moved it meanwhile.
+    if folder.is_dir():  # Print the folder only if nobody moved it.
         print(f"results in {one_line(folder)}")  # noqa: T201
     for line in words:
         print(line, file=sys.stderr)  # noqa: T201
@@ -424,16 +426,17 @@ def resumed(
             the training, or the scene or a package has changed.
     """
     accepted = {"accept_scene": accept_scene, "accept_plugins": accept_plugins}
-    read_config(folder)  # Before the lock, which must not be written into any other folder.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    read_config(folder)
     with resume_hint(resume_line(folder)), _held(folder):
         setup, state = continued(folder, settings, way.verbosity, **accepted)
         step, total = state.step, setup.schedule.total
         done = step >= total and summarised_step(folder, "finished") == step
         files = PER_VIEW, f"{CLOUD}.{setup.selection.exporter.suffix}"
-        damaged = set(changed_files(folder)) - {CONFIG}  # Its settings are compared by themselves.
+        damaged = set(changed_files(folder)) - {CONFIG}  # Settings are compared separately.
         if done and not damaged and all((folder / name).is_file() for name in files):
             raise UserError(
-                "the run is finished",
+                "the run is finished, so that it cannot be resumed",
                 where=folder,
                 found=f"all {total} steps done",
                 todo=f"start a new run; --init {folder / files[1]} starts from its Gaussians",
@@ -441,13 +444,13 @@ def resumed(
         stop, follows_clock = setup.config.stop_after, setup.config.planned_seconds is not None
         if stop is not None and (stop <= step or (stop > total and not follows_clock)):
             raise UserError(
-                "the run is past the step at which it is to stop"
+                "--stop-after names a step that the run has already passed"
                 if stop <= step
-                else "the run ends before the step at which it is to stop",
+                else "--stop-after names a step after the end of the run",
                 where="--stop-after",
                 expected=f"a step from {step + 1} to {total}",
                 found=str(stop),
-                todo="name one of these, or leave it out to train to the end",
+                todo="name a step in this range, or leave --stop-after out to train to the end",
             )
         if step < total:
             state.clock.load += _decoded(setup, way)
@@ -476,7 +479,7 @@ def _print_dry_run(setup: Setup) -> None:
     for note in (*short_lines(setup.decisions), *setup.notes):
         print(f"# {note}")  # noqa: T201
     memory = initial_bytes(setup) / 2**20
-    print(f"# would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
+    print(f"# the run would train; parameters and optimizer start at {memory:.0f} MiB")  # noqa: T201
 
 
 @contextmanager

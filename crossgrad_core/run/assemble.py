@@ -54,10 +54,14 @@ def idle_note(setup: Setup) -> tuple[str, ...]:
         return ()
     sampler = selection.names["sampler"]
     more = next((k for k in (2, 3) if selection.sampler.view_counts.admits(k)), None)
-    way_out = f"--views {more}" if more else f"a sampler other than {sampler} as it is set"
+    way_out = (
+        f"--views {more}" if more else f"another sampler than {sampler} with its present options"
+    )
     return (
-        f"operator {name} does nothing at K = {views}: a step has one gradient, which it leaves as "
-        f"it is; {way_out} gives it more",
+        (
+            f"operator {name} has no effect at K = {views}, because a step has only one "
+            f"gradient; {way_out} gives it more views"
+        ),
     )
 
 
@@ -76,10 +80,10 @@ def read_scene(config: RunConfig, path: Path) -> tuple[Scene, str]:
         able = [each for each in entries("readers") if accepts(each, path)]
         if len(able) > 1:
             raise UserError(
-                "the scene can be read in several ways",
+                "the scene folder contains files of several formats",
                 where=path,
-                found=f"files of the readers {listed(able)}",
-                todo=f"choose one, such as --reader {able[0]}",
+                found=f"files for the readers {listed(able)}",
+                todo=f"choose a reader, such as --reader {able[0]}",
             )
         # If no reader recognises the folder, one reader explains what is missing.
         near = [] if able else [each for each in entries("readers") if nearly_accepts(each, path)]
@@ -124,7 +128,9 @@ def _answer(name: str, question: Callable[[], bool]) -> bool:
     try:
         return question()
     except Exception as error:
-        _LOG.warning("reader %s left out: %s", name, getattr(error, "what", in_one_line(error)))
+        _LOG.warning(
+            "reader %s cannot be used: %s", name, getattr(error, "what", in_one_line(error))
+        )
         return False
 
 
@@ -210,7 +216,7 @@ def assemble(config: RunConfig, scene: Scene, reader: str) -> Setup:
 def _photos(config: RunConfig) -> ScaledPhotos | DevicePhotos:
     """Return the cache of photos, in addition to the photos that were decoded last."""
     mib, device = config.data.cache_mib, choose_device(config.device)
-    # At half the size photos take a quarter of the memory.
+    # At half the size, photos use a quarter of the memory.
     scaled = ScaledPhotos(mib // 4)
     return scaled if device.type == "cpu" else DevicePhotos(scaled, device, mib)
 
@@ -242,11 +248,11 @@ def _with_steps(config: RunConfig, views: ViewsPerStepSpec) -> RunConfig:
     steps = views.steps_of(config.max_views)
     if steps == 0:
         raise UserError(
-            "the run is shorter than its first step",
+            "--max-views is smaller than the number of views of the first step",
             where="--max-views",
-            expected=f"at least {views.counts[0]}, the views of a step",
+            expected=f"at least {views.counts[0]}, the number of views of the first step",
             found=str(config.max_views),
-            todo="ask for more --max-views, or for fewer --views",
+            todo="raise --max-views, or lower --views",
         )
     if config.seconds is not None:
         return config
@@ -287,12 +293,12 @@ def reasons_against(
     reasons = objections_to(selection) + [reason for answer in given for reason in answer]
     if config.backward == "joint" and selection.operator.separate:
         reasons.append(
-            f"--backward joint makes one gradient of all views, but operator "
-            f"{selection.names['operator']} needs them apart"
+            "--backward joint computes only the sum of the views' gradients, but "
+            f"operator {selection.names['operator']} needs the gradient of each view"
         )
     views = selection.views_per_step
     if config.batch_rule == "sqrt" and views > MOST_VIEWS:
-        reasons.append(f"--batch-rule sqrt has a meaning for K <= {MOST_VIEWS}; K is {views}")
+        reasons.append(f"--batch-rule sqrt supports at most K = {MOST_VIEWS} views; K is {views}")
     return tuple(sorted(set(reasons)))
 
 
@@ -304,9 +310,10 @@ def refuse(reasons: tuple[str, ...]) -> None:
     """
     if reasons:
         raise IncompatibleSelectionError(
-            "these components cannot work together",
+            "the selected components cannot work together",
             found="; ".join(reasons),
-            todo="choose another combination (crossgrad plugins show NAME tells what each needs)",
+            todo="choose another combination (`crossgrad plugins show NAME` lists the "
+            "requirements of a component)",
         )
 
 
@@ -316,6 +323,14 @@ def _linear_note(setup: Setup) -> tuple[str, ...]:
         return ()
     if setup.watchers:
         return (
-            f"gradients of single views kept apart for {', '.join(setup.watchers)} (same bits)",
+            (
+                f"gradients of single views are stored for {', '.join(setup.watchers)} (the "
+                "result has the same bits)"
+            ),
         )
-    return (f"no separate gradients: operator {name} is linear, the backward passes accumulate",)
+    return (
+        (
+            f"gradients of single views are not stored: operator {name} is linear, so the "
+            "backward passes accumulate their sum"
+        ),
+    )

@@ -28,7 +28,7 @@ FRAMES: Final = 120
 FEWEST_SEEN: Final = 8
 #: With more views than this, the ends of a zoom path are chosen from an even sample of this size.
 MOST_VIEWS: Final = 500
-_TODO: Final = "write it with nerfstudio's viewer, or as docs/runs.md says"
+_TODO: Final = "write the file with nerfstudio's viewer, or as described in docs/runs.md"
 #: Longer paths are refused as a mistake.
 MOST_FRAMES: Final = 100_000
 _Floats = NDArray[np.float64]
@@ -84,11 +84,11 @@ def zoom_path(views: Sequence[View], points: _Floats, frames: int) -> tuple[Came
     known = known[:: 1 + len(known) // MOST_VIEWS]
     if len(known) < 2:  # noqa: PLR2004 - two ends
         raise UserError(
-            "the photos give no zoom path",
+            "no zoom path can be computed from the photos",
             where=f"--path {ZOOM}",
-            expected=f"two photos that observe {FEWEST_SEEN} SfM points or more",
+            expected=f"two photos that each observe at least {FEWEST_SEEN} SfM points",
             found=f"{len(known)}",
-            todo="give a file of cameras: --path FILE.json",
+            todo="give a camera path as a file: --path FILE.json",
         )
     distances = np.array([_distance(view.camera, points[view.seen]) for view in known])
     first, last = _ends(known, distances, len(points))
@@ -176,7 +176,7 @@ def _read(path: Path, similarity: Similarity) -> CameraPath:
         raise as_user_error(error, _Path, subject=f"camera path {path}", todo=_TODO) from error
     except (FileNotFoundError, ValueError) as error:
         raise UserError(
-            "unreadable camera path", where=f"--path {path}", found=str(error), todo=_TODO
+            "the camera path cannot be read", where=f"--path {path}", found=str(error), todo=_TODO
         ) from error
     size = round(found.render_width), round(found.render_height)
     cameras = [_camera(frame, size, similarity, path) for frame in found.camera_path]
@@ -187,9 +187,9 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
     matrix = np.array(frame.camera_to_world).reshape(4, 4)
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
         raise UserError(
-            "a camera of the path has no last row of a pose",
+            "the last row of a camera's pose is wrong",
             where=f"{path}, camera_to_world",
-            expected="16 numbers row by row, the last four 0, 0, 0, 1",
+            expected="16 numbers, row by row; the last four are 0, 0, 0, 1",
             found=str(matrix[3].tolist()),
             todo=_TODO,
         )
@@ -198,7 +198,7 @@ def _camera(frame: _Frame, size: tuple[int, int], similarity: Similarity, path: 
     rotation = turned / np.where(lengths > 0, lengths, 1.0)
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise UserError(
-            "a camera of the path has no rotation",
+            "the pose of a camera contains no valid rotation",
             where=f"{path}, camera_to_world",
             expected="three orthogonal axes, right-handed",
             found=str(frame.camera_to_world),
@@ -227,11 +227,11 @@ def checked_camera(camera: object) -> Camera:
         UserError: The input is not a camera, or one of its numbers is not valid for a camera.
     """
     if not isinstance(camera, Camera):
-        raise _refused("a view's name or a camera", f"{type(camera).__name__}")
+        raise _refused("the name of a view, or a camera", f"{type(camera).__name__}")
     sides = {"width": camera.width, "height": camera.height}
     for name, side in sides.items():
         if not isinstance(side, Integral) or isinstance(side, bool) or side < 1:
-            raise _refused(f"a {name} of 1 pixel or more", repr(side))
+            raise _refused(f"a {name} of at least 1 pixel", repr(side))
     for name in ("fx", "fy", "cx", "cy"):
         value, focal = getattr(camera, name), name in {"fx", "fy"}
         known = isinstance(value, Real) and isfinite(value)
@@ -240,7 +240,7 @@ def checked_camera(camera: object) -> Camera:
             raise _refused(f"a finite {name}{above}, in pixels", repr(value))
     if not _is_pose(camera.world_to_camera):
         raise _refused(
-            "world_to_camera, a tensor [4, 4] of a rotation and a translation",
+            "world_to_camera as a [4, 4] tensor of a rotation and a translation",
             str(camera.world_to_camera).replace("\n", ""),
         )
     return camera
@@ -257,9 +257,9 @@ def _is_pose(pose: object) -> bool:
 
 def _refused(expected: str, found: str) -> UserError:
     return UserError(
-        "this is no camera to draw",
+        "the argument is not a camera that can be rendered",
         where="Run.render",
         expected=expected,
         found=found,
-        todo="take one of `run.scene.views`, or change it with `dataclasses.replace`",
+        todo="use one of `run.scene.views`, or a copy made with `dataclasses.replace`",
     )

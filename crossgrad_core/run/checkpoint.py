@@ -112,10 +112,10 @@ def damaged(folder: Path, found: str) -> UserError:
     named = named_checkpoints(folder.parent).values()
     others = [path for path in named if path.name != folder.name and is_complete(path)]
     return UserError(
-        "damaged checkpoint",
+        "the checkpoint is damaged",
         where=folder,
         found=found,
-        todo=f"remove it; the run then goes on from {others[-1].name}"
+        todo=f"remove it; the run then continues from {others[-1].name}"
         if others
         else "start the run again",
     )
@@ -189,7 +189,7 @@ def check_json(value: object, where: str) -> None:
     """
     if wrong := no_json(value):
         raise UserError(
-            "state that a checkpoint cannot hold",
+            "a plugin's state contains values that a checkpoint cannot hold",
             where=where,
             expected="numbers, strings, lists, dictionaries with text keys, None",
             found=wrong,
@@ -205,25 +205,25 @@ def read_state(folder: Path) -> dict[str, Any]:
     """
     if not folder.is_dir():
         raise UserError(
-            "no such checkpoint",
+            "the checkpoint does not exist",
             where=folder,
-            todo="name a folder below checkpoints/ in the folder of a run",
+            todo="name a folder in checkpoints/ of a run",
         )
     try:
         state = read_json(folder / STATE)
     except FileNotFoundError as error:
         raise damaged(folder, f"no {STATE}") from error
     except ValueError as error:
-        raise damaged(folder, f"{STATE} is not JSON: {error}") from error
+        raise damaged(folder, f"{STATE} is not valid JSON: {error}") from error
     if not isinstance(state, dict) or "format" not in state:
-        raise damaged(folder, f"{STATE} is not the state of a checkpoint")
+        raise damaged(folder, f"{STATE} does not contain the state of a checkpoint")
     if state["format"] != FORMAT:
         raise UserError(
-            "checkpoint of another format version",
+            "the checkpoint was written in another format version",
             where=folder,
             expected=f"version {FORMAT} (crossgrad {VERSION})",
             found=f"version {state['format']} (crossgrad {state.get('crossgrad', '?')})",
-            todo="continue with the version of crossgrad that wrote it",
+            todo="resume with the version of crossgrad that wrote it",
         )
     _check_whole(state, folder)
     return state
@@ -236,10 +236,10 @@ def _check_whole(state: Mapping[str, Any], folder: Path) -> None:
         UserError: The digest differs, or a part is missing or of another type.
     """
     if state.get(_DIGEST) != digest(state):
-        raise damaged(folder, f"{STATE} is not what was written (its SHA-256 differs)")
+        raise damaged(folder, f"{STATE} has changed since it was written (its SHA-256 differs)")
     wrong = [name for name, holds in _PARTS.items() if not holds(state.get(name))]
     if wrong:
-        raise damaged(folder, f"{STATE} lacks a valid {', '.join(wrong)}")
+        raise damaged(folder, f"{STATE} has no valid {', '.join(wrong)}")
 
 
 def _is_count(value: object) -> bool:
@@ -250,7 +250,7 @@ def _is_map(value: object) -> bool:
     return isinstance(value, dict)
 
 
-#: Part of a state -> test for a valid value.
+#: Part of a state -> function that tests whether its value is valid.
 _PARTS: Mapping[str, Callable[[Any], bool]] = {
     "sha256": lambda value: isinstance(value, str),
     "step": _is_count,
@@ -339,7 +339,7 @@ def write_tensors(path: Path, packed: dict[str, Tensor]) -> None:
         path.touch()
         mode = path.stat().st_mode
         save_file(packed, path)
-        # The library creates a file of its own that only its owner may read.
+        # The library creates a new file that only its owner may read.
         path.chmod(mode)
         sync_file(path)
     except SafetensorError as error:
@@ -361,7 +361,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     try:
         if showable(str(path)) != str(path):  # The library opens names in UTF-8 only.
             return load(path.read_bytes())
-        # Clones, because the library maps the file, which a later checkpoint may delete.
+        # Clone the tensors, because the library maps the file, which a later checkpoint may delete.
         return {key: tensor.clone() for key, tensor in load_file(path).items()}
     except SafetensorError as error:
         raise ValueError(str(error)) from error
@@ -463,9 +463,9 @@ def latest(run: Path) -> Path:
         if steps:
             return steps[max(steps)]
     raise UserError(
-        "no checkpoint to continue from",
+        "there is no checkpoint to resume from",
         where=run,
-        expected=f"the folder of a run with {CHECKPOINTS}/step-.../{STATE} in it",
+        expected=f"the folder of a run that contains {CHECKPOINTS}/step-.../{STATE}",
         found="a PLY file, which holds no optimizer state" if run.suffix == ".ply" else "",
         todo="name the folder of a run; use --init FILE.ply to start a new run from Gaussians",
     )
@@ -488,7 +488,7 @@ def load(folder: Path) -> Checkpoint:
     if not (folder / TENSORS).is_file():
         raise damaged(folder, f"no {TENSORS}")
     if digest_of(folder / TENSORS) != state["sha256"]:
-        raise damaged(folder, f"{TENSORS} is not what was written (its SHA-256 differs)")
+        raise damaged(folder, f"{TENSORS} has changed since it was written (its SHA-256 differs)")
     try:
         packed = read_tensors(folder / TENSORS)
         # The library sorts by key; the order of parameters must survive too.

@@ -16,17 +16,17 @@ from crossgrad_core.numerics.rotations import rotation_matrices
 from crossgrad_core.run.assemble import accepts, read_scene
 from crossgrad_core.training.setup import Setup
 
-#: A pose nearer than this to the pose of a training view counts as the same: local units (extents),
-#: and radians.
+#: A view counts as a training view if its pose is nearer to a training pose than these limits:
+#: local units (extents), and radians.
 SAME_PLACE, SAME_DIRECTION = 1e-3, 1e-2
-#: At least this share of the other capture's points must be in the box around the run's points and
-#: cameras, enlarged by this factor.
+#: The capture is accepted if at least this share of its points is inside the box around the run's
+#: points and cameras, enlarged by this factor.
 LEAST_SHARED, MARGIN = 0.1, 1.1
 #: Points of two captures of one place are on the same surfaces. Their median distance from the
 #: run's points is at most this share of the median after any of `TURNS` random rotations about the
 #: middle of the capture.
 LEAST_ALIKE, TURNS = 0.4, 9
-#: Numbers of points for this test: at least, at most of the other capture, at most of the run.
+#: Numbers of points for this test: minimum, maximum from the other capture, maximum from the run.
 FEWEST_POINTS, MOST_POINTS, MOST_OWN = 200, 2_000, 50_000
 
 
@@ -53,11 +53,12 @@ class Elsewhere:
         told = []
         if not self.alike:
             told.append(
-                "the points of this scene lie hardly nearer to the run's than if it were turned at "
-                "random: look at its renders; is it the same place, in the same coordinates?"
+                "the points of this capture match the scene of the run hardly better than "
+                "after a random rotation: check the renders, and check that both show the "
+                "same place in the same coordinates"
             )
         if self.trained:
-            told.append(f"left out: {self.trained} of its views that the run was trained on")
+            told.append(f"left out: {self.trained} views that the run was trained on")
         return told
 
 
@@ -84,9 +85,10 @@ def elsewhere(setup: Setup, path: Path) -> Elsewhere:
     views = tuple(view for view, known in zip(moved, trained, strict=True) if not known)
     if not views:
         raise UserError(
-            "the run was trained on all views of this scene",
+            "there are no views to evaluate: the run was trained on all views of this scene",
             where=f"--on {path}",
-            todo="name another capture of the place; leave --on out for the held-out views",
+            todo="name another capture of the same place, or leave --on out to evaluate the "
+            "held-out views",
         )
     alike = _alike(setup.scene.points, points)
     return Elsewhere(other.name, views, points, len(moved) - len(views), alike)
@@ -140,11 +142,11 @@ def _check_place(
     share = float(np.mean(np.all(np.abs(what - middle) <= MARGIN * half, axis=1)))
     if share < LEAST_SHARED:
         raise UserError(
-            "this scene lies elsewhere",
+            "the other capture does not overlap with the scene of the run",
             where=f"--on {path}",
-            expected="a capture of the same place, in the coordinates of the run's scene",
-            found=f"{share:.0%} of its points lie within the run's",
-            todo="align the two models first, or find the poses of all photos in one go",
+            expected="a capture of the same place, in the coordinate system of the run's scene",
+            found=f"{share:.0%} of its points are inside the run's scene",
+            todo="align the two models first, or estimate the poses of all photos together",
         )
 
 
@@ -155,7 +157,8 @@ def _alike(own: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
     """
     from scipy.spatial import cKDTree
 
-    # Points outside the run's points do not count: the other capture may show more of the place.
+    # Ignore points outside the box of the run's points, because the other capture may show a larger
+    # area.
     points = points[((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1)]
     if min(len(own), len(points)) < FEWEST_POINTS:
         return True

@@ -30,10 +30,10 @@ from crossgrad_core.training.numbers import Numbers
 from crossgrad_core.training.setup import Setup
 
 _LOG = logging.getLogger(__name__)
-#: A planner: a function of the configuration (only the user's settings) and the scene that returns
-#: the rows of the settings that the scene decides.
+#: Function of a planner. It receives the configuration (only the user's settings) and the scene,
+#: and returns the rows of the settings that the scene decides.
 Planner: TypeAlias = Callable[[RunConfig, Scene], Sequence[Decision]]
-#: Length of a run for which neither steps nor views nor seconds are set (3DGS).
+#: Default length of a run if neither steps nor views nor seconds are set (3DGS).
 DEFAULT_STEPS = 30_000
 
 
@@ -89,13 +89,14 @@ def with_decisions(
             or the recipe does not decide a setting.
     """
     if config.seconds is not None:
-        # The seconds are planned anew, and so is everything that depends on the length.
+        # The number of steps for the time budget is planned again, and all settings that depend on
+        # the length.
         config = open_again(config)
     if is_complete(config):
         return config, rows_of(config), repeats
     of_scene: tuple[Decision, ...] = ()
     if config.plan != "off":
-        _LOG.info("looking at what the scene needs")
+        _LOG.info("checking which components the scene needs")
         planner = cast("Planner", resolve_entry(find(PLANNERS, PLANNER)))
         of_scene = tuple(planner(config, scene))
         config = applied(config, of_scene, PLANNER)

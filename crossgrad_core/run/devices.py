@@ -26,7 +26,7 @@ def choose_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise UserError(
-            f"there is no device {name!r}",
+            f"the device name {name!r} is unknown",
             where="--device",
             expected="auto, cpu, cuda or cuda:N",
             todo="leave --device out to run on a GPU if one can be used, or use --device cpu",
@@ -50,14 +50,14 @@ def _require_cuda(device: torch.device) -> None:
     # A torch build for AMD GPUs also calls them CUDA devices.
     built_for = torch.version.cuda or torch.version.hip
     if built_for is None:
-        found, todo = "a build for CPUs only", "install a CUDA build of torch"
+        found, todo = "a build without CUDA", "install a CUDA build of torch"
     elif count == 0:
-        found = f"a build for CUDA {built_for}, but no GPU that it can use"
-        todo = "run nvidia-smi: it tells whether there is a GPU and whether its driver works"
+        found = f"a build for CUDA {built_for}, but no usable GPU"
+        todo = "run nvidia-smi, which shows whether there is a GPU and whether its driver works"
     else:
-        found, todo = f"devices cuda:0 to cuda:{count - 1}", "choose one of them"
+        found, todo = f"devices cuda:0 to cuda:{count - 1}", "choose one of these devices"
     raise UserError(
-        f"torch sees no device {str(device)!r}",
+        f"torch cannot use the device {str(device)!r}",
         where="--device",
         found=f"torch {torch.__version__}: {found}",
         todo=f"use --device cpu, or {todo}",
@@ -79,7 +79,10 @@ def with_device(config: RunConfig) -> tuple[RunConfig, tuple[str, ...]]:
     if why:
         device, note = "cpu", f"device cpu: {gpu} is not used, because {why}"
     else:
-        device, note = "cuda", f"device cuda: rasterizer {name} works on {gpu} (or --device cpu)"
+        device, note = (
+            "cuda",
+            f"device cuda: rasterizer {name} works on {gpu} (use --device cpu to avoid it)",
+        )
     return config.model_copy(update={"device": device}), (note,)
 
 
@@ -91,7 +94,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
     """
     name = config.rasterizer.name
     if config.seconds is not None and config.clock == "cpu":
-        return name, "--clock cpu does not count what a GPU does"
+        return name, "--clock cpu does not count the time of a GPU"
     if name != AUTO:
         named = load(Rasterizer, name)
         runs = "cuda" in named.devices
@@ -102,7 +105,7 @@ def _rasterizer(config: RunConfig) -> tuple[str, str]:
     able = fastest_able(faster, demands(config, "cuda", *_trained(config)), notes)
     if able is not None:
         return able, ""
-    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster there"
+    return name, sentences(*notes, *_missing()) or "no installed rasterizer is faster on it"
 
 
 def _trained(config: RunConfig) -> tuple[Backbone, Densifier]:
@@ -119,14 +122,14 @@ def _missing() -> list[str]:
     for name in entries("rasterizers"):
         try:
             told.append(load(Rasterizer, name).missing("cuda"))
-        except UserError:  # Another note already reports that it cannot be imported.
+        except UserError:  # Another note already reports that the package cannot be imported.
             continue
     return told
 
 
 def _failure(config: RunConfig, name: str) -> str:
     """Test the rasterizer on the GPU and return the problem; empty if it works."""
-    _LOG.info("trying rasterizer %s on the GPU: the first time it may compile for minutes", name)
+    _LOG.info("testing rasterizer %s on the GPU; the first time, compiling may take minutes", name)
     try:
         build(Rasterizer, name, config.rasterizer.options).self_test("cuda")
     except UserError as error:

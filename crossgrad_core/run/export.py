@@ -212,8 +212,9 @@ def described(exported: Exported, path: Path) -> Sequence[str]:
     baked = "" if exported.baked_for is None else f"baked for {exported.baked_for}; "
     over = "" if exported.background is None else f" over its background {exported.background}"
     lines.append(
-        f"{path.name}: {baked}drawn on black, as viewers draw it, it has {exported.psnr:.2f} dB, "
-        f"the live model{over} {exported.live_psnr:.2f} dB (loss {exported.loss:.2f} dB, "
-        f"{exported.views} views)"
+        f"{path.name}: {baked}rendered on black, as viewers do, it has "
+        f"{exported.psnr:.2f} dB, and the trained model{over} has "
+        f"{exported.live_psnr:.2f} dB (loss {exported.loss:.2f} dB, {exported.views} "
+        "views)"
     )
     return lines

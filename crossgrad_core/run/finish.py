@@ -28,7 +28,7 @@ from crossgrad_core.training.state import PhaseTimer, RollbackGuard, TrainingFai
 from crossgrad_core.training.step import final_edits
 from crossgrad_core.wording import one_line
 
-#: Texts in torch errors that mean out of memory; some such errors have a type of their own.
+#: Texts in errors of torch that mean out of memory; some of these errors also have their own type.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
@@ -118,11 +118,12 @@ class RunLoop:
         """
         self._attempt("", lambda: self._train(length))
         if self.ending.status == "finished":
-            self._attempt("the model is left as it was trained", self._edit_finished)
+            self._attempt("the trained model was not changed", self._edit_finished)
         self._attempt("", lambda: self.session.align(self.setup, self.state))
         if self.session.gone:
             return self.ending
-        # A state that a step left half changed, and that was not restored, cannot be continued.
+        # A run cannot continue from a state that a failed step changed partly and that was not
+        # restored.
         if self.state.step > 0 and not self.state.touched:
             self._attempt("no checkpoint", lambda: self.session.save(self.setup, self.state))
             self._describe()
@@ -155,8 +156,10 @@ class RunLoop:
                     return
                 revised = length.revised(self.setup, state)
                 if revised is not self.setup:
-                    guard.copy(state)  # No rollback before the step of a new length.
-                if revised.config is not self.setup.config:  # A planned length is written already.
+                    # Do not allow a rollback to a step before the length changed.
+                    guard.copy(state)
+                # If the configuration is the same object, the planned length is already written.
+                if revised.config is not self.setup.config:
                     folder = self.session.folder
                     write_config(folder, revised.config, read_notes(folder))
                 self.setup = revised
@@ -197,7 +200,7 @@ class RunLoop:
             try:
                 return part()
             except Exception as error:
-                # Compiled code can turn an interrupt into an error of its own.
+                # Compiled code can replace an interrupt by its own error.
                 if self.stopper.at_once:
                     raise KeyboardInterrupt from error
                 raise
@@ -254,13 +257,13 @@ def exit_messages(course: RunLoop) -> list[str]:
     lines = []
     if not course.state.primitives(course.setup):
         name = course.setup.selection.names["densifier"]
-        lines.append(f"no primitive is left: look at densifier {name} and at the photos")
+        lines.append(f"no Gaussian is left: check densifier {name} and the photos")
     if ending.error is not None:
         lines += f"training failed: {ending.error}".splitlines()
     if course.session.gone:
         return lines
     if ending.traced:
-        lines.append(f"the traceback is in {one_line(folder / LOG)}")
+        lines.append(f"{one_line(folder / LOG)} contains the traceback")
     lines += _kept(course)
     if ending.status == "finished":
         return [*lines, *overdone(read_metrics(folder))]
@@ -274,16 +277,18 @@ def overdone(rows: Sequence[Row]) -> list[str]:
         return []
     gap, step = best["psnr"] - last, best["step"]
     return [
-        f"the last evaluation is {gap:.2f} dB below that of step {step:.0f}, "
-        f"{best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: a shorter run "
-        "may be enough (--max-views N)"
+        (
+            f"the last evaluation is {gap:.2f} dB lower than at step {step:.0f}, which "
+            f"had {best['psnr']:.2f} dB after {best['train_seconds']:,.0f} s of training: "
+            "a shorter run may be sufficient (--max-views N)"
+        )
     ]
 
 
 def next_line(folder: Path) -> str:
     """Return the commands that show and deliver the results of a finished run."""
     run = one_line(quote(str(folder)))
-    return f"next: crossgrad render {run} (pictures), crossgrad export {run} (a file for viewers)"
+    return f"next: crossgrad render {run} (images), crossgrad export {run} (a file for viewers)"
 
 
 def resume_line(folder: Path) -> str:
@@ -297,13 +302,13 @@ def _kept(course: RunLoop) -> list[str]:
     saved = max(named_checkpoints(course.session.folder / CHECKPOINTS), default=0)
     if saved >= step:
         return []
-    there = f"the newest checkpoint is that of step {saved}" if saved else "there is no checkpoint"
+    there = f"the latest checkpoint is from step {saved}" if saved else "there is no checkpoint"
     return [f"the state of step {step} could not be saved; {there}"]
 
 
 #: Steps and training seconds to observe before the estimate; the very first step is left out.
 LOOK_STEPS, LOOK_SECONDS = 3, 2.0
-#: No estimate is given for less than this many seconds: the run ends before it helps.
+#: No estimate is shown if less time than this remains, in seconds.
 WORTH_A_LINE = 60.0
 
 
@@ -347,8 +352,9 @@ class Forecast:
         if ahead < WORTH_A_LINE:
             return
         left = setup.schedule.total - state.step
-        growth = ", growth included" if ahead > left * each else ""
+        growth = ", including growth" if ahead > left * each else ""
         setup.hook.crossgrad_log(
-            text=f"{left:,} more steps take {roughly(ahead)} (one takes {each * 1000:.0f} ms now"
-            f"{growth}); --seconds S sets a time instead, and Ctrl-C keeps what there is"
+            text=f"the remaining {left:,} steps take {roughly(ahead)} (one step takes "
+            f"{each * 1000:.0f} ms now{growth}); --seconds S sets a time limit instead, "
+            "and Ctrl-C stops the run and keeps the results so far"
         )

@@ -54,8 +54,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import Clock, Counters, TrainState
 from crossgrad_core.wording import in_one_line, listed, plural, singular
 
-#: Settings that do not affect what was trained, or that a resumed run may have changed: paths,
-#: times of evaluations, the number of tolerated faults, and a length that follows the clock.
+#: Settings that do not affect the trained result, or that a resumed run may have changed: paths,
+#: times of evaluations, the number of tolerated faults, and a length that follows a time budget.
 _LOOSE: Final = frozenset(
     {
         "clock",
@@ -83,10 +83,10 @@ _LOOSE: Final = frozenset(
         "threads",
     }
 )
-#: The component that another machine may lack.
+#: Component that another machine may lack.
 _DRAWN: Final = "rasterizer"
-#: Key that tells whether the length follows a clock.
-_TIMED: Final = "follows the clock"
+#: Key that records whether the length follows a time budget.
+_TIMED: Final = "the length follows a time budget"
 
 
 def settings_of(config: RunConfig) -> dict[str, Json]:
@@ -95,10 +95,11 @@ def settings_of(config: RunConfig) -> dict[str, Json]:
     if config.planned_seconds is None:
         loose -= {"revisions"}
     else:
-        loose |= {"steps"}  # The clock may have changed the number.
+        loose |= {"steps"}  # The run may have changed the number to meet its time budget.
     data = config.model_dump(mode="json", exclude=loose)
-    del data[_DRAWN]["name"]  # Another machine may use another rasterizer; its options still count.
-    # The same default as in `_config`, for a run that did not write this setting.
+    # Another machine may use another rasterizer, but its options still count.
+    del data[_DRAWN]["name"]
+    # The default is equal to that of `_config`, for a run that did not write this setting.
     data |= {
         "sh_from": config.sh_from or 0,
     }
@@ -151,7 +152,9 @@ def from_checkpoint(setup: Setup, checkpoint: Checkpoint) -> TrainState:
     rows = state.primitives(setup)
     for name, held in state.states.items():
         if any(tensor.shape[:1] != (rows,) for tensor in held.per_primitive.values()):
-            raise _misfit(checkpoint, f"a row for each of {rows} primitives", f"state of {name}")
+            raise _misfit(
+                checkpoint, f"one row for each of {rows} Gaussians", f"the state of {name}"
+            )
     return state
 
 
@@ -163,22 +166,24 @@ def check_settings(config: RunConfig, checkpoint: Checkpoint) -> None:
     """
     stored = checkpoint.scalars.get("settings")
     if not isinstance(stored, dict) or stored.get("crossgrad") != VERSION:
-        return  # Written by another version: it stored no settings, or they may have other names.
+        return  # Another version wrote the checkpoint: it stored no settings, or under other names.
     ours = settings_of(config)
-    # A setting that is newer than the checkpoint is not a change; an option of a component may be.
+    # A setting that did not exist when the checkpoint was written is not a change. A new option of
+    # a component may be a change.
     known = {key.partition(".")[0] for key in stored}
     both = {key for key in ours.keys() | stored.keys() if key.partition(".")[0] in known}
-    # Another rasterizer has other options. A length that follows the clock lacks these settings.
+    # Another rasterizer has other options. A length that follows a time budget lacks these
+    # settings.
     either = {_DRAWN, "steps", "revisions", "revised"}
     both -= {k for k in ours.keys() ^ stored.keys() if k.partition(".")[0] in either}
     changed = sorted(key for key in both if ours.get(key) != stored.get(key))
     if changed:
         raise UserError(
-            "config.yaml was changed since this run began",
+            "settings in config.yaml have changed since the run was started",
             where=f"settings {listed(changed)}; step {checkpoint.step}",
             expected=listed(f"{key}: {stored.get(key)}" for key in changed),
             found=listed(f"{key}: {ours.get(key)}" for key in changed),
-            todo="put them back, or start a new run with the changed file (--config)",
+            todo="restore the old values, or start a new run with the changed file (--config)",
         )
 
 
@@ -229,7 +234,7 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
     trained = [name for block in setup.trained_blocks for name in block.tensors]
     whole = [name for name in trained if not parameters[name].is_floating_point()]
     if whole:
-        raise _misfit(checkpoint, "floating-point numbers to train", listed(whole))
+        raise _misfit(checkpoint, "floating-point numbers for the trained tensors", listed(whole))
     rows = {
         parameters[name].shape[:1]
         for block in setup.blocks
@@ -237,16 +242,16 @@ def _check_tensors(setup: Setup, checkpoint: Checkpoint) -> None:
         for name in block.tensors
     }
     if len(rows) > 1:
-        raise _misfit(checkpoint, "as many rows of one parameter as of another", str(sorted(rows)))
+        raise _misfit(checkpoint, "the same number of rows in every parameter", str(sorted(rows)))
     for moments in (checkpoint.exp_avg, checkpoint.exp_avg_sq):
         for name, tensor in moments.items():
             if name not in parameters or tensor.shape != parameters[name].shape:
-                raise _misfit(checkpoint, "moments in the shapes of the parameters", name)
+                raise _misfit(checkpoint, "moments with the shapes of the parameters", name)
 
 
 def _misfit(checkpoint: Checkpoint, expected: str, found: str) -> UserError:
     return UserError(
-        "the checkpoint does not fit the run",
+        "the checkpoint does not match the run",
         where=f"the checkpoint of step {checkpoint.step}",
         expected=expected,
         found=found,
@@ -278,11 +283,11 @@ _PLAIN: Final = {
     "operator": defaults.OPERATOR,
     "densifier": defaults.NO_DENSIFIER,
     "loss": defaults.LOSS,
-    # It needs no points; the scene may have none.
+    # This initializer needs no points, because the scene may have none.
     "initializer": defaults.INITIALIZER_WITHOUT_POINTS,
     "resolution": defaults.RESOLUTION,
 }
-#: Slots (singular words) whose components are not needed to look at a run.
+#: Slots (singular words) whose components are not needed to evaluate a run.
 REPLACEABLE: Final = frozenset({*_PLAIN, *map(singular, MANY)})
 
 
@@ -307,7 +312,7 @@ def without_missing(config: RunConfig) -> RunConfig:
         lacking.append(f"rules {listed(gone)}")
         update["rules"] = {n: each for n, each in config.rules.items() if n not in gone}
     if lacking:
-        _LOG.warning("not installed here, and left out: %s", listed(lacking))
+        _LOG.warning("not installed here, so they are not used: %s", listed(lacking))
     return config.model_copy(update=update)
 
 
@@ -332,8 +337,8 @@ def as_it_was(config: RunConfig, trained: RunConfig) -> RunConfig:
 
 #: Status of a run that wrote its results and a checkpoint.
 _WITH_RESULTS: Final[tuple[Status, ...]] = ("finished", "stopped")
-#: Note of a run that has to begin again.
-BEGINS_AGAIN = "no checkpoint yet: the run begins again from its configuration"
+#: Note of a run that has to start again.
+BEGINS_AGAIN = "no checkpoint yet: the run starts again from its configuration"
 
 
 def set_up(
@@ -383,12 +388,13 @@ def _refuse_lost_checkpoints(folder: Path) -> None:
     for status in _WITH_RESULTS:
         if step := summarised_step(folder, status):
             raise UserError(
-                "the checkpoints of the run are gone",
+                "the checkpoints of the run are missing",
                 where=folder / CHECKPOINTS,
-                expected=f"step {step}, which the results in the folder are of",
+                expected=f"the checkpoint of step {step}, the step of the results in the folder",
                 found="none",
-                todo="its files are as they were, and --init with its point_cloud.ply starts from "
-                "its Gaussians; `crossgrad run --config FOLDER/config.yaml` repeats it elsewhere",
+                todo="nothing was changed; --init with the run's point_cloud.ply starts a new run "
+                "from its Gaussians, and `crossgrad run --config FOLDER/config.yaml` repeats "
+                "the run in a new folder",
             )
 
 
@@ -405,10 +411,10 @@ def require_checkpoint(folder: Path) -> None:
         raise UserError(
             "the run has no checkpoint yet",
             where=folder,
-            found=writer or "a run that was ended before its first checkpoint",
-            todo="wait for the first one"
+            found=writer or "a run that ended before its first checkpoint",
+            todo="wait for the first checkpoint"
             if writer
-            else f"crossgrad run --resume {folder} begins it again",
+            else f"start it again: crossgrad run --resume {folder}",
         )
 
 
@@ -481,7 +487,7 @@ def _from(
     looks: bool = False,
 ) -> tuple[Setup, TrainState]:
     checkpoint = load_latest(folder)
-    # Read after the checkpoint: a run that follows the clock only adds to its configuration.
+    # Read the file after the checkpoint, because a run with a time budget only adds settings to it.
     config = _config(folder, settings)
     config_now = without_missing(config) if looks else config
     setup, seconds = set_up(config_now, verbosity, check, looks=looks)
@@ -511,14 +517,14 @@ def _config(folder: Path, settings: Mapping[str, Any]) -> RunConfig:
     frozen = sorted(set(settings) - CHANGEABLE)
     if frozen:
         raise UserError(
-            "a resumed run keeps its settings",
+            "settings cannot be changed when a run is resumed",
             where=f"settings {listed(frozen)}",
-            expected=f"none but {listed(sorted(CHANGEABLE))}",
-            todo="leave them out, or start a new run",
+            expected=f"only {listed(sorted(CHANGEABLE))}",
+            todo="leave these settings out, or start a new run",
         )
     stored = read_config(folder)
     stored.pop("stop_after", None)
-    # Runs write the degree that they begin with; runs of the first versions began with degree 0.
+    # Runs write the initial degree; runs of the first versions started with degree 0.
     stored["sh_from"] = stored.get("sh_from") or 0
     try:
         config = parsed({**stored, **settings})
@@ -544,5 +550,5 @@ def _check_device(name: str, folder: Path) -> None:
         raise UserError(
             "the run was trained on CUDA, and torch sees no CUDA device here",
             where=f"{folder / CONFIG}, device: {name}",
-            todo="add --device cpu, or go on where there is one",
+            todo="add --device cpu, or resume the run on a machine with a CUDA device",
         )

@@ -72,16 +72,20 @@ def choose_rasterizer(name: str, wanted: Wanted) -> tuple[str, tuple[str, ...]]:
         UserError: The user named no rasterizer, and no installed rasterizer runs on the device.
     """
     if name != AUTO:
-        return name, (f"rasterizer {name}: asked for",)
+        return name, (f"rasterizer {name}: chosen by the user",)
     speeds, notes = speeds_on(wanted.device)
     if not speeds:
         raise UserError(
             f"no installed rasterizer runs on device {wanted.device}",
             where="--rasterizer",
-            todo="install one, or use --device cpu",
+            todo="install a rasterizer for this device, or use --device cpu",
         )
     chosen = fastest_able(speeds, wanted, notes) or _ranked(speeds)[0]
-    why = f"the fastest of {len(speeds)} here" if len(speeds) > 1 else "the only one here that runs"
+    why = (
+        f"the fastest of {len(speeds)} usable rasterizers"
+        if len(speeds) > 1
+        else "the only usable rasterizer"
+    )
     return chosen, (*notes, f"rasterizer {chosen}: {why} on {wanted.device}")
 
 
@@ -97,11 +101,11 @@ def fastest_able(speeds: Mapping[str, float], wanted: Wanted, notes: list[str]) 
         try:
             lacks = wanted.lacking(load(Rasterizer, name))
         except UserError as error:
-            notes.append(f"rasterizer {name} left out: {error.what}")
+            notes.append(f"rasterizer {name} is not used: {error.what}")
             continue
         if not lacks:
             return name
-        notes.append(f"rasterizer {name} left out: this run needs {listed(lacks)}")
+        notes.append(f"rasterizer {name} is not used: this run needs {listed(lacks)}")
     return None
 
 
@@ -121,7 +125,7 @@ def drawn_elsewhere(config: RunConfig) -> RunConfig:
         return config
     shared = set.intersection(*(set(load(Rasterizer, each).model_fields) for each in others))
     kept = {key: value for key, value in config.rasterizer.options.items() if key in shared}
-    _LOG.warning("rasterizer %s does not run on %s: another one draws", name, device)
+    _LOG.warning("rasterizer %s does not run on %s: another rasterizer is used", name, device)
     choice = ComponentChoice.model_validate({"name": AUTO, **kept})
     return config.model_copy(update={"rasterizer": choice})
 
@@ -139,7 +143,7 @@ def speeds_on(device: str) -> tuple[dict[str, float], list[str]]:
             speed = float((load(Rasterizer, name).speed if quick is None else quick)(device))
         except Exception as error:
             why = getattr(error, "what", in_one_line(error))
-            notes.append(f"rasterizer {name} left out: {why}")
+            notes.append(f"rasterizer {name} is not used: {why}")
             continue
         if speed > 0.0:
             speeds[name] = speed

@@ -32,7 +32,7 @@ from crossgrad_core.wording import listed
 
 #: The base class of a slot.
 C = TypeVar("C", bound=Component)
-#: The search for a K that suits sampler and operator ends before this number.
+#: The search for a K that suits both sampler and operator ends before this number.
 _MOST_VIEWS: Final = 13
 
 
@@ -113,9 +113,9 @@ def _require_points(config: RunConfig, scene: Scene, start: Initializer) -> None
             "the scene has no SfM points to start from",
             where=config.scene or scene.name,
             found=_clouds_in(config.scene),
-            todo=f"find some in the photos (--initializer {INITIALIZER_WITHOUT_POINTS}), or start "
-            "from those of a point cloud (--points FILE), from the Gaussians of a file (--init "
-            "FILE.ply) or from random points (--init random)",
+            todo=f"find points in the photos (--initializer {INITIALIZER_WITHOUT_POINTS}), "
+            "start from a point cloud (--points FILE), from the Gaussians of a PLY file "
+            "(--init FILE.ply) or from random points (--init random)",
         )
 
 
@@ -123,7 +123,7 @@ def _clouds_in(folder: Path | None) -> str:
     """Describe the files in the scene's folder that may be point clouds."""
     files = sorted(folder.iterdir()) if folder is not None and folder.is_dir() else []
     names = [file.name for file in files if file.suffix.lower() in CLOUDS]
-    return f"point clouds that are not used: {listed(names)}" if names else "no point cloud"
+    return f"unused point clouds: {listed(names)}" if names else "no point cloud"
 
 
 def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -> None:
@@ -131,12 +131,13 @@ def _require_shown_points(config: RunConfig, scene: Scene, start: Initializer) -
         return
     if not any(is_in_image(view.camera, scene.points).any() for view in scene.train_views):
         raise UserError(
-            "no training photo shows any of the scene's points: there is nothing to train",
+            "no SfM point of the scene is visible in a training photo, so nothing can be trained",
             where=config.scene or scene.name,
-            expected="points and cameras in one frame, with the cameras looking at the points",
-            found=f"{len(scene.points):,} points, none of them in {len(scene.train_views)} photos",
-            todo="mend the model, or find points in the photos "
-            f"(--initializer {INITIALIZER_WITHOUT_POINTS})",
+            expected="cameras that look at the points, in the same coordinate system",
+            found=f"{len(scene.points):,} points, none of them visible in "
+            f"{len(scene.train_views)} photos",
+            todo="correct the model, or find points in the photos (--initializer "
+            f"{INITIALIZER_WITHOUT_POINTS})",
         )
 
 
@@ -147,8 +148,9 @@ def _require_decided_options(config: RunConfig, name: str) -> None:
         raise UserError(
             f"rasterizer {name} has no option {listed(decided)}, which the recipe sets",
             where=f"--recipe {config.recipe.name}",
-            expected=f"a rasterizer with the option {listed(decided)}",
-            todo="leave --rasterizer out: auto takes one that has it; or choose another recipe",
+            expected="a rasterizer with this option",
+            todo="leave --rasterizer out, so that `auto` chooses a rasterizer with the "
+            "option, or choose another recipe",
         )
 
 
@@ -184,12 +186,14 @@ def _metrics(config: RunConfig, scene: Scene, notes: list[str]) -> dict[str, Met
         if not twice:
             metrics[name] = metric
         elif name in METRICS.split("+"):
-            notes.append(f"metric {name} is left out: metrics.csv has a column {listed(twice)}")
+            notes.append(
+                f"metric {name} is not computed: metrics.csv already has a column {listed(twice)}"
+            )
         else:
             raise UserError(
-                f"two columns of metrics.csv would be called {listed(twice)}",
+                f"two columns of metrics.csv would have the same name: {listed(twice)}",
                 where=f"metrics {listed((*metrics, name))}; regimes {listed(regimes)}",
-                expected="figures whose names are no other's, nor those of another one in a regime",
+                expected="a different column name for every metric and regime",
                 todo=f"leave metric {name} out, or rename the folder of photos",
             )
     return metrics
@@ -200,9 +204,9 @@ def _check_form(name: str, form: str) -> None:
         format(0.0, form)
     except (TypeError, ValueError) as error:
         raise UserError(
-            f"metric {name} has a figure that cannot be shown",
-            where="its form",
-            expected="one that formats floating-point numbers, such as .4f or .0f",
+            f"a value of metric {name} cannot be formatted",
+            where="the format of the metric",
+            expected="a format for floating-point numbers, such as .4f or .0f",
             found=repr(form),
             todo=f"repair the plugin, or leave metric {name} out",
         ) from error
@@ -227,11 +231,12 @@ def _grouping_choice(
         return _or_default(config.grouping, name)
     if config.grouping is not None:
         raise UserError(
-            "neither the sampler nor the operator uses a grouping that could have options",
+            "options of a grouping were given, but neither the sampler nor the operator "
+            "uses a grouping",
             where="grouping",
-            todo="name the grouping with --grouping, or leave its options out",
+            todo="choose a grouping with --grouping, or leave its options out",
         )
-    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views alike")
+    notes.append(f"no grouping: sampler {config.sampler.name} draws from all views without groups")
     return None
 
 
@@ -259,9 +264,9 @@ def views_per_step_of(config: RunConfig) -> tuple[ViewsPerStepSpec, str]:
     named = config.operator != RunConfig.model_fields["operator"].default
     found, why = usual, ""
     if usual not in both:
-        # If no K suits both, the objections say so.
+        # If no K suits both, the validation of the selection reports it.
         found, why = next(iter(both), usual), f"the operator needs {operator.views}"
     elif named and operator.needs_more_views(usual):
         found = next((k for k in both if not operator.needs_more_views(k)), usual)
-        why = "with fewer views the operator does nothing"
+        why = "with fewer views the operator has no effect"
     return ViewsPerStepSpec((found,)), why if found != usual else ""

@@ -34,7 +34,7 @@ from crossgrad_core.training.state import TrainState
 
 #: The trained scene, for viewers; the exporter gives the suffix.
 CLOUD = "point_cloud"
-#: Number of held-out views for which panels are drawn.
+#: Number of held-out views for which panels are rendered.
 PANELS = 4
 
 
@@ -134,10 +134,10 @@ class Session:
         """
         if self.gone:
             raise UserError(
-                "the folder of the run is gone",
+                "the folder of the run no longer exists",
                 where=self.folder,
-                expected="the folder that it began to write into",
-                todo="where it was moved, `crossgrad run --resume FOLDER` goes on from there",
+                expected="the folder that the run was started in",
+                todo="if it was moved, resume the run there: `crossgrad run --resume FOLDER`",
             )
 
     def rewind(self, setup: Setup, step: int) -> None:

@@ -43,7 +43,10 @@ LENGTHS: Final = tuple(
 _DECIDING: Final = ("recipe", "backbone", "densifier", "operator", "sampler", "views_per_step")
 #: Settings that contain settings.
 GROUPS_OF_SETTINGS: Final = ("data",)
-_FILE: Final = ("the configuration file", "name or repair it; a run's config.yaml is an example")
+_FILE: Final = (
+    "the configuration file",
+    "correct the file or the option; the config.yaml of a run is an example",
+)
 #: Options of the command line -> their setting.
 _PLACES: Final = {option.name: option.path for option in OPTIONS}
 
@@ -133,7 +136,7 @@ def parsed(settings: Mapping[str, Any]) -> RunConfig:
             error,
             RunConfig,
             subject="a run",
-            todo="docs/settings.md lists every setting, crossgrad run --help-all every option",
+            todo="docs/settings.md lists all settings, `crossgrad run --help-all` all options",
         ) from error
 
 
@@ -164,10 +167,10 @@ def _places(options: Mapping[str, object]) -> dict[tuple[str, ...], object]:
                 }
                 if twice := [place[-1] for place in places.keys() & rules.keys()]:
                     raise UserError(
-                        "a rule is added and left out",
+                        "the same rule is added and removed",
                         where="--rule, --no-rule",
                         found=listed(sorted(twice)),
-                        todo="leave one of the two options out",
+                        todo="leave out one of the two options",
                     )
                 places |= rules
             else:
@@ -188,11 +191,11 @@ def _rules(option: str, value: object) -> Mapping[str, object]:
         choice = _named(RULES, each)
         if not isinstance(choice, dict) or not isinstance(choice.get("name"), str):
             raise UserError(
-                "there is something else than a rule",
+                "the list of rules contains an entry that is not a rule",
                 where=RULES,
                 expected="names of rules, or a mapping of names to options",
                 found=repr(each),
-                todo="`crossgrad plugins list --slot rules` shows what there is",
+                todo="`crossgrad plugins list --slot rules` shows all rules",
             )
         options = {key: each for key, each in choice.items() if key != "name"}
         found[choice["name"]] = option != "no_rule" and (options or True)
@@ -208,13 +211,13 @@ def _overlaid(
     lengths = {*chosen, *(path for path, _ in assigned)} & {*LENGTHS}
     had = {(key,) for key, value in settings.items() if value is not None} & {*LENGTHS}
     if lengths:
-        # A new length replaces the earlier one as a whole, including its clock and the step at
-        # which it was to stop.
+        # A new length replaces all settings of the earlier length, including its time budget and
+        # the step of `stop_after`.
         timed = bool(had & {("seconds",), ("planned_seconds",)}) and ("seconds",) not in lengths
         gone = had | ({("stop_after",)} if had else set()) | ({("clock",)} if timed else set())
         settings = {key: value for key, value in settings.items() if (key,) not in gone}
     settings = _opened(settings, [*chosen, *(path for path, _ in assigned)])
-    # Names first: the choice of another component drops the options of the previous one.
+    # Set names first, because a new component drops the options of the previous component.
     for given in (list(chosen.items()), assigned):
         for path, value in sorted(given, key=lambda each: not _is_name(each[0])):
             _assign(settings, path, value)
@@ -310,20 +313,21 @@ def _component(key: str, kind: type[Component], value: object) -> Settings:
     where = f"{key}, {kind.__module__}:{kind.__qualname__}"
     if getattr(kind, "slot", None) != slot:
         raise UserError(
-            f"{kind.__name__} cannot be chosen as {with_article(singular(slot))}",
+            f"class {kind.__name__} cannot be used as {with_article(singular(slot))}",
             where=where,
-            expected=f"a class of crossgrad_core.plugin.{singular(slot).capitalize()}",
+            expected=f"a subclass of crossgrad_core.plugin.{singular(slot).capitalize()}",
             found=", ".join(base.__name__ for base in kind.__bases__),
-            todo=f"`crossgrad plugins list --slot {slot}` shows what there is",
+            todo=f"`crossgrad plugins list --slot {slot}` shows the installed components",
         )
     entry = installed_as(kind)
     if entry is None:
         raise UserError(
             f"{singular(slot)} {kind.__name__} is not installed as a plugin",
             where=where,
-            expected=f"a class that an installed package offers in the group {GROUPS[slot]}: a run "
-            "writes the name of each component into config.yaml, and is continued from there",
-            todo=f"`crossgrad plugins new NAME --slot {slot}` writes a package for it",
+            expected=f"a class that an installed package offers in the group {GROUPS[slot]}: "
+            "config.yaml stores the name of each component, which is needed to resume "
+            "the run",
+            todo=f"`crossgrad plugins new NAME --slot {slot}` creates a package for the class",
         )
     if not isinstance(value, Component):
         return {"name": entry.name}
@@ -348,7 +352,7 @@ def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:
     path = tuple(part.strip() for part in key.split("."))
     if not equals or not all(path):
         raise UserError(
-            "--set does not say which setting has which value",
+            "the value of --set has the wrong form",
             where="--set",
             expected="KEY=VALUE",
             found=repr(assignment),
@@ -362,7 +366,7 @@ def _parsed(assignment: str) -> tuple[tuple[str, ...], object]:
             where=f"--set {key}",
             expected="a number, a word, or a quoted text",
             found=f"{text!r}: {described(error)}",
-            todo="put quotes around texts with special characters",
+            todo="put quotes around text with special characters",
         ) from error
 
 
@@ -476,9 +480,9 @@ def _inner(place: object, path: tuple[str, ...], depth: int) -> object:
 
 def _no_options(path: tuple[str, ...], depth: int) -> UserError:
     return UserError(
-        f"{'.'.join(path[:depth])} is a plain setting without options of its own",
+        f"{'.'.join(path[:depth])} has no options of its own",
         where=f"--set {'.'.join(path)}",
-        todo=f"set it as a whole: --set {'.'.join(path[:depth])}=VALUE",
+        todo=f"set its value directly: --set {'.'.join(path[:depth])}=VALUE",
     )
 
 
@@ -486,7 +490,7 @@ def _whose(links: list[object], path: tuple[str, ...]) -> UserError:
     names = [str(link.get("name")) for link in _links(links)]
     whole = f"for all of them: --operator {CHAIN} --set 'operator.links=[{listed(names)}]'"
     return UserError(
-        f"{path[0]} is a list; the option must say whose it is",
+        f"{path[0]} is a list, and the key does not say which component of the list is meant",
         where=f"--set {'.'.join(path)}",
         expected=listed(f"{path[0]}.{name}.{path[-1]}" for name in names),
         todo=f"{ADDING[path[0]]} NAME adds one" if path[0] in ADDING else whole,

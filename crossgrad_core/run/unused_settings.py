@@ -65,10 +65,10 @@ def refuse_settings_for_nothing(config: RunConfig, setup: Setup) -> None:
     ]
     if found:
         raise UserError(
-            "settings that would do nothing",
+            "some settings would have no effect",
             where=listed(name for name, _ in found),
             found="; ".join(f"{name}: {why}" for name, why in found),
-            todo="leave them out, or change what keeps them from doing something",
+            todo="leave them out, or change the setting that makes them ineffective",
         )
 
 
@@ -77,7 +77,7 @@ def _of_components(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
         yield from _of_choice(slot, slot, getattr(config, slot), setup)
     links = config.operators
     for link in links:
-        # An option of a link in a chain is set by the name of the link.
+        # Options of an operator in a chain are set by the name of the operator.
         place = "operator" if len(links) == 1 else f"operator.{link.name}"
         yield from _of_choice("operator", place, link, setup)
 
@@ -88,7 +88,8 @@ def _of_choice(
     if choice is None or not choice.options:
         return
     name = setup.selection.names[slot] if choice.name == AUTO else choice.name
-    # As the user set it: a component fitted to the scene may have lost unneeded options.
+    # Use the options as the user set them: a component that was fitted to the scene may have lost
+    # unneeded options.
     component = build(plural(slot), name, choice.options)
     for option, why in set_for_nothing(component, setup.selection).items():
         yield f"{place}.{option}", why
@@ -98,20 +99,26 @@ def _of_density_control(config: RunConfig, setup: Setup) -> Iterator[tuple[str, 
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     for setting in _TIMES:
         if getattr(config, setting) is not None and not densifier.edits:
-            yield setting, f"densifier {name} never edits"
+            yield setting, f"densifier {name} makes no edits"
     if config.growth == "budget" and not densifier.edits:
-        yield "growth", f"densifier {name} never edits"
+        yield "growth", f"densifier {name} makes no edits"
     # A number also limits the initial points.
     if not densifier.edits and config.max_gaussians == AUTO:
-        yield "max_gaussians", f"densifier {name} never edits, and auto bounds no start"
+        yield (
+            "max_gaussians",
+            f"densifier {name} makes no edits, and auto sets no limit on the start",
+        )
     elif not densifier.edits and config.max_gaussians and config.data.init_file is not None:
-        yield "max_gaussians", f"densifier {name} never edits, and a PLY is taken as it is"
+        yield "max_gaussians", f"densifier {name} makes no edits, and a PLY is used unchanged"
 
 
 def _of_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.reset_every and not setup.densifier.resets:
-        yield "reset_every", f"densifier {setup.selection.names['densifier']} resets no opacities"
-    # A run that follows the clock reports this as a note once its length is known.
+        yield (
+            "reset_every",
+            f"densifier {setup.selection.names['densifier']} makes no opacity resets",
+        )
+    # A run with a time budget reports this as a note as soon as its length is known.
     if not (config.seconds or config.planned_seconds):
         yield from without_resets(config, setup)
 
@@ -124,7 +131,7 @@ def without_resets(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]
     fields = type(densifier).model_fields
     for option in sorted(densifier.reset_options & given.keys()):
         if getattr(densifier, option) != fields[option].default:
-            yield f"densifier.{option}", "the run has no opacity resets; --set reset_every=N"
+            yield f"densifier.{option}", "the run has no opacity resets; add --set reset_every=N"
 
 
 def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
@@ -132,28 +139,28 @@ def _of_views(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     densifier, name = setup.densifier, setup.selection.names["densifier"]
     one = setup.selection.views_per_step == 1
     if config.densify_views != "all" and not (densifier.edits and densifier.observes):
-        yield "densify_views", f"densifier {name} gathers no statistics of views"
+        yield "densify_views", f"densifier {name} uses no statistics of views"
     elif config.densify_views == "one" and one:
-        yield "densify_views", "a step has one view; ask for more --views"
+        yield "densify_views", "a step has one view; add --views with more views"
     if config.batch_rule != "none" and one:
-        yield "batch_rule", "a step has one view; ask for more --views"
+        yield "batch_rule", "a step has one view; add --views with more views"
 
 
 def _of_the_schedule(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.schedule_length is not None and config.schedule == "scaled":
         yield (
             "schedule_length",
-            "--schedule scaled has the run's own length; add --schedule absolute",
+            "--schedule scaled uses the length of the run; add --schedule absolute",
         )
     if config.clock == "cpu" and not (config.seconds or config.planned_seconds):
-        yield "clock", "the length of the run is not in seconds; add --seconds"
+        yield "clock", "the length of the run is not given in seconds; add --seconds"
     stop, total = config.stop_after, setup.schedule.total
     # A run with a time budget may become longer.
     if stop is not None and stop > total and not (config.seconds or config.planned_seconds):
         yield "stop_after", f"the run ends after step {total}"
     if config.min_refinements and not setup.schedule.min_refinements:
-        why = "are published or have times that were set are not made to fit"
-        yield "min_refinements", f"edits that count steps, {why}"
+        why = "published or set by the user are not adapted"
+        yield "min_refinements", f"densification times that are counted in steps, {why}"
     yield from _of_harmonics(config, setup)
 
 
@@ -162,7 +169,7 @@ def _of_harmonics(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
         name = setup.selection.names["backbone"]
         yield "sh_start", f"backbone {name} trains no SH bands above the first"
     elif config.sh_start and setup.schedule.sh_from >= MOST_DEGREES:
-        yield "sh_start", "all harmonics are drawn from the first step on (sh_from, --init)"
+        yield "sh_start", "all SH bands are rendered from the first step on (sh_from, --init)"
 
 
 def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
@@ -178,9 +185,12 @@ def _of_groups(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     elif not operator.reads_labels():
         yield (
             "grouping",
-            f"sampler {selection.names['sampler']} draws from all views alike, and operator "
-            f"{selection.names['operator']} reads no labels; --sampler {GROUP_SAMPLER} "
-            "draws from groups, --set grouping=null leaves a file's out",
+            (
+                f"sampler {selection.names['sampler']} draws from all views without groups, "
+                f"and operator {selection.names['operator']} uses no labels; --sampler "
+                f"{GROUP_SAMPLER} draws from groups, --set grouping=null removes the grouping "
+                "of a file"
+            ),
         )
 
 
@@ -189,8 +199,10 @@ def _of_exposure(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
         name = setup.selection.names["exposure"]
         yield (
             "exposure_from",
-            f"exposure {name} has no values of photos; --exposure NAME takes the one that wrote "
-            "the file",
+            (
+                f"exposure {name} has no per-photo values; choose with --exposure NAME the "
+                "exposure that wrote the file"
+            ),
         )
 
 
@@ -199,10 +211,13 @@ def _of_the_split(config: RunConfig) -> Iterator[tuple[str, str]]:
     if data.test_every == SceneOptions.model_fields["test_every"].default:
         return
     if data.split == "none":
-        yield "data.test_every", "--split none holds no photo out"
+        yield "data.test_every", "--split none holds out no photo"
     lists = [name for name in (TRAIN_LIST, TEST_LIST) if _is_there(config.scene, name)]
     if data.split == "auto" and lists:
-        yield "data.test_every", f"{listed(lists)} decide; --split every leaves them aside"
+        yield (
+            "data.test_every",
+            f"{listed(lists)} determine the split; --split every ignores the lists",
+        )
 
 
 def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
@@ -210,7 +225,7 @@ def _of_the_start(config: RunConfig) -> Iterator[tuple[str, str]]:
     if asked and config.data.init != "points":
         yield (
             "initializer",
-            f"--init {config.data.init} has points of its own; leave one of them out",
+            f"--init {config.data.init} has its own points; leave out one of the two",
         )
     if config.data.points is not None and config.data.init != "points":
         yield "data.points", f"--init {config.data.init} starts from other points"
@@ -225,7 +240,7 @@ def _of_rules(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
 def _of_positions(config: RunConfig, setup: Setup) -> Iterator[tuple[str, str]]:
     if config.position_lr == "per-axis" and axes_of(setup) is None:
         name = setup.selection.names["backbone"]
-        yield "position_lr", f"primitives of backbone {name} are no Gaussians with axes"
+        yield "position_lr", f"backbone {name} does not train Gaussians with axes"
 
 
 def _is_there(scene: Path | None, name: str) -> bool:

@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: The coefficient of a uniform sample, rounded down: samples below it have one mode.
+#: The coefficient of a uniform sample, rounded down; samples below this value have one mode.
 ONE_MODE: Final = 0.555
 #: Smallest sample with a finite-sample kurtosis.
 _SMALLEST = 4
-#: In smaller samples two equal points stay below the uniform value in the finite-sample form
-#: (docs/groupings.md).
+#: Minimum sample size: in smaller samples, two equal points stay below the uniform value in the
+#: finite-sample form (docs/groupings.md).
 _SMALLEST_SAMPLE = 10
 
 
@@ -50,7 +50,7 @@ def bimodality(values: NDArray[np.float64]) -> Bimodality:
     """
     size = len(values)
     if size < _SMALLEST:
-        reason = f"{size} values; the coefficient needs {_SMALLEST}"
+        reason = f"{size} values, but the coefficient needs at least {_SMALLEST}"
         return Bimodality(float("nan"), float("nan"), size, reason)
     deviations = values - values.mean()
     spread = float(np.abs(deviations).max())

@@ -36,8 +36,9 @@ from crossgrad_core.system.input_files import is_file
 from crossgrad_core.wording import one_line
 
 _LOG = logging.getLogger(__name__)
-#: If at least this share of the stored pixels counts, some pixels count after every later step.
-#: Below this share, undistorting and resizing could remove all of them, so the photo is decoded.
+#: If at least this share of the stored pixels is unmasked, some unmasked pixels remain after every
+#: later step. Below this share, undistorting and resizing could remove all of them, so the photo is
+#: decoded to check.
 _SURE = 0.05
 _HALF = 128
 
@@ -60,7 +61,10 @@ def without_blank_photos(split: Split, sources: Mapping[str, PhotoSource], root:
     if len(blank) == len(split.train):
         raise _all_blank(blank, root)
     train = tuple(name for name in split.train if name not in set(blank))
-    what = f"{count(len(blank), 'training photo')} left out, masked as a whole: {name_some(blank)}"
+    what = (
+        f"{count(len(blank), 'training photo')} left out (all pixels are masked): "
+        f"{name_some(blank)}"
+    )
     return replace(split, train=train, notes=(*split.notes, f"masks: {what}"))
 
 
@@ -90,9 +94,10 @@ def _all_blank(names: Sequence[str], root: Path) -> UserError:
     return UserError(
         "every pixel of every training photo is masked",
         where=root,
-        expected="white in a mask, or opaque in a photo with transparency, where a pixel counts",
+        expected="a pixel that is white in its mask, or opaque in a photo with transparency",
         found=f"no such pixel in {name_some(names)}",
-        todo="invert the masks if black is meant to count, or rename their folder to train without",
+        todo="invert the masks if black marks the pixels to use, or rename the mask "
+        "folder to train without masks",
     )
 
 
@@ -112,22 +117,27 @@ def with_points_of_file(raw: RawScene, option: Path | None) -> RawScene:
     path = next(filter(is_file, (option, raw.root / option)), None)
     if path is None:
         raise UserError(
-            "the file of points is not there",
+            "the point file does not exist",
             where=option,
-            expected="a PLY, LAS or LAZ file, as it is or within the scene",
+            expected="a PLY, LAS or LAZ file, as a path or as a path below the scene folder",
             todo="check the path: --points FILE",
         )
     cloud = read_cloud(path, path.name)
     if cloud.gaussians:
         raise UserError(
-            "a PLY of Gaussians in place of points",
+            "the point file contains Gaussians instead of points",
             where=path,
-            expected="positions and colours",
-            todo=f"--init {option} starts from its Gaussians",
+            expected="a file with positions and colours",
+            todo=f"use --init {option} to start from its Gaussians",
         )
-    check_seen(cloud, raw.views, path, "cut the cloud to what the photos show; or leave it out")
+    check_seen(
+        cloud,
+        raw.views,
+        path,
+        "crop the point cloud to the area that the photos show, or leave it out",
+    )
     views = tuple(replace(view, seen=np.zeros(0, dtype=np.int64)) for view in raw.views)
-    note = f"points: {len(cloud.positions):,} from {path.name}, in place of those of the scene"
+    note = f"points: {len(cloud.positions):,} from {path.name}, instead of the scene's points"
     return replace(
         raw,
         views=views,
@@ -290,8 +300,11 @@ def _note_stray(names: Sequence[str], frame: Frame) -> list[str]:
     if not stray:
         return []
     return [
-        f"cameras: {count(len(stray), 'training camera')} far away from all others: "
-        f"{name_some(stray)}; the local frame is made without them, and their poses may be wrong"
+        (
+            f"cameras: {count(len(stray), 'training camera')} far away from all other "
+            f"cameras: {name_some(stray)}; the local frame is computed without them, and "
+            "their poses may be wrong"
+        )
     ]
 
 
@@ -312,10 +325,10 @@ def _note_unmeasured(
     held_out = Counter(regimes) - Counter(regimes[i] for i in train)
     lacking = sorted(set(regimes) - set(held_out))
     if held_out and lacking:
-        way = "--split stratified holds photos of every regime out"
+        way = "--split stratified holds out photos of every regime"
         if options.split == "stratified":
-            way = "there are too few photos of it"
+            way = "this regime has too few photos"
         yield (
-            f"split: no photo of {' and '.join(lacking)} is held out, so no figure tells how good "
-            f"it gets; {way}"
+            f"split: no photo of {' and '.join(lacking)} is held out, so no metric shows "
+            f"its quality; {way}"
         )

@@ -27,7 +27,7 @@ _ALL_AROUND = frozenset({"EQUIRECTANGULAR"})
 _LONGEST_SIDE = 10_000_000  # pixels
 _LARGEST_PARAMETER, _SHORTEST_FOCAL = 1e12, 1e-6
 _WHITE = 255
-_AGAIN = "repair the camera, or export the model again"
+_AGAIN = "correct the camera, or export the model again"
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Calibration:
         """
         if min(self.width, self.height) < 1 or max(self.width, self.height) > _LONGEST_SIDE:
             raise UserError(
-                "the size of a camera is zero, or larger than any photo",
+                "the image size of a camera is zero or too large",
                 where=where,
                 expected=f"sides of 1 to {_LONGEST_SIDE:,} pixels",
                 found=f"{self.width} x {self.height}",
@@ -66,7 +66,7 @@ class Calibration:
             valid = camera.verify_params()
         except (RuntimeError, ValueError, TypeError) as error:
             raise UserError(
-                "unknown camera model",
+                "the camera model is unknown",
                 where=where,
                 expected="a camera model of COLMAP",
                 found=self.model,
@@ -74,15 +74,16 @@ class Calibration:
             ) from error
         if self.model in _ALL_AROUND:
             raise UserError(
-                f"photos of camera model {self.model} have no pinhole camera",
+                f"camera model {self.model} cannot be converted to a pinhole camera",
                 where=where,
                 expected="perspective photos",
                 found=self.model,
-                todo="cut them into perspective views first, as COLMAP's panorama tools do",
+                todo="cut the photos into perspective views first, for example with COLMAP's "
+                "panorama tools",
             )
         if not valid:
             raise UserError(
-                f"wrong number of parameters for camera model {self.model}",
+                f"camera model {self.model} has a wrong number of parameters",
                 where=where,
                 expected=str(camera.params_info),
                 found=str(len(self.params)),
@@ -99,7 +100,7 @@ class Calibration:
         focal = [self.params[i] for i in camera.focal_length_idxs()]
         if min(focal, default=1.0) < _SHORTEST_FOCAL:
             raise UserError(
-                "a focal length is not positive",
+                "the focal length of a camera is not positive",
                 where=where,
                 expected=f"at least {_SHORTEST_FOCAL:g} pixels",
                 found=f"{min(focal):g}",
@@ -160,7 +161,7 @@ class Calibration:
         rows = [np.stack([u, np.full_like(u, y)], 1) for y in (v[0], v[-1])]
         columns = [np.stack([np.full_like(v, x), v], 1) for x in (u[0], u[-1])]
         plane = (np.concatenate(rows + columns) - [frame.cx, frame.cy]) / [frame.fx, frame.fy]
-        # Bilinear interpolation needs a pixel centre on either side.
+        # Bilinear interpolation needs a neighbouring pixel centre on each side.
         pixels = source_pixels(self._camera, plane) - 0.5
         inside = (pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])
         return bool(inside.all() and not self._reach.beyond(plane).any())
@@ -225,7 +226,7 @@ class Calibration:
             camera = pycolmap.undistort_camera(options, self._camera)
         except (RuntimeError, ValueError) as error:
             raise UserError(
-                f"photos of camera model {self.model} cannot be undistorted to a pinhole",
+                f"photos of camera model {self.model} cannot be undistorted to a pinhole camera",
                 found=str(error),
                 todo="export perspective photos, for example with COLMAP's image undistorter",
             ) from error

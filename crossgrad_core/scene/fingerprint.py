@@ -159,7 +159,7 @@ def mark_of(path: Path) -> FileMark:
             "a file of the scene cannot be read",
             where=path,
             found=error.strerror or str(error),
-            todo="put it back, or make it readable",
+            todo="restore the file, or make it readable",
         ) from error
     return FileMark(bytes=size, sha256=digest.hexdigest(), whole=whole)
 
@@ -192,11 +192,11 @@ def _points_of(scene: Scene) -> PointsMark:
 class Weight(IntEnum):
     """The effect of a difference on a model that was trained on the former scene."""
 
-    #: Pixels or points differ; every camera and every parameter is unchanged.
+    #: Only pixels or points differ; all cameras and parameters are unchanged.
     CONTENT = 1
     #: Other views are held out.
     HELD_OUT = 2
-    #: Other views are trained, or cameras moved: parameters would be misplaced.
+    #: Other views are trained, or cameras moved, so the parameters would be misplaced.
     PLACE = 3
 
 
@@ -223,7 +223,7 @@ def differences(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     if not any(each.weight is Weight.PLACE for each in found):
         found += _frame(was, now) or [*_cameras(was, now), *_points(was, now)]
     found += _files(was, now)
-    # Other changed files are reported only if no difference was found, else their effect is listed.
+    # If a difference was found, it is listed, and other changed files are not reported in addition.
     return found or _others(was, now)
 
 
@@ -233,8 +233,12 @@ def _views(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     found = [
         *_named(Weight.PLACE, "training photos missing", trained - trains - tests),
         *_named(Weight.PLACE, "new training photos", trains - trained - tested),
-        *_named(Weight.PLACE, "photos held out that were trained on", trained & tests),
-        *_named(Weight.PLACE, "photos trained on that were held out", tested & trains),
+        *_named(
+            Weight.PLACE, "photos that were training photos and are now held out", trained & tests
+        ),
+        *_named(
+            Weight.PLACE, "photos that were held out and are now training photos", tested & trains
+        ),
         *_named(Weight.HELD_OUT, "held-out photos missing", tested - trains - tests),
         *_named(Weight.HELD_OUT, "new held-out photos", tests - trained - tested),
     ]
@@ -256,8 +260,8 @@ def _frame(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     if shift * before.scale < _TOLERANCE and abs(after.scale / before.scale - 1) < _TOLERANCE:
         return []
     text = (
-        f"another local frame: its unit is {1 / after.scale:.6g} input units instead of "
-        f"{1 / before.scale:.6g}, its origin moved by {shift:.6g}"
+        f"another local frame: its unit is {1 / after.scale:.6g} input units (before: "
+        f"{1 / before.scale:.6g}), and its origin moved by {shift:.6g}"
     )
     return [Difference(Weight.PLACE, text)]
 
@@ -268,14 +272,14 @@ def _cameras(was: Fingerprint, now: Fingerprint) -> list[Difference]:
         for name in was.views.keys() & now.views.keys()
         if not _close(was.views[name].camera, now.views[name].camera)
     ]
-    return _named(Weight.PLACE, "photos of another size, camera or pose", moved)
+    return _named(Weight.PLACE, "photos with another size, camera or pose", moved)
 
 
 def _points(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     before, after = was.points, now.points
     if before.count == after.count and _close(before.moments, after.moments):
         return []
-    text = f"other SfM points ({after.count:,}; there were {before.count:,})"
+    text = f"other SfM points ({after.count:,}; before: {before.count:,})"
     return [Difference(Weight.CONTENT, text)]
 
 
@@ -285,7 +289,7 @@ def _files(was: Fingerprint, now: Fingerprint) -> list[Difference]:
     masks = [name for name in common if _differ(was.views[name].mask, now.views[name].mask)]
     return [
         *_named(Weight.CONTENT, "photos changed", photos),
-        *_named(Weight.CONTENT, "masks changed, new or missing", masks),
+        *_named(Weight.CONTENT, "masks that were changed, added or removed", masks),
     ]
 
 
@@ -295,7 +299,7 @@ def _others(was: Fingerprint, now: Fingerprint) -> list[Difference]:
         return []
     names = was.files.keys() | now.files.keys()
     changed = [name for name in names if _differ(was.files.get(name), now.files.get(name))]
-    return _named(Weight.CONTENT, "files changed, new or missing", changed)
+    return _named(Weight.CONTENT, "files that were changed, added or removed", changed)
 
 
 def _differ(before: FileMark | None, after: FileMark | None) -> bool:

@@ -10,7 +10,8 @@ from crossgrad_core.contract.scene import Similarity, stray_rows
 # 1.1 x the largest distance of a training camera from the mean of all (3DGS, scene extent).
 _MARGIN = 1.1
 
-# If cameras are closer together than this share of their distance to the scene, they give no unit.
+# If the distance between cameras is below this share of their distance to the scene, it is not used
+# as the unit.
 _SAME_PLACE = 1e-6
 
 # A smaller size, in input units, is treated as 0, because its inverse must be finite.
@@ -82,14 +83,14 @@ def make_frame(centers: NDArray[np.float64], points: NDArray[np.float64]) -> Fra
     if depth > _SMALLEST:
         return Frame(
             Similarity(origin, 1 / depth),
-            f"local frame: 1 unit = {depth:.6g} input units, the median distance to the SfM "
-            "points, because the training cameras stand in one place",
+            f"local frame: 1 unit = {depth:.6g} input units, the median distance to the "
+            "SfM points, because all training cameras have the same position",
             stray,
         )
     return Frame(
         Similarity(origin, 1.0),
-        "local frame: 1 unit = 1 input unit, because the training cameras stand in one place and "
-        "there are no SfM points",
+        "local frame: 1 unit = 1 input unit, because all training cameras have the "
+        "same position and there are no SfM points",
         stray,
     )
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _FIRST, _CLOSER = (72, 128), (180, 360)
 #: The largest scanned angle from the axis: a pinhole camera ends at 90 degrees.
 _WIDEST: Final = np.deg2rad(89.5)
-#: The last pixel before a fold is smeared over many undistorted pixels, so it does not count.
+#: The last pixel before the fold is spread over many undistorted pixels, so it is ignored.
 _RIM: Final = 1.0
 #: Cells along each side of a frame for the sum of areas, and rows that are masked at a time.
 _CELLS, _ROWS = 64, 256

@@ -29,7 +29,7 @@ SUFFIXES: Final = (".las", ".laz")
 #: Suffixes of all point clouds.
 CLOUDS: Final = (".ply", *SUFFIXES)
 _GREY: Final = 127
-#: Colours have 16 bits if this percentile of them is at least `_LONG`.
+#: Colours have 16 bits if this percentile is at least `_LONG`.
 _MOST: Final = 99.0
 _LONG: Final = 512.0
 _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -37,22 +37,24 @@ _COLORS: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "di
 _GAUSSIAN: Final = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 _RGB: Final = ("red", "green", "blue")
 _AT_ONCE: Final = 1_000_000
-#: The most points that are read from a file; from a larger file, every second, third ... point.
+#: Maximum number of points that are read from a file; from a larger file, only every n-th point is
+#: read.
 _MOST_IN_LAS: Final = 20_000_000
-#: Points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more. Structure
-#: from motion finds a few hundred points per photo.
+#: Number of points that are kept by default: FEWEST, or PER_PHOTO for each photo if that is more.
+#: Structure from motion finds a few hundred points per photo.
 FEWEST: Final = 100_000
 PER_PHOTO: Final = 1_000
-#: The most cube sizes that are tried, and the share of the wanted points that ends the search.
+#: Maximum number of cube sizes that are tried. The search ends early at this share of the wanted
+#: points.
 _TRIES, _ENOUGH = 12, 0.8
-#: Sampled points from which the size of a cloud is estimated.
+#: Number of sampled points from which the size of a cloud is estimated.
 _SAMPLED: Final = 100_000
-#: Points are on surfaces, so their number falls with the square of the side.
+#: Points are on surfaces, so the number of occupied cubes falls with the square of the side.
 _SURFACE: Final = 2.0
 #: Odd factors that hash the integer coordinates of a cube.
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _FARTHEST: Final = 2.0**62
-#: Side of the cubes if all points are in one place, in input units.
+#: Side of the cubes in input units, if all points have the same position.
 _SMALLEST: Final = 1e-12
 
 
@@ -94,7 +96,7 @@ def read_cloud(path: Path, source: str) -> PointCloud:
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise UserError(
-            "PLY file without positions",
+            "the PLY file has no positions",
             where=path,
             expected="vertices with properties x, y and z",
             found=f"no {', '.join(missing)}",
@@ -150,7 +152,7 @@ def read_las(path: Path) -> dict[str, NDArray[np.generic]]:
     found = sum(count for count, _ in rows)
     if found < expected:
         raise UserError(
-            "LAS file ends too early",
+            "the LAS file is incomplete: its end is missing",
             where=path,
             expected=f"{expected:,} points",
             found=f"{found:,} points",
@@ -182,7 +184,7 @@ def _require_laspy(path: Path) -> None:
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
         raise UserError(
-            "point clouds in LAS and LAZ need a package that is not installed",
+            "point clouds in LAS and LAZ format need a package that is not installed",
             where=path,
             expected=f"the package {missing[0]}",
             todo="pip install 'crossgrad[las]', or convert the points to PLY",
@@ -200,8 +202,8 @@ def thinned(points: CheckedPoints, most: int) -> tuple[CheckedPoints, list[str]]
     rows, side = _one_per_cube(points.xyz, most)
     chosen = np.zeros(count, dtype=np.bool_)
     chosen[rows] = True
-    how = f"from each cube with a side of {side:.3g} input units" if side else "of so many"
-    kept = f"{len(rows):,} of {count:,} kept, one {how}"
+    how = f"one in each cube with a side of {side:.3g} input units" if side else "evenly spaced"
+    kept = f"{len(rows):,} of {count:,} kept, {how}"
     return points.selected(chosen), [f"points: {kept} (--set data.max_points=N keeps more)"]
 
 

@@ -14,7 +14,8 @@ from crossgrad_core.scene.frame import camera_centers
 from crossgrad_core.scene.point_cloud import PointCloud
 from crossgrad_core.scene.raw import RawView
 
-#: Points and photos that are tested, and the least share of points that must be in some photo.
+#: Number of points and photos that are tested, and the minimum share of points that must be visible
+#: in a photo.
 _TRIED: Final = 1000
 _FEWEST: Final = 0.01
 #: If a change of the poses brings this share of points into photos, it is the likely cause.
@@ -35,14 +36,20 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 _FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Mistakes in poses that put all points behind the cameras or outside the photos.
 _MISTAKES: Final[tuple[tuple[str, _Change], ...]] = (
-    ("cameras have the other axes (OpenGL: y up, z backward)", lambda pose: _FLIP @ pose),
-    ("poses are inverse (camera to world, or world to camera)", _inverse),
     (
-        "poses are inverse (camera to world, or world to camera)",
+        "the camera axes follow another convention (OpenGL: y up, z backward)",
+        lambda pose: _FLIP @ pose,
+    ),
+    ("the poses are inverted (camera to world, or world to camera)", _inverse),
+    (
+        "the poses are inverted (camera to world, or world to camera)",
         lambda pose: _FLIP @ _inverse(_FLIP @ pose),
     ),
     (
-        "poses are inverse, and cameras have the other axes (OpenGL: y up, z backward)",
+        (
+            "the poses are inverted, and the camera axes follow another convention "
+            "(OpenGL: y up, z backward)"
+        ),
         lambda pose: _inverse(_FLIP @ pose),
     ),
 )
@@ -71,15 +78,21 @@ def check_seen(
         return
     cause = _likely_cause(tried, views)
     raise UserError(
-        "the points lie in no photo: "
-        + (f"the {cause}" if cause else "they stand in another frame than the cameras"),
+        "no photo shows the SfM points: "
+        + (
+            f"the {cause}"
+            if cause
+            else "the points are in another coordinate system than the cameras"
+        ),
         where=where,
-        expected="points in the coordinates of the cameras",
-        found=f"{int(shown.sum())} of {len(shown)} points in a photo ({points.source})",
-        todo="correct the poses: after that change the photos show the points"
+        expected="points in the coordinate system of the cameras",
+        found=f"{int(shown.sum())} of {len(shown)} points visible in a photo ({points.source})",
+        todo="correct the poses; the photos will then show the points"
         if cause
-        else f"export points and cameras in one frame; or {todo} and start from random points "
-        "(--init random)",
+        else (
+            f"export points and cameras in one coordinate system; or {todo} and start "
+            "from random points (--init random)"
+        ),
     )
 
 

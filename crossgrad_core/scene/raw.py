@@ -118,9 +118,9 @@ def check_views(raw: RawScene) -> None:
     """
     if not raw.views:
         raise UserError(
-            "the scene has no posed image",
+            "the scene has no image with a pose",
             where=raw.root,
-            todo="check that the poses were estimated: at least one image must be registered",
+            todo="estimate the poses again: at least one image must be registered",
         )
     for view in raw.views:
         _check_name(raw, view.name)
@@ -128,10 +128,10 @@ def check_views(raw: RawScene) -> None:
     twice = [name for name, number in names.items() if number > 1]
     if twice:
         raise UserError(
-            "several poses belong to one image name",
+            "several images of the model have the same name",
             where=raw.root,
             found=name_some(twice),
-            todo="keep one image of each name in the model",
+            todo="keep only one image of each name in the model",
         )
     for view in raw.views:
         _check_view(raw, view)
@@ -139,9 +139,9 @@ def check_views(raw: RawScene) -> None:
 
 def check_points(raw: RawScene) -> tuple[CheckedPoints, list[str]]:
     """Leave out points that are not finite, and note their number."""
-    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # False for NaN
+    finite = np.asarray((np.abs(raw.points) <= FARTHEST).all(1))  # This is also False for NaN.
     broken = int((~finite).sum())
-    notes = [f"points: {count(broken, 'point')} left out: not finite"] if broken else []
+    notes = [f"points: {count(broken, 'point')} left out (not finite)"] if broken else []
     new_row = np.where(finite, np.cumsum(finite) - 1, -1)
     return CheckedPoints(raw.points[finite], raw.point_colors[finite], new_row), notes
 
@@ -169,8 +169,10 @@ def check_distances(
     if not far:
         return points, []
     return points.selected(near), [
-        f"points: {count(far, 'point')} left out: farther than {FARTHEST_LOCAL:g} times the extent "
-        "of the training cameras"
+        (
+            f"points: {count(far, 'point')} left out (farther away than "
+            f"{FARTHEST_LOCAL:g} times the extent of the training cameras)"
+        )
     ]
 
 
@@ -187,12 +189,12 @@ def _check_name(raw: RawScene, name: str) -> None:
         )
     if not is_possible_name(name):
         raise UserError(
-            "an image name that no photo can be found or listed by",
+            "the image name is not valid",
             where=raw.root,
             expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file "
             f"or folder and {LONGEST_NAME} in all",
             found=ascii(name),
-            todo="rename the image in the model, and its photo",
+            todo="rename the image in the model and its photo",
         )
 
 
@@ -200,12 +202,16 @@ def _check_view(raw: RawScene, view: RawView) -> None:
     where = f"{raw.root}: image {view.name}"
     view.calibration.check(where)
     pose = view.world_to_camera
-    if not (np.abs(pose) <= FARTHEST).all():  # False for NaN
-        raise UserError("a pose is not finite", where=where, todo="remove or re-estimate the image")
+    if not (np.abs(pose) <= FARTHEST).all():  # This is also False for NaN.
+        raise UserError(
+            "a pose contains numbers that are not finite",
+            where=where,
+            todo="remove the image, or estimate its pose again",
+        )
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
         raise UserError(
-            "a pose is not a rotation and a shift",
+            "a pose does not consist of a rotation and a translation",
             where=where,
             expected="an orthonormal, right-handed rotation",
             found=str(rotation.round(4).tolist()),

@@ -15,7 +15,8 @@ from crossgrad_core.system.input_files import read_file
 TRAIN_LIST = "train_list.txt"
 TEST_LIST = "test_list.txt"
 
-#: Names of training views -> regime of every view; without folders, their median is the threshold.
+#: Function that maps the names of training views to the regime of every view. Without folders, the
+#: median of the training views is the threshold.
 Label: TypeAlias = Callable[[Sequence[str]], Mapping[str, str]]
 
 _LINES: Final = {b"\n": 150}  # bytes of a name in memory
@@ -65,7 +66,9 @@ def split_views(
         UserError: The lists contradict each other, match no view or leave no training view.
     """
     if options.split == "none":
-        return Split(tuple(sorted(names)), (), (f"split: all {len(names)} views are trained on",))
+        return Split(
+            tuple(sorted(names)), (), (f"split: all {len(names)} views are training views",)
+        )
     if options.split == "auto":
         for listed, how in ((_read_lists(root, names), "by lists"), (given, "as given")):
             if listed is not None:
@@ -92,14 +95,14 @@ def _by_regime(every: Split, names: Sequence[str], options: SceneOptions, label:
 def _split_every(names: Sequence[str], every: int) -> Split:
     """Hold out each n-th view by name of each folder."""
     folders = {name: str(PurePosixPath(name).parent) for name in names}
-    how = " of each folder" if len(set(folders.values())) > 1 else ""
+    how = " in each folder" if len(set(folders.values())) > 1 else ""
     return _split_each(folders, every, how)
 
 
 def _split_stratified(names: Sequence[str], every: int, regimes: Mapping[str, str]) -> Split:
     """Hold out each n-th view by name of each regime; `regimes` covers all views."""
     return replace(
-        _split_each({name: regimes.get(name, "") for name in names}, every, " of each regime"),
+        _split_each({name: regimes.get(name, "") for name in names}, every, " in each regime"),
         regimes=regimes,
     )
 
@@ -130,29 +133,33 @@ def _split_by_lists(
     root: Path,
     how: str,
 ) -> Split:
-    # A split prescribed by the input is in no list file.
+    # No list file contains a split that the input prescribes.
     places = [root / file if how == "by lists" else root for file in (TRAIN_LIST, TEST_LIST)]
     both = sorted(listed[0] & listed[1])
     if both:
         raise UserError(
-            "views are listed for training and for testing",
+            "a view is listed for both training and testing",
             where=places[1],
             found=name_some(both),
-            todo=f"leave each name in one of {TRAIN_LIST} and {TEST_LIST}",
+            todo=f"remove each name from one of {TRAIN_LIST} and {TEST_LIST}",
         )
     train, test = (tuple(name for name in sorted(names) if name in part) for part in listed)
     if not train:
-        raise _matches_nothing("no listed view can be trained on", places[0], names, listed[0])
+        raise _matches_nothing(
+            "no listed view can be used for training", places[0], names, listed[0]
+        )
     if listed[1] and not test:
         raise _matches_nothing("no listed view can be held out", places[1], names, listed[1])
     notes = [f"split: {len(train)} train, {len(test)} test ({how})"]
     absent = sorted((listed[0] | listed[1]) - set(names))
     if absent:
-        notes.append(f"split: {len(absent)} listed names have no posed photo: {name_some(absent)}")
+        notes.append(
+            f"split: {len(absent)} listed names have no photo with a pose: {name_some(absent)}"
+        )
     unlisted = sorted(set(names) - listed[0] - listed[1])
     if unlisted:
         notes.append(
-            f"split: {count(len(unlisted), 'view')} in no list left out: {name_some(unlisted)}"
+            f"split: {count(len(unlisted), 'view')} left out (in no list): {name_some(unlisted)}"
         )
     return Split(train, test, tuple(notes))
 
@@ -163,9 +170,9 @@ def _matches_nothing(
     return UserError(
         what,
         where=place,
-        expected=f"names below the image folder, such as {min(names)}",
+        expected=f"names of photos relative to the image folder, such as {min(names)}",
         found=name_some(sorted(listed)) if listed else "no name",
-        todo="mend the lists, add the photos that they name, or use --split every",
+        todo="correct the lists, add the missing photos, or use --split every",
     )
 
 
@@ -196,7 +203,7 @@ def _read_list(path: Path, views: Sequence[str]) -> frozenset[str] | None:
             "the list of views cannot be read",
             where=path,
             found=str(error),
-            todo="save it as text in UTF-8, one name a line, or remove it",
+            todo="save the list as UTF-8 text with one name per line, or remove it",
         ) from error
     cleaned = (line.strip().replace("\\", "/").removeprefix("./") for line in lines)
     names = [name for name in cleaned if name and not name.startswith("#")]

@@ -10,14 +10,15 @@ from typing import Any, Final
 TRIM_THRESHOLD: Final = -1
 TOP_PAD: Final = -2
 MMAP_THRESHOLD: Final = -3
-#: Bytes of freed memory that stay; and the largest array on the heap, the upper bound of glibc.
+#: Bytes of freed memory that are kept, and size of the largest array on the heap (the upper bound
+#: of glibc).
 KEPT: Final = 512 << 20
 LARGEST: Final = 32 << 20
-#: Bytes by which the heap grows at first, and later. The first growth is small enough that it is
-#: not given back at once. The heaps of other threads are given back only in such pieces.
+#: Bytes by which the heap grows at first, and later. The first growth is small, so that it is not
+#: returned at once. The heaps of other threads are returned only in pieces of the later size.
 FIRST: Final = KEPT - 2 * LARGEST
 LATER: Final = 16 << 20
-#: Bytes of a large page, and the advice to use them, which older headers may lack.
+#: Size of a large page in bytes, and the advice constant, which older headers may lack.
 LARGE_PAGE: Final = 2 << 20
 _HUGE: Final[int] = getattr(mmap, "MADV_HUGEPAGE", 14)
 

@@ -15,7 +15,7 @@ from crossgrad_core.system.files import (
     unfinished_name,
 )
 
-#: Bytes that a path of a file below a folder of results may add.
+#: Maximum number of bytes that the path of a file below a folder of results adds.
 _BELOW: Final = 200
 
 
@@ -35,10 +35,10 @@ def check_folder(folder: Path, needed: int = 0) -> None:
     _check_length(folder, place)
     if not place.is_dir():
         raise UserError(
-            "cannot make this folder",
+            "the folder cannot be created",
             where=folder,
-            found=f"{place} is no folder",
-            todo="choose another place, or remove that file",
+            found=f"{place} is not a folder",
+            todo="choose another path, or remove the file",
         )
     try:
         # Permission bits are not reliable on network file systems; a test file is.
@@ -72,7 +72,7 @@ def check_own(path: Path) -> None:
     if path.is_symlink() or (path.exists() and not path.is_file()):
         found = f"a link to {path.resolve()}" if path.is_symlink() else "a pipe, device or folder"
         raise UserError(
-            "this is written to, and is no file of its own",
+            "the output path is a link or a special file, which crossgrad does not write to",
             where=path,
             found=found,
             todo="remove it",
@@ -88,8 +88,8 @@ def check_new(*paths: Path) -> None:
     for path in paths:
         with disk_errors(path):
             if path.exists():
-                todo = "choose another place, or remove it"
-                raise UserError("the file exists", where=path, todo=todo)
+                todo = "choose another path, or remove it"
+                raise UserError("the output file already exists", where=path, todo=todo)
 
 
 def check_name(path: Path) -> None:
@@ -111,12 +111,14 @@ def check_file(path: Path) -> None:
     check_name(path)
     if path.is_dir():
         raise UserError(
-            "a file is to be written, and this is a folder", where=path, todo="name a file in it"
+            "the output path is a folder, but a file is to be written",
+            where=path,
+            todo="name a file in the folder",
         )
     if not path.parent.is_dir():
         raise UserError(
-            "the folder of this file is not there",
+            "the folder of the output file does not exist",
             where=path,
-            todo=f"make {path.parent}, or choose another place",
+            todo=f"create {path.parent}, or choose another path",
         )
     check_folder(path.parent)

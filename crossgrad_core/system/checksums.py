@@ -134,18 +134,18 @@ def check_unchanged(folder: Path, names: Iterable[str], todo: str) -> None:
     """
     for name in changed_files(folder, names):
         raise UserError(
-            f"{name} is not what was written",
+            f"{name} has changed since crossgrad wrote it",
             where=folder / name,
-            expected=f"the SHA-256 that {SUMS} has",
-            found="another one" if (folder / name).is_file() else "no such file",
-            todo=f"{todo}; remove {SUMS} to take the file as it is",
+            expected=f"a file with the SHA-256 in {SUMS}",
+            found="another SHA-256" if (folder / name).is_file() else "no such file",
+            todo=f"{todo}; or remove {SUMS} to accept the file as it is",
         )
 
 
 def warn_if_changed(path: Path) -> None:
     """Warn about a file that differs from SHA256SUMS; another program may have edited it."""
     if changed_files(path.parent, [path.name]):
-        _LOG.warning("%s is not the file that its run wrote: its SHA-256 differs", path)
+        _LOG.warning("%s has changed since its run wrote it: its SHA-256 differs", path)
 
 
 def _is(path: Path, digest: str) -> bool:
@@ -163,9 +163,9 @@ def _write(folder: Path, digests: Mapping[str, str]) -> None:
 
 def _unreadable(path: Path, found: str) -> UserError:
     return UserError(
-        f"unreadable {SUMS}",
+        f"{SUMS} cannot be read",
         where=path,
-        expected="lines of a SHA-256 in hexadecimal digits, two spaces and a name",
+        expected="lines of a SHA-256 in hexadecimal digits, two spaces and a file name",
         found=found,
-        todo="restore the file from a copy, or remove it: then nothing is checked against it",
+        todo="restore the file from a copy, or remove it; without it the files are not checked",
     )

@@ -38,7 +38,7 @@ def free_bytes(path: Path) -> int:
 def disk_full(path: Path, needed: int | None) -> UserError:
     """Return the error for a full disk; `needed` is the size in bytes of the file to write."""
     return UserError(
-        "not enough disk space",
+        "there is not enough disk space",
         where=path,
         expected=f"{size_text(needed)} free" if needed is not None else "",
         found=f"{size_text(free_bytes(path))} free",
@@ -49,10 +49,10 @@ def disk_full(path: Path, needed: int | None) -> UserError:
 def read_only(path: Path) -> UserError:
     """Return the error for a path that is not writable."""
     return UserError(
-        "cannot write here",
+        "crossgrad cannot write to this path",
         where=path,
-        expected="a folder that you may write to",
-        todo="check its permissions, or choose another place",
+        expected="a folder with write permission",
+        todo="check its permissions, or choose another path",
     )
 
 
@@ -61,9 +61,9 @@ def path_too_long(path: object) -> UserError:
     return UserError(
         "the path is too long for the file system",
         where=path,
-        expected="names of at most 255 bytes, and at most 4,096 bytes in all, on most systems; "
-        "results need some of these",
-        todo="choose a shorter one",
+        expected="names of at most 255 bytes, and on most systems at most 4,096 bytes in "
+        "total, including the names of the result files",
+        todo="choose a shorter path",
     )
 
 
@@ -93,8 +93,10 @@ def disk_errors(path: Path, needed: int | None = None) -> Iterator[None]:
         if error.errno in _FORBIDDEN:
             raise read_only(path) from error
         if error.errno in _IN_THE_WAY:
-            what, found = "something else is in the way", error.strerror or ""
-            raise UserError(what, where=path, found=found, todo="move it elsewhere") from error
+            what, found = "another file or folder already has this name", error.strerror or ""
+            raise UserError(
+                what, where=path, found=found, todo="move it to another path"
+            ) from error
         if is_too_long(error):
             raise path_too_long(path) from error
         raise
@@ -151,7 +153,8 @@ def clear_leftovers(folder: Path, *, shared: bool = False) -> None:
 
 def _is_alive(process: int) -> bool:
     """Return True if another process of this machine has that number."""
-    if process == os.getpid():  # Left by an earlier process with this number, as in a container.
+    # An earlier process with the same number left it, as in a container.
+    if process == os.getpid():
         return False
     try:
         os.kill(process, 0)

@@ -35,7 +35,7 @@ def open_file(path: Path) -> BufferedReader:
             end.
     """
     if not stat.S_ISREG(path.stat().st_mode):
-        raise OSError("a folder, pipe or device in place of a file")
+        raise OSError("a folder, pipe or device instead of a file")
     return path.open("rb")
 
 
@@ -54,10 +54,13 @@ def read_file(path: Path, weights: Mapping[bytes, int] | None = None, most: int 
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise OSError(f"{size_text(size)}, more than {size_text(most)}")
+            raise OSError(f"{size_text(size)}; at most {size_text(most)} can be read")
         content = file.read(size)
     held = len(content) * (1 if content.isascii() else _WIDEST)
     held += sum(weight * content.count(sign) for sign, weight in (weights or {}).items())
     if held > GROWS * most:
-        raise OSError(f"values of {size_text(held)} in memory, more than {size_text(GROWS * most)}")
+        raise OSError(
+            f"values that need {size_text(held)} in memory; at most "
+            f"{size_text(GROWS * most)} can be used"
+        )
     return content

@@ -15,7 +15,7 @@ from types import FrameType
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-#: Lines for the user about how to continue after an immediate end, the newest last.
+#: Lines that tell the user how to continue after an immediate end, the newest last.
 _WAYS_ON: list[str] = []
 #: Files that are being written; they are deleted if the process ends immediately.
 UNFINISHED: set[str] = set()
@@ -44,11 +44,11 @@ def tell(text: str, *, alone: bool = True) -> None:
     try:
         sys.stderr.write(line)
         sys.stderr.flush()
-    except RuntimeError:  # The signal came during another write to stderr.
+    except RuntimeError:  # The signal came while another message was written to stderr.
         with suppress(OSError):
             os.write(2, line.encode(errors="backslashreplace"))
     except (OSError, ValueError):
-        pass  # There is no place left to report it.
+        pass  # The message cannot be shown anywhere else.
 
 
 def end_at_once(number: int, _frame: FrameType | None) -> None:
@@ -87,6 +87,6 @@ def ended_quietly() -> Iterator[None]:
     try:
         yield
     finally:
-        # Only the exit is left; Python's own handler would print a traceback.
+        # The process is about to exit; Python's own handler would print a traceback.
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

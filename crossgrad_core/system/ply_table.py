@@ -98,9 +98,9 @@ def read_vertices(path: Path) -> Vertices:
                 return Vertices(read(file, path, header, element, before), header.comments)
             before.append(element)
     raise UserError(
-        "PLY file without vertices",
+        "the PLY file has no vertices",
         where=path,
-        expected="an element called vertex",
+        expected="an element named vertex",
         found=listed(element.name for element in header.elements),
         todo="export the Gaussians or points as a PLY file of vertices",
     )
@@ -121,9 +121,9 @@ def vertex_properties(path: Path) -> tuple[str, ...]:
 
 def _require_file(path: Path) -> None:
     if not is_file(path):
-        other = "a pipe or device in place of a file" if os.path.exists(path) else "nothing"
+        other = "a pipe or device instead of a file" if os.path.exists(path) else "nothing"
         raise UserError(
-            "no such PLY file",
+            "the PLY file does not exist",
             where=path,
             found="a folder" if os.path.isdir(path) else other,
             todo="check the path",
@@ -132,7 +132,7 @@ def _require_file(path: Path) -> None:
 
 def _malformed(path: Path, found: str) -> UserError:
     return UserError(
-        "not a readable PLY file",
+        "the PLY file cannot be read",
         where=path,
         found=found,
         todo="copy, download or export the file again",
@@ -142,16 +142,16 @@ def _malformed(path: Path, found: str) -> UserError:
 def _read_header(file: BinaryIO, path: Path) -> Header:
     if file.readline(8).strip() != b"ply":
         raise UserError(
-            "not a PLY file",
+            "the file is not a PLY file",
             where=path,
-            expected="a first line that says ply",
+            expected="a first line that contains only ply",
             todo="name a PLY file, such as the point_cloud.ply of a run",
         )
     lines = _header_lines(file, path)
     comments = [line.removeprefix("comment").strip() for line in lines if _keyword(line, "comment")]
     formats = [line.split()[1:2] for line in lines if _keyword(line, "format")]
     if len(formats) != 1 or not formats[0] or formats[0][0] not in _FORMATS:
-        raise _malformed(path, f"a header whose format is none of {', '.join(_FORMATS)}")
+        raise _malformed(path, f"a header whose format is not one of {', '.join(_FORMATS)}")
     return Header(_FORMATS[formats[0][0]], _elements(lines, path), tuple(comments))
 
 
@@ -184,7 +184,7 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
         if not raw.endswith(b"\n"):
             break
         lines.append(line)
-    raise _malformed(path, "a header that does not end")
+    raise _malformed(path, "a header without an end")
 
 
 def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
@@ -195,14 +195,14 @@ def _add_property(draft: _Draft, words: list[str], path: Path) -> None:
         raise _malformed(path, f"the property {' '.join(words)!r}")
     kind, name = words
     if name in draft.fields:
-        raise _malformed(path, f"two properties called {name!r}")
+        raise _malformed(path, f"two properties named {name!r}")
     draft.fields[name] = _TYPES[kind]
 
 
 def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
     if element.fields is None:
         raise UserError(
-            "PLY file with lists where vertices are expected",
+            "the PLY file contains lists among its vertices",
             where=path,
             found=f"list properties in the element {element.name}",
             todo="export the Gaussians or points without faces",
@@ -212,7 +212,7 @@ def _dtype(element: Element, header: Header, path: Path) -> np.dtype[np.void]:
 
 def _truncated(path: Path, expected: str, found: str) -> UserError:
     return UserError(
-        "PLY file ends too early",
+        "the PLY file is incomplete: its end is missing",
         where=path,
         expected=expected,
         found=found,
@@ -254,11 +254,13 @@ def _read_ascii(
     try:
         table = _parsed(lines).reshape(vertex.count, len(names))
     except ValueError as error:
-        raise _malformed(path, f"a vertex line that is not {len(names)} numbers") from error
+        raise _malformed(
+            path, f"a vertex line that does not contain {len(names)} numbers"
+        ) from error
     return {name: table[:, i] for i, name in enumerate(names)}
 
 
 def _parsed(lines: list[bytes]) -> NDArray[np.float64]:
     if any(b"_" in line for line in lines):
-        raise ValueError("Python's digit groups are no numbers of PLY")
+        raise ValueError("digits are grouped with underscores, which PLY does not allow")
     return np.array([line.split() for line in lines], dtype=np.float64)

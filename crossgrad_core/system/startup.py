@@ -18,10 +18,10 @@ from crossgrad_core.wording import one_line
 
 #: The logger of the kernel cache.
 KERNELS: Final = "crossgrad_core.numerics.kernel_cache"
-#: Seconds between lines about compiling: if stderr is not a terminal, and if it is one.
+#: Seconds between lines about compiling, for a stderr that is not a terminal and for a terminal.
 PLAIN_INTERVAL, TERMINAL_INTERVAL = 60.0, 1.0
 _PACKAGE = "crossgrad_core"
-_EXPLANATION = "compiling for this machine, before the first start only (about a minute)"
+_EXPLANATION = "compiling for this machine, only before the first start (about a minute)"
 
 
 def announce(*, quiet: bool = False) -> None:
@@ -137,7 +137,7 @@ def _say(text: str, *, stays: bool = True) -> None:
         stream.write(f"{clear}{one_line(text)}" + ("\n" if stays else ""))
         stream.flush()
     except (OSError, ValueError):
-        pass  # Nobody reads it any more.
+        pass  # Nobody reads the output any more.
 
 
 class Progress:

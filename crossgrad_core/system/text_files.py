@@ -15,7 +15,8 @@ from crossgrad_core.system.input_files import LARGEST, read_file
 # `int` and `float` also accept digits of other scripts, digit groups and spaces.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?inf|nan", re.ASCII)
 _LONGEST_NUMBER = 400
-# Bytes in memory of a list, a cell, an object with one member, and a value with its place or key.
+# Bytes in memory of a list, a cell, an object with one member, and a value with its position or
+# key.
 _CSV = {b"\n": 160, b"\r": 160, b",": 60}
 _JSON = {b"[": 96, b"{": 240, b",": 64, b":": 64}
 
@@ -59,9 +60,9 @@ def read_json(path: Path, most: int = LARGEST) -> object:
     try:
         value: object = json.loads(read_file(path, _JSON, most).decode("utf-8-sig"))
     except RecursionError as error:
-        raise ValueError("lists or objects within each other without an end") from error
+        raise ValueError("lists or objects are nested too deeply") from error
     except FileNotFoundError as error:
-        raise FileNotFoundError("there is no such file") from error
+        raise FileNotFoundError("the file does not exist") from error
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
     return value

@@ -20,8 +20,8 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from crossgrad_core.errors import UserError
 from crossgrad_core.system.input_files import open_file
 
-#: Bounds of a text: bytes, values (an alias counts like the value that it copies), depth of nested
-#: lists, digits of a number.
+#: Limits of a text: bytes, values (an alias counts as often as the value that it copies), nesting
+#: depth of lists, digits of a number.
 MOST_BYTES: Final = 1 << 18
 MOST_VALUES: Final = 10_000
 DEEPEST: Final = 32
@@ -57,9 +57,9 @@ class _Loader(yaml.SafeLoader):
         self._depth += 1
         self._values += 1
         if self._depth > DEEPEST:
-            raise _error(f"more than {DEEPEST} lists or mappings within each other", mark)
+            raise _error(f"lists or mappings are nested more than {DEEPEST} levels deep", mark)
         if self._values > MOST_VALUES:
-            raise _error(f"more than {MOST_VALUES:,} values", mark)
+            raise _error(f"the file contains more than {MOST_VALUES:,} values", mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -98,14 +98,14 @@ def read_yaml(text: str) -> object:
             twice, or contains a value that a setting cannot have.
     """
     if len(text) > MOST_BYTES:
-        raise yaml.YAMLError(f"more than {MOST_BYTES // 1024} KiB")
+        raise yaml.YAMLError(f"the file is larger than {MOST_BYTES // 1024} KiB")
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
         return None if node is None else _Values().of(node, 0)
     except (ValueError, OverflowError) as error:
         # PyYAML raises these for escapes beyond Unicode and for endless version numbers.
-        raise yaml.YAMLError(f"an escape or number that does not exist ({error})") from error
+        raise yaml.YAMLError(f"an escape sequence or number is not valid ({error})") from error
     finally:
         loader.dispose()
 
@@ -134,7 +134,7 @@ def read_mapping(path: Path, what: str, todo: str) -> dict[str, Any]:
         return {}
     if not isinstance(settings, dict):
         raise UserError(
-            f"{what} holds no settings",
+            f"{what} contains no settings",
             where=path,
             expected="lines such as `steps: 3000`",
             found=f"a {type(settings).__name__}",
@@ -168,9 +168,12 @@ class _Values:
         """Return the value of a node."""
         self._count += 1
         if self._count > MOST_VALUES:
-            raise _error(f"more than {MOST_VALUES:,} values, counting aliases", node.start_mark)
+            raise _error(
+                f"the file contains more than {MOST_VALUES:,} values, including aliases",
+                node.start_mark,
+            )
         if depth > DEEPEST:
-            raise _error(f"more than {DEEPEST} values within each other", node.start_mark)
+            raise _error(f"values are nested more than {DEEPEST} levels deep", node.start_mark)
         name = node.tag.removeprefix(_TAG)
         match node:
             case MappingNode() if name == "map":
@@ -179,13 +182,13 @@ class _Values:
                 return [self.of(item, depth + 1) for item in node.value]
             case ScalarNode() if name in _SCALARS:
                 return _scalar(node, name)
-        raise _error(f"the tag {node.tag} has no meaning here", node.start_mark)
+        raise _error(f"the tag {node.tag} is not supported", node.start_mark)
 
     def _items(self, node: MappingNode, depth: int) -> Iterator[tuple[str, object]]:
         seen: set[str] = set()
         for key, value in node.value:
             if not isinstance(key, ScalarNode):
-                raise _error("a key that is not a word", key.start_mark)
+                raise _error("a key is not a string", key.start_mark)
             name = _scalar(key, "str")
             if name in seen:
                 raise _error(f"the key {name!r} occurs twice", key.start_mark)
@@ -195,13 +198,13 @@ class _Values:
 
 def _word(text: str) -> str:
     if _IMPOSSIBLE.search(text):
-        raise ValueError("a character that no file can hold")
+        raise ValueError("the file contains a character that is not allowed")
     return text
 
 
 def _integer(text: str) -> int:
     if len(text) > MOST_DIGITS:
-        raise ValueError("a number with too many digits")
+        raise ValueError("the file contains a number with too many digits")
     return int(text)
 
 
@@ -209,7 +212,7 @@ def _float(text: str) -> float:
     # Python writes `.inf` as `inf`.
     value = float(text.replace(".", "", 1) if text.lower().endswith((".inf", ".nan")) else text)
     if isnan(value):
-        raise ValueError("not a number, which no setting can be")
+        raise ValueError("a value is NaN, which no setting can be")
     return value
 
 
@@ -227,7 +230,7 @@ def _scalar(node: ScalarNode, name: str) -> object:
     pattern, build = _SCALARS[name]
     try:
         if not pattern.match(node.value):
-            raise _error(f"{node.value!r} is not of the type {name}", node.start_mark)
+            raise _error(f"{node.value!r} is not a valid {name}", node.start_mark)
         return build(node.value)
     except ValueError as error:
         raise _error(str(error), node.start_mark) from error

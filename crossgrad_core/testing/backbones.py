@@ -50,19 +50,19 @@ def blocks_cover_the_parameters(make: Make[Backbone]) -> None:
     names = [block.name for block in blocks]
     require(len(set(names)) == len(names), f"block names occur twice: {listed(names)}")
     held = [tensor for block in blocks for tensor in block.tensors]
-    require(len(set(held)) == len(held), f"a tensor is in two blocks: {listed(held)}")
+    require(len(set(held)) == len(held), f"a tensor belongs to two blocks: {listed(held)}")
     missing = sorted(set(held) - set(parameters))
-    require(not missing, f"blocks hold tensors that create() does not make: {listed(missing)}")
+    require(not missing, f"blocks contain tensors that create() does not return: {listed(missing)}")
     trained = {name for name, tensor in parameters.items() if tensor.requires_grad}
     loose = sorted(trained - set(held))
-    require(not loose, f"trained tensors that are in no block: {listed(loose)}")
+    require(not loose, f"trained tensors that belong to no block: {listed(loose)}")
     rows = primitives_of(blocks, parameters)
     for block in blocks:
         single = len(block.tensors) > 1 or block.tensors[0] == block.name
-        require(single, f"the single-tensor block {block.name} does not carry its tensor's name")
+        require(single, f"the single-tensor block {block.name} must have the name of its tensor")
         for name in block.tensors if block.per_primitive else ():
             found = parameters[name].shape[0]
-            require(found == rows, f"{name} has {found} rows for {rows} primitives")
+            require(found == rows, f"{name} has {found} rows for {rows} Gaussians")
 
 
 def the_default_densifier_is_there(make: Make[Backbone]) -> None:
@@ -71,19 +71,21 @@ def the_default_densifier_is_there(make: Make[Backbone]) -> None:
     usual = registry.load(Densifier, backbone.default_densifier)
     lacks = usual.tensors - {name for block in backbone.blocks() for name in block.tensors}
     what = f"default_densifier: {backbone.default_densifier}"
-    require(not lacks, f"{what} needs the tensors {listed(sorted(lacks))}, which no block holds")
+    require(not lacks, f"{what} needs the tensors {listed(sorted(lacks))}, which no block contains")
 
 
 def created_from_the_scene(make: Make[Backbone]) -> None:
     """Parameters are finite float32 leaves on the CPU, and equal for equal seeds."""
     with global_randomness_untouched():
         one, other = created(make()), created(make())
-    require(primitives_of(make().blocks(), one) > 0, "create() makes no primitives")
+    require(primitives_of(make().blocks(), one) > 0, "create() returns no Gaussians")
     for name, tensor in one.items():
         good = tensor.is_leaf and tensor.device.type == "cpu" and tensor.dtype == torch.float32
-        require(good or not tensor.requires_grad, f"{name} is no float32 leaf on the CPU")
+        require(good or not tensor.requires_grad, f"{name} is not a float32 leaf tensor on the CPU")
         require(tensor.isfinite().all(), f"{name} is not finite")
-        require(torch.equal(tensor, other[name]), f"{name} differs between two calls with one seed")
+        require(
+            torch.equal(tensor, other[name]), f"{name} differs between two calls with the same seed"
+        )
 
 
 def decoding_has_the_shape(make: Make[Backbone]) -> None:
@@ -99,14 +101,16 @@ def decoding_has_the_shape(make: Make[Backbone]) -> None:
 
 def _require_valid(gaussians: Gaussians, primitives: int) -> None:
     misfit = gaussians.misfit()
-    require(misfit is None, f"decode() gives Gaussians that do not go together: {misfit}")
+    require(misfit is None, f"decode() returns inconsistent Gaussians: {misfit}")
     number, kind = len(gaussians), gaussians.means.dtype
-    require(kind.is_floating_point, f"means are {kind}, not of a floating type")
+    require(kind.is_floating_point, f"means have the type {kind}, which is not a floating type")
     bands = 1 if gaussians.sh_rest is None else 1 + gaussians.sh_rest.shape[1]
-    require(bands in COEFFICIENTS, f"there are {bands} coefficients, none of {COEFFICIENTS}")
+    require(
+        bands in COEFFICIENTS, f"there are {bands} coefficients, which is none of {COEFFICIENTS}"
+    )
     decoded = gaussians.decoded
     whole = decoded is None or decoded.shape == (primitives,)
-    require(whole, f"decoded is not [{primitives}], the number of primitives")
+    require(whole, f"decoded does not have the shape [{primitives}] of the primitives")
     kinds = {"origin": torch.int64, "slot": torch.int64, "decoded": torch.bool}
     for name, value in vars(gaussians).items():
         if isinstance(value, Tensor):
@@ -118,10 +122,12 @@ def _require_valid(gaussians: Gaussians, primitives: int) -> None:
     require(inside, "an opacity is outside [0, 1]")
     origin = gaussians.origin
     if origin is None:
-        require(number == primitives, f"{number} Gaussians of {primitives} primitives, no origin")
+        require(
+            number == primitives, f"{number} Gaussians for {primitives} primitives, without origin"
+        )
     else:
         within = number == 0 or (int(origin.min()) >= 0 and int(origin.max()) < primitives)
-        require(within, f"origin leaves 0 .. {primitives - 1}")
+        require(within, f"origin contains indices outside 0 to {primitives - 1}")
 
 
 def positions_are_those_of_primitives(make: Make[Backbone]) -> None:
@@ -155,7 +161,7 @@ def gradients_reach_every_block(make: Make[Backbone]) -> None:
         gradients = [parameters[name].grad for name in block.tensors]
         reached = any(gradient is not None and gradient.any() for gradient in gradients)
         frozen = block.lr.initial == 0.0
-        require(reached or frozen, f"no gradient reaches block {block.name} (lr {block.lr})")
+        require(reached or frozen, f"block {block.name} receives no gradient (lr {block.lr})")
         for gradient in gradients:
             finite = gradient is None or gradient.isfinite().all()
             require(finite, f"the gradient of block {block.name} is not finite")
@@ -183,7 +189,7 @@ def checkpoints_give_the_same_gaussians(make: Make[Backbone]) -> None:
             other = make().decode(load(written), sample_camera(), phase)
         for name in (name for name, value in vars(one).items() if isinstance(value, Tensor)):
             same = torch.equal(getattr(one, name), getattr(other, name))
-            require(same, f"{name} differs after a checkpoint; keep everything in the parameters")
+            require(same, f"{name} differs after a checkpoint; keep all state in the parameters")
 
 
 def edits_keep_rows_together(make: Make[Backbone]) -> None:
@@ -234,18 +240,18 @@ def baking_gives_plain_gaussians(make: Make[Backbone]) -> None:
     """Baking for a PLY file gives Gaussians with spherical harmonics, without a graph."""
     backbone = make()
     baked = backbone.bake(created(backbone), sample_phase(training=False), [sample_camera()])
-    require(baked.sh_dc is not None and baked.colors is None, "bake() does not give sh_dc")
-    require(not baked.means.requires_grad, "bake() gives tensors with a graph")
-    require(len(baked) > 0, "bake() gives no Gaussians")
+    require(baked.sh_dc is not None and baked.colors is None, "bake() does not return sh_dc")
+    require(not baked.means.requires_grad, "bake() returns tensors with a graph")
+    require(len(baked) > 0, "bake() returns no Gaussians")
     finite = all(getattr(baked, name).isfinite().all() for name in ("means", "quats", "scales"))
-    require(finite, "bake() gives Gaussians that are not finite")
+    require(finite, "bake() returns Gaussians that are not finite")
 
 
 def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
     """With `plain`, baked Gaussians give every camera the same image as decoding."""
     backbone = make()
     if not backbone.plain:
-        raise cannot_tell("it does not say that a standard PLY loses nothing (plain)")
+        raise cannot_tell("the backbone does not declare that a standard PLY loses nothing (plain)")
     parameters, phase = _grown(created(backbone)), sample_phase(training=False)
     cameras = [view.camera for view in sample_scene().train_views]
     baked = backbone.bake(parameters, phase, cameras[:1])
@@ -259,9 +265,10 @@ def plain_ones_bake_what_they_draw(make: Make[Backbone]) -> None:
         error = (drawn - again).abs()
         require(
             error.max() < _PIXEL and error.mean() < _MEAN,
-            f"plain is True, but what bake gives is drawn otherwise than what decode gives, by up "
-            f"to {float(error.max()):.2g}, {float(error.mean()):.2g} in the mean; expected at most "
-            f"{_PIXEL:g} and {_MEAN:g}: bake what decode draws, or leave plain out",
+            "plain is True, but the render of bake differs from the render of decode by "
+            f"up to {float(error.max()):.2g}, {float(error.mean()):.2g} on average; "
+            f"expected at most {_PIXEL:g} and {_MEAN:g}: make bake return the Gaussians "
+            "of decode, or set plain to False",
         )
 
 
@@ -285,10 +292,10 @@ def fitting_respects_the_user(make: Make[Backbone]) -> None:
     backbone = make()
     fitted, notes = backbone.fitted_to(sample_scene())
     told = fitted == backbone or len(notes) > 0
-    require(told, "fitted_to() changes options and says nothing about it")
+    require(told, "fitted_to() changes options but returns no note about the change")
     asked = type(backbone).model_validate(backbone.model_dump())
     require(
-        asked.fitted_to(sample_scene())[0] == asked, "fitted_to() changes options that were set"
+        asked.fitted_to(sample_scene())[0] == asked, "fitted_to() changes options that the user set"
     )
 
 
@@ -306,7 +313,7 @@ def passed_on_tensors_are_handed_over(make: Make[Backbone]) -> None:
                 require(kept, f"{field} is not the tensor that passthrough names")
             elif isinstance(value, Tensor):
                 known = bool(value.isfinite().all())
-                require(known, f"{field} is made of a tensor that passthrough names")
+                require(known, f"{field} is computed from a tensor that passthrough names")
 
 
 BACKBONE_CHECKS: tuple[Check[Backbone], ...] = (

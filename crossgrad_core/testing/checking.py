@@ -14,7 +14,7 @@ from crossgrad_core.registry.signatures import defined_at, raised_at
 from crossgrad_core.registry.slots import COMMANDS, OWN_COMMANDS
 from crossgrad_core.wording import in_one_line, listed, singular
 
-#: `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
+#: Function `check(make)` of any slot, see `crossgrad_core.testing.support.contract`.
 AnyCheck: TypeAlias = Callable[[Any], None]
 
 
@@ -46,7 +46,11 @@ def checks_of(slot: str) -> tuple[AnyCheck, ...]:
 def check_entry(entry: registry.Entry) -> list[Result]:
     """Load a plugin and run every check of its slot; stop early if it cannot be loaded."""
     taken = _taken(entry)
-    names = [Result("its name is free", failure=taken, where=entry.origin)] if taken else []
+    names = (
+        [Result("its name is not used by another plugin", failure=taken, where=entry.origin)]
+        if taken
+        else []
+    )
     if taken and entry.slot == COMMANDS:
         return names  # The command can never be called.
     try:
@@ -63,7 +67,10 @@ def check_entry(entry: registry.Entry) -> list[Result]:
         try:
             loaded()
         except (Exception, SystemExit) as error:
-            return [*names, _failed("it can be made with default options", error, package, where)]
+            return [
+                *names,
+                _failed("it can be created with default options", error, package, where),
+            ]
     return [*names, *(_result(check, loaded, package, where) for check in checks_of(entry.slot))]
 
 
@@ -83,7 +90,7 @@ def _announced_at(entry: registry.Entry) -> str:
     module, _, name = entry.value.partition(":")
     loaded = sys.modules.get(module.strip())
     thing = getattr(loaded, name.strip(), None)
-    # The object may belong to another package; its location would not help then.
+    # If the object belongs to another package, its location would not help the author.
     own = defined_at(thing) if getattr(thing, "__module__", "") == module.strip() else ""
     return own or getattr(loaded, "__file__", None) or entry.origin
 
@@ -92,7 +99,7 @@ def _failed(check: str, error: BaseException, package: str, where: str) -> Resul
     """Return a failure at the innermost line of the package, or else at `where`."""
     where = raised_at(error, package) or where
     if isinstance(error, AssertionError):
-        return Result(check, str(error) or "an assertion without a text failed", where=where)
+        return Result(check, str(error) or "an assertion without a message failed", where=where)
     return Result(check, in_one_line(error), where=where)
 
 

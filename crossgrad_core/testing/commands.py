@@ -17,7 +17,8 @@ from crossgrad_core.registry.commands import Command, as_group_member
 from crossgrad_core.testing.support.contract import cannot_tell, require
 from crossgrad_core.wording import listed
 
-#: Libraries with a long import time; a command imports them after it has reported its start.
+#: Libraries with a long import time. A command imports them only after it has printed its first
+#: message.
 HEAVY: Final = ("matplotlib", "numba", "numpy", "pydantic", "scipy", "torch")
 _IMPORTED = """
 import sys
@@ -38,7 +39,7 @@ def help_can_be_shown(command: Command) -> None:
     printed = StringIO()
     with redirect_stdout(printed):
         as_group_member(command, "command").main(["--help"], "command", standalone_mode=False)
-    require("Usage" in printed.getvalue(), "--help prints no usage")
+    require("Usage" in printed.getvalue(), "--help prints no usage line")
 
 
 def importing_it_is_quick(command: Command) -> None:

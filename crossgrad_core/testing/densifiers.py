@@ -49,7 +49,7 @@ from crossgrad_core.wording import listed
 _AROUND_EDITS = (*range(596, 602), *range(698, 702))
 _EDIT = 600
 _ROOM = 10_000
-#: Least share of the present primitives that remains after one edit.
+#: Minimum share of the present Gaussians that must remain after one edit.
 _LEFT = 0.1
 #: Typical gradient of the projected mean, per pixel: for images of the sample scene's size, 2e-5
 #: corresponds to the published threshold in NDC units.
@@ -109,7 +109,7 @@ class DensifierRun:
     def take_step(self, step: int, room: int = _ROOM) -> Edit:
         """Call the densifier for a step, apply its edit and return it."""
         edit, state = self.densifier.densify(self.context(step, room), self.state)
-        require(isinstance(edit, Edit), f"the answer is {edit!r}, not an Edit or NO_EDIT")
+        require(isinstance(edit, Edit), f"the result is {edit!r}, not an Edit or NO_EDIT")
         require(isinstance(state, PluginState), f"the new state is {state!r}, not a PluginState")
         self._require_rows(state)
         self.state = state
@@ -128,8 +128,8 @@ class DensifierRun:
             rows = tensor.shape[0]
             require(
                 rows == self.primitives,
-                f"the returned state's {name} has {rows} rows for {self.primitives} primitives; "
-                "the edit gathers its rows afterwards",
+                f"the returned state's {name} has {rows} rows for {self.primitives} "
+                "Gaussians; the edit selects the rows later",
             )
 
     def _apply(self, edit: Edit) -> None:
@@ -174,7 +174,7 @@ def _directions(radii: Tensor, gradient: Tensor, rng: np.random.Generator) -> Te
 def _backbone_for(densifier: Densifier) -> Backbone:
     """Return a backbone that uses this densifier by default, or that has the tensors it edits."""
     fitting = []
-    # Of equally good backbones the first is used: crossgrad's own.
+    # Of several suitable backbones, use the first one, which is crossgrad's own.
     known = sorted(entries("backbones").values(), key=lambda each: each.distribution != "crossgrad")
     for entry in sorted(known, key=lambda each: each.name != BACKBONE):
         try:
@@ -182,7 +182,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
             have = {tensor for block in backbone.blocks() for tensor in block.tensors}
             usual = load("densifiers", backbone.default_densifier)
         except (Exception, SystemExit):
-            # A broken backbone of another package is not this densifier's fault.
+            # If a backbone of another package is broken, the densifier is not the cause.
             continue
         if densifier.tensors <= have:
             fitting.append((type(densifier) is not usual, backbone))
@@ -195,7 +195,7 @@ def _backbone_for(densifier: Densifier) -> Backbone:
 def require_good(edit: Edit, blocks: tuple[Block, ...], parameters: Parameters) -> None:
     """Require that an edit can be applied and that its values are finite."""
     misfit = misfit_of(edit, blocks, parameters)
-    require(not misfit, f"the edit does not fit: {misfit}")
+    require(not misfit, f"the edit is inconsistent: {misfit}")
     plain = all(type(each) is int for each in edit.counts.values())
     require(plain, f"edit.counts is {edit.counts!r}; expected plain integers")
     number = primitives_of(blocks, parameters) if edit.source is None else len(edit.source)
@@ -212,7 +212,7 @@ def its_needs_are_statistics(make: Make[Densifier]) -> None:
     """`needs` names optional outputs that rasterizers may provide; other names refuse every run."""
     known = ("depth", "pixels", "abs_gradient", "directions", "count")
     more = sorted(make().needs.difference(known))
-    require(not more, f"needs names {listed(more)}; rasterizers may provide {listed(known)}")
+    require(not more, f"needs contains {listed(more)}; rasterizers can provide {listed(known)}")
 
 
 def quiet_before_its_time(make: Make[Densifier]) -> None:
@@ -245,7 +245,7 @@ def never_outgrows_the_room(make: Make[Densifier]) -> None:
         before = run.primitives
         run.take_step(_EDIT, room)
         grown = run.primitives - before
-        require(grown <= room, f"{grown} primitives were added where context.room was {room}")
+        require(grown <= room, f"{grown} Gaussians were added, but context.room was {room}")
 
 
 def most_primitives_survive(make: Make[Densifier]) -> None:
@@ -257,8 +257,8 @@ def most_primitives_survive(make: Make[Densifier]) -> None:
         left = before if edit.source is None else len(set(edit.source.tolist()))
         require(
             left >= _LEFT * before,
-            f"step {step}: the edit of densify keeps {left} of {before} primitives of a model that "
-            f"has just begun to train; expected at least {_LEFT:.0%} of them",
+            f"step {step}: the edit of densify keeps {left} of {before} Gaussians at the "
+            f"start of training; expected at least {_LEFT:.0%}",
         )
 
 
@@ -269,7 +269,7 @@ def same_seed_same_edits(make: Make[Densifier]) -> None:
         for step in _AROUND_EDITS:
             one.take_step(step)
             other.take_step(step)
-            _require_same(one, other, f"step {step}: two runs with one seed differ")
+            _require_same(one, other, f"step {step}: two runs with the same seed differ")
 
 
 def resumes_exactly(make: Make[Densifier]) -> None:
@@ -282,7 +282,7 @@ def resumes_exactly(make: Make[Densifier]) -> None:
         _require_same(
             whole,
             broken,
-            f"step {step}: a resumed run differs; keep what is remembered in the returned state",
+            f"step {step}: a resumed run differs; keep all state in the returned state",
         )
 
 
@@ -303,8 +303,10 @@ def inputs_stay_untouched(make: Make[Densifier]) -> None:
         run.densifier.densify(replace(context, rng=np.random.default_rng(step)), run.state)
         for name, tensor in run.parameters.items():
             same = torch.equal(tensor.detach(), copies[name])
-            require(same, f"step {step}: densify changes {name} itself; answer with an edit")
-        require(same_state(run.state, kept), f"step {step}: densify changes the state it was given")
+            require(same, f"step {step}: densify changes {name} itself; return an edit instead")
+        require(
+            same_state(run.state, kept), f"step {step}: densify changes the state that it received"
+        )
         run.take_step(step)
 
 

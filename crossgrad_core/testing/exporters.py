@@ -34,12 +34,12 @@ def writes_one_file(make: Make[Exporter]) -> None:
             notes: object = make().write(given, _FRAME, path, ("a comment",))
             _require_kept(given, "write")
             good = isinstance(notes, tuple) and all(isinstance(note, str) for note in notes)
-            require(good, f"write() answers {notes!r}, not a tuple of sentences")
+            require(good, f"write() returns {notes!r}, not a tuple of strings")
         found = sorted(path.name for path in Path(folder).iterdir())
-        require(found == ["a", "b"], f"two files were to be written; the folder holds {found}")
+        require(found == ["a", "b"], f"two files were expected; the folder contains {found}")
         require(first.stat().st_size > 0, "the file is empty")
         same = first.read_bytes() == second.read_bytes()
-        require(same, "the same Gaussians give different files")
+        require(same, "two exports of the same Gaussians differ")
 
 
 def appears_at_once(make: Make[Exporter]) -> None:
@@ -49,13 +49,13 @@ def appears_at_once(make: Make[Exporter]) -> None:
         make().write(_gaussians(), _FRAME, path, ())
         before = path.stat().st_ino
         if not before:
-            raise cannot_tell("this file system does not number its files")
+            raise cannot_tell("this file system has no inode numbers")
         make().write(_gaussians(), _FRAME, path, ())
         require(
             path.stat().st_ino != before,
-            "write() writes over the file in place, so that a full disk or a reader in between "
-            "finds half of it; expected that it appears complete or not at all: write to another "
-            "name in its folder and rename it, or use crossgrad_core.plugin.atomic_file",
+            "write() overwrites the file in place, so a reader or a full disk can leave "
+            "an incomplete file; expected an atomic write: write to another name in the "
+            "folder and rename the file, or use crossgrad_core.plugin.atomic_file",
         )
 
 
@@ -73,9 +73,9 @@ def writes_the_input_frame(make: Make[Exporter]) -> None:
             moved = not np.array_equal(exporter.rounding(given, similarity).offset, rounding.offset)
             require(
                 path.read_bytes() != written or moved,
-                f"another {what} of the similarity gives the same file: write() writes the local "
-                "frame; expected the input frame: positions by similarity.to_input, lengths "
-                "divided by similarity.scale",
+                f"another {what} of the similarity gives the same file: write() writes the "
+                "local frame; expected the input frame: positions by similarity.to_input, "
+                "lengths divided by similarity.scale",
             )
 
 
@@ -83,21 +83,24 @@ def what_it_writes_is_read_again(make: Make[Exporter]) -> None:
     """`read` gives the positions, sizes and opacities of `stored`, up to float32 rounding."""
     exporter = make()
     if type(exporter).read is Exporter.read:
-        raise cannot_tell("its files are written, not read")
+        raise cannot_tell("crossgrad writes files of this format but does not read them")
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{exporter.suffix}"
         exporter.write(_gaussians(), _FRAME, path, ())
         found = exporter.read(path, _FRAME)
     stored = exporter.stored(_gaussians())
-    require(len(found) == len(stored), f"{len(stored)} Gaussians are read as {len(found)}")
-    # The offset in the input frame costs the positions their last bits.
+    require(
+        len(found) == len(stored),
+        f"{len(stored)} Gaussians were written, but {len(found)} were read",
+    )
+    # Positions lose their last bits, because the offset of the input frame is large.
     size = float(np.abs(_FRAME.offset).max()) * _FRAME.scale
     for name in ("means", "scales", "opacities"):
         error = float((getattr(found, name) - getattr(stored, name)).abs().max())
         require(
             error <= _ROUNDING * max(1.0, size),
-            f"read() gives {name} that differ from those of stored() by up to {error:.2g}; "
-            "expected the local frame again, up to rounding",
+            f"read() returns {name} that differ from those of stored() by up to "
+            f"{error:.2g}; expected the local frame, up to rounding",
         )
 
 
@@ -105,7 +108,7 @@ def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
     """`stored` returns as many finite Gaussians as it got, and does not change its input."""
     given = _gaussians()
     stored = make().stored(given)
-    require(isinstance(stored, Gaussians), f"stored() answers {stored!r}, not Gaussians")
+    require(isinstance(stored, Gaussians), f"stored() returns {stored!r}, not Gaussians")
     require(len(stored) == len(given), f"{len(given)} Gaussians became {len(stored)}")
     for name in ("means", "quats", "scales", "opacities"):
         require(getattr(stored, name).isfinite().all(), f"the stored {name} are not finite")
@@ -114,7 +117,7 @@ def the_stored_ones_can_be_drawn(make: Make[Exporter]) -> None:
 
 def _require_kept(given: Gaussians, method: str) -> None:
     same = all(map(torch.equal, given.floats(), _gaussians().floats()))
-    require(same, f"{method}() changes the Gaussians that it was given")
+    require(same, f"{method}() changes the Gaussians that it received")
 
 
 def _gaussians() -> Gaussians:

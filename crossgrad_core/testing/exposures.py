@@ -19,18 +19,18 @@ def fitting_gives_an_installed_one(make: Make[Exposure]) -> None:
     """`fitted_to` returns a `Fitted`: an exposure, the name of another exposure, and notes."""
     exposure = make()
     fitted = exposure.fitted_to(sample_scene())
-    require(isinstance(fitted, Fitted), f"fitted_to() answers {fitted!r}, not a Fitted")
+    require(isinstance(fitted, Fitted), f"fitted_to() returns {fitted!r}, not a Fitted")
     told = isinstance(fitted.notes, tuple) and all(isinstance(note, str) for note in fitted.notes)
-    require(told, f"the notes of fitted_to() are {fitted.notes!r}, not a tuple of sentences")
+    require(told, f"the notes of fitted_to() are {fitted.notes!r}, not a tuple of strings")
     kind = type(exposure) if fitted.name is None else load(Exposure, fitted.name)
     right = type(fitted.exposure) is kind
-    require(right, f"fitted_to() gives {fitted.exposure!r} under the name {fitted.name!r}")
+    require(right, f"fitted_to() returns {fitted.exposure!r} under the name {fitted.name!r}")
 
 
 def every_photo_has_a_start(make: Make[Exposure]) -> None:
     """Each parameter starts with one finite float32 row per training photo, and is trained."""
     for name, each in make().per_photo(sample_scene()).items():
-        _require_rows(f"the start of {name}", each.first())
+        _require_rows(f"the initial value of {name}", each.first())
         require(each.lr.initial > 0, f"the learning rate of {name} is {each.lr.initial}")
 
 
@@ -40,10 +40,12 @@ def an_image_stays_an_image(make: Make[Exposure]) -> None:
     for image in (_image(), _image()[:5, :9], 3.0 * _image() - 1.0, torch.zeros(4, 4, 3)):
         kept = image.clone()
         taken = exposure.apply(image, values)
-        require(taken.shape == image.shape, f"{list(image.shape)} became {list(taken.shape)}")
-        require(taken.dtype == image.dtype, f"{image.dtype} became {taken.dtype}")
-        require(taken.isfinite().all(), "the image as taken is not finite")
-        require(torch.equal(image, kept), "the exposure changes the render that it was given")
+        require(
+            taken.shape == image.shape, f"the shape {list(image.shape)} became {list(taken.shape)}"
+        )
+        require(taken.dtype == image.dtype, f"the type {image.dtype} became {taken.dtype}")
+        require(taken.isfinite().all(), "the exposed image is not finite")
+        require(torch.equal(image, kept), "the exposure changes the render that it received")
 
 
 def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
@@ -56,7 +58,7 @@ def gradients_reach_render_and_values(make: Make[Exposure]) -> None:
     inputs = {"the render": image, **values}
     found = torch.autograd.grad((taken * weights).sum(), list(inputs.values()), allow_unused=True)
     for name, gradient in zip(inputs, found, strict=True):
-        require(gradient is not None, f"{name} gets no gradient")
+        require(gradient is not None, f"{name} receives no gradient")
         good = gradient is not None and gradient.isfinite().all()
         require(good, f"the gradient of {name} is not finite")
 
@@ -69,13 +71,13 @@ def projected_values_stay_projected(make: Make[Exposure]) -> None:
         raise cannot_tell("it has no parameters")
     kept = {name: each.clone() for name, each in values.items()}
     once = exposure.project(values)
-    require(once.keys() == values.keys(), f"{sorted(values)} became {sorted(once)}")
+    require(once.keys() == values.keys(), f"the parameters {sorted(values)} became {sorted(once)}")
     for name, each in once.items():
         _require_rows(f"the projected {name}", each)
         require(torch.equal(values[name], kept[name]), f"the projection changes {name} in place")
         again = exposure.project(once)[name]
         close = torch.allclose(again, each, rtol=_ROUNDING, atol=_ROUNDING)
-        require(close, f"a second projection moves {name} on")
+        require(close, f"a second projection changes {name} again")
 
 
 def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
@@ -84,7 +86,7 @@ def a_view_that_was_not_seen_has_values(make: Make[Exposure]) -> None:
     starts = _starts(exposure)
     for view in scene.test_views:
         values = exposure.predict_unseen(view, scene, starts)
-        require(values.keys() == starts.keys(), f"a held-out view gets {sorted(values)}")
+        require(values.keys() == starts.keys(), f"a held-out view receives {sorted(values)}")
         for name, value in values.items():
             right = value.shape == starts[name].shape[1:] and value.isfinite().all()
             require(right, f"a held-out view's {name} is {value!r}")
@@ -94,7 +96,7 @@ def same_input_same_bits(make: Make[Exposure]) -> None:
     """The exposed image depends only on the render and the values."""
     values = _first(_starts(make()))
     one, two = (make().apply(_image(), values) for _ in range(2))
-    require(torch.equal(one, two), "two calls give different images")
+    require(torch.equal(one, two), "two calls return different images")
 
 
 def _starts(exposure: Exposure) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from crossgrad_core.contract.schedule import Phase, Schedule
 from crossgrad_core.contract.slots.sampler import Sampler
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
-#: Length of the schedule in the contexts: the published one.
+#: Length of the schedule in the test contexts: the published length.
 STEPS = 30_000
 _VIEWS, _POINTS = 12, 40
 _NEAR_RADIUS, _FAR_RADIUS, _STEP = 0.4, 0.8, 0.02

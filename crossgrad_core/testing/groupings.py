@@ -53,7 +53,7 @@ def every_view_has_a_declared_label(make: Make[Grouping]) -> None:
     """Each view has one label, declared in `labels` (unless the user's input names it)."""
     grouping, scene = make(), sample_scene()
     rule = fitted(grouping, scene)
-    require(isinstance(rule, GroupingRule), f"the answer is {rule!r}, not a GroupingRule")
+    require(isinstance(rule, GroupingRule), f"the result is {rule!r}, not a GroupingRule")
     for views in (scene.train_views, scene.views, scene.views[:1]):
         labels = rule.labels(views)
         require(len(labels) == len(views), f"{len(views)} views have {len(labels)} labels")
@@ -78,7 +78,8 @@ def the_rule_is_fitted_on_training_views(make: Make[Grouping]) -> None:
         alone = rule.label(view)
         require(
             alone == label,
-            f"{view.name} is {alone!r} when labelled alone and {label!r} among the others",
+            f"{view.name} has the label {alone!r} when labelled alone and {label!r} "
+            "together with other views",
         )
 
 
@@ -87,7 +88,7 @@ def the_quantity_is_one_number_per_view(make: Make[Grouping]) -> None:
     grouping, scene = make(), sample_scene()
     together = grouping.quantity(scene, scene.views)
     if together is None:
-        raise cannot_tell("the rule splits no single number")
+        raise cannot_tell("the rule does not split by a single number")
     require(bool(together.name.strip()), "the quantity has no name")
     shape = np.shape(together.values)
     require(shape == (len(scene.views),), f"{len(scene.views)} views have values {list(shape)}")
@@ -103,7 +104,7 @@ def same_seed_same_labels(make: Make[Grouping]) -> None:
     with global_randomness_untouched():
         one = fitted(make(), scene).labels(scene.views)
         other = fitted(make(), scene).labels(scene.views)
-    require(one == other, "two calls with one seed give different labels")
+    require(one == other, "two calls with the same seed return different labels")
 
 
 GROUPING_CHECKS: tuple[Check[Grouping], ...] = (

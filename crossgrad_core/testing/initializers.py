@@ -36,7 +36,7 @@ def _require_points(more: object) -> None:
     if more is None:
         return
     if not isinstance(more, MorePoints):
-        raise ContractError(f"more_points() answers {type(more).__name__}, not MorePoints")
+        raise ContractError(f"more_points() returned {type(more).__name__}, not MorePoints")
     count = len(more.positions)
     shapes = {"positions": (count, 3), "colors": (count, 3), "sizes": (count,)}
     for name, shape in {**shapes, "opacities": (count,)}.items():
@@ -58,12 +58,12 @@ def answers_alike(make: Make[Initializer]) -> None:
         one, other = make(), make()
         first, second = one.more_points(scene), other.more_points(scene)
         told = one.messages(scene) == other.messages(scene)
-    require(told, "remarks() differ from one call to the next")
-    require((first is None) == (second is None), "points are added the one time only")
+    require(told, "remarks() returns different notes in two calls")
+    require((first is None) == (second is None), "points are added in only one of two calls")
     if first is not None and second is not None:
         for each in fields(first):
             same = np.array_equal(getattr(first, each.name), getattr(second, each.name))
-            require(same, f"{each.name} differ from one call to the next")
+            require(same, f"{each.name} differ between two calls")
 
 
 INITIALIZER_CHECKS: tuple[Check[Initializer], ...] = (*COMPONENT_CHECKS, adds_points, answers_alike)

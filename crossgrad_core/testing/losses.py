@@ -16,10 +16,13 @@ def is_a_finite_scalar_with_a_gradient(make: Make[Loss]) -> None:
     """The loss is one finite number, and the render gets a finite gradient that is not zero."""
     for mask, weights in ((None, None), (_mask(), None), (None, _weights()), (_mask(), _weights())):
         value, gradient = _taken(make(), _render(), mask, weights)
-        require(value.shape == (), f"the loss has the shape {list(value.shape)}, not that of one")
+        require(
+            value.shape == (),
+            f"the loss has the shape {list(value.shape)}, not the shape of a scalar",
+        )
         require(value.isfinite(), f"the loss is {value.item()}")
         require(gradient.isfinite().all(), "the gradient by the render is not finite")
-        require(gradient.any(), "the render gets no gradient from a photo that it is unlike")
+        require(gradient.any(), "the render receives no gradient from a photo that differs from it")
 
 
 def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
@@ -27,17 +30,17 @@ def is_smallest_where_render_and_photo_agree(make: Make[Loss]) -> None:
     loss, same = make(), _photo().float() / 255
     best = loss.loss(same, _photo(), None, None)
     other = loss.loss(_render(), _photo(), None, None)
-    require(best < other, f"a perfect render has the loss {best.item()}, a poor one {other.item()}")
+    require(best < other, f"a perfect render has the loss {best.item()}, a bad one {other.item()}")
 
 
 def masked_pixels_do_not_count(make: Make[Loss]) -> None:
     """Pixels with a False mask do not change the loss and get no gradient."""
     loss, mask = make(), _mask()
     value, gradient = _taken(loss, _render(), mask, None)
-    require(not gradient[~mask].any(), "the render gets a gradient where the mask is False")
+    require(not gradient[~mask].any(), "the render receives a gradient where the mask is False")
     changed = torch.where(mask[..., None], _render(), torch.full_like(_render(), 0.9))
     again = loss.loss(changed, _photo(), mask, None)
-    require(torch.equal(value, again), "pixels that do not count change the loss")
+    require(torch.equal(value, again), "masked pixels change the loss")
 
 
 def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
@@ -46,8 +49,8 @@ def nothing_that_counts_is_no_loss(make: Make[Loss]) -> None:
     for mask, weights in ((nothing.bool(), None), (None, nothing)):
         value, gradient = _taken(make(), _render(), mask, weights)
         what = "weight" if mask is None else "mask"
-        require(value == 0, f"without a pixel that counts ({what}) the loss is {value.item()}")
-        require(not gradient.any(), f"without a pixel that counts ({what}) there is a gradient")
+        require(value == 0, f"without an unmasked pixel ({what}) the loss is {value.item()}")
+        require(not gradient.any(), f"without an unmasked pixel ({what}) there is a gradient")
 
 
 def equal_weights_change_nothing(make: Make[Loss]) -> None:
@@ -57,7 +60,9 @@ def equal_weights_change_nothing(make: Make[Loss]) -> None:
     for level in (1.0, 0.25):
         equal = loss.loss(_render(), _photo(), _mask(), torch.full((_HEIGHT, _WIDTH), level))
         close = torch.isclose(plain, equal, rtol=_ROUNDING)
-        require(close, f"the loss is {plain.item()}, with all weights {level} {equal.item()}")
+        require(
+            close, f"the loss is {plain.item()}, but with all weights {level} it is {equal.item()}"
+        )
 
 
 def weights_count(make: Make[Loss]) -> None:
@@ -66,7 +71,7 @@ def weights_count(make: Make[Loss]) -> None:
     left[:, : _WIDTH // 2] = 1.0
     _, gradient = _taken(make(), _render(), None, left)
     sides = gradient.abs().sum(dim=(0, 2)).chunk(2)
-    require(sides[0].sum() > sides[1].sum(), "pixel weights make no difference to the gradient")
+    require(sides[0].sum() > sides[1].sum(), "pixel weights do not change the gradient")
 
 
 def same_input_same_bits(make: Make[Loss]) -> None:

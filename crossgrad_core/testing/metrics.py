@@ -20,11 +20,13 @@ def names_its_figure(make: Make[Metric]) -> None:
     figure = getattr(make(), "figure", None)
     require(isinstance(figure, Figure), f"figure is {figure!r}, not a Figure")
     name, label = make().figure.name, make().figure.label
-    require(name.isidentifier() and name == name.lower(), f"{name!r} is no name of a column")
+    require(name.isidentifier() and name == name.lower(), f"{name!r} is not a valid column name")
     require(label, "the figure has no label")
-    require(format(0.5, make().figure.form), f"the form {make().figure.form!r} shows nothing")
+    require(format(0.5, make().figure.form), f"the format {make().figure.form!r} prints nothing")
     told = make().described().name
-    require(told == name, f"described() calls the figure {told!r}, figure calls it {name!r}")
+    require(
+        told == name, f"described() returns the metric name {told!r}, but figure contains {name!r}"
+    )
 
 
 def its_columns_are_its_own(make: Make[Metric]) -> None:
@@ -33,7 +35,7 @@ def its_columns_are_its_own(make: Make[Metric]) -> None:
     first = load(Metric, METRICS.split("+")[0])
     figures = () if type(metric) is first else (first.figure,)
     free = metric.figure.name not in {"name", "regime", *columns_for((), figures)}
-    require(free, f"crossgrad writes a column {metric.figure.name!r} already: rename the figure")
+    require(free, f"crossgrad already writes a column {metric.figure.name!r}: rename the metric")
 
 
 def measures_a_finite_number(make: Make[Metric]) -> None:
@@ -56,20 +58,22 @@ def masked_pixels_do_not_count(make: Make[Metric]) -> None:
     other = _render()
     other[~mask] = 255 - other[~mask]
     one, two = (make().measure(_compared(render, mask)) for render in (_render(), other))
-    require(one == two, f"pixels that do not count change the figure from {one} to {two}")
+    require(one == two, f"masked pixels change the metric from {one} to {two}")
 
 
 def same_input_same_figure(make: Make[Metric]) -> None:
     """The metric depends only on the compared images and does not change them."""
     compared = _compared(_render())
     one, two = make().measure(compared), make().measure(compared)
-    require(one == two, f"two looks at one render give {one} and {two}")
+    require(one == two, f"two measurements of one render return {one} and {two}")
     require(torch.equal(compared.render, _render()), "the metric changes the render")
 
 
 def _require_number(value: object) -> None:
     number = isinstance(value, int | float) and isfinite(value)
-    require(value is None or number, f"measure() answers {value!r}; None or a finite number")
+    require(
+        value is None or number, f"measure() returns {value!r}; expected None or a finite number"
+    )
 
 
 def _compared(render: Tensor, mask: Tensor | None = None) -> Compared:

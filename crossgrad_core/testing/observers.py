@@ -184,8 +184,9 @@ def _require_survival(hooks: Hooks, observer: Observer, step: int) -> None:
         raise
     except (Exception, SystemExit) as error:
         raise ContractError(
-            f"step {step}: a hook of the observer raises {in_one_line(error)}; expected that an "
-            "observer ends no run: catch what can fail, and leave out what failed"
+            f"step {step}: a hook of the observer raises {in_one_line(error)}; an "
+            "observer must not end a run: catch errors, and leave out the part that "
+            "failed"
         ) from error
 
 
@@ -238,12 +239,12 @@ def _require_views(step: int, sampled: SampleResult, scaled: ScaleResult) -> Non
     require(drawn == len(_VIEWS), f"step {step}: {len(_VIEWS)} views became {drawn}")
     good = len(scales) == len(_VIEWS) and all(0.0 < scale <= 1.0 for scale in scales)
     wanted = "expected one in (0, 1] for each"
-    require(good, f"step {step}: {len(_VIEWS)} views get the scales {scales}; {wanted}")
+    require(good, f"step {step}: {len(_VIEWS)} views received the scales {scales}; {wanted}")
 
 
 def _require_gradients(step: int, aggregated: AggregateResult) -> None:
     gradients, answered = sample_gradients(len(_VIEWS))[0], aggregated.gradients
-    what = f"step {step}: a wrapper of crossgrad_aggregate_gradients answers"
+    what = f"step {step}: a wrapper of crossgrad_aggregate_gradients returns"
     require(
         answered.keys() == gradients.keys(),
         f"{what} gradients of {sorted(answered)}; expected those of {sorted(gradients)}",
@@ -267,14 +268,14 @@ def questions_are_answered_in_kind(make: Make[Observer]) -> None:
         for reasons in hooks.crossgrad_validate_selection(selection=selection):
             good = isinstance(reasons, list) and all(isinstance(each, str) for each in reasons)
             require(
-                good, f"crossgrad_validate_selection answers {reasons!r}, not a list of sentences"
+                good, f"crossgrad_validate_selection returns {reasons!r}, not a list of strings"
             )
         _start(hooks, None)
         for step in _STEPS:
             _require_usable(hooks, run, step, 0.5 if step == 2 else 1.0)  # noqa: PLR2004
     for name, tensor in run.parameters.items():
         same = torch.equal(tensor.detach(), kept[name])
-        require(same, f"the observer changes the parameters {name} itself; answer with an edit")
+        require(same, f"the observer changes the parameters {name} itself; return an edit instead")
 
 
 def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) -> None:
@@ -285,8 +286,8 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
         size = shown.photo.shape[:2]
         fits = isinstance(weights, Tensor) and weights.is_floating_point() and weights.shape == size
         good = fits and ((weights >= 0.0) & weights.isfinite()).all()
-        wanted = f"finite numbers of 0 or more, floating point, {list(size)}"
-        require(good, f"crossgrad_pixel_weights answers {weights!r:.60}; expected {wanted}")
+        wanted = f"finite floating-point numbers of at least 0, with shape {list(size)}"
+        require(good, f"crossgrad_pixel_weights returns {weights!r:.60}; expected {wanted}")
     fields |= {"parameters": parameters_in_a_run(run.parameters), "backbone": run.backbone}
     drawn = gaussians_in_a_run(shown.gaussians, run.backbone)
     for gaussians, view in ((drawn, shown.view), (None, None)):
@@ -295,7 +296,7 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
             _require_answer(answer, RegularizeResult)
             loss = answer.loss
             good = isinstance(loss, Tensor) and loss.ndim == 0 and loss.isfinite()
-            require(good, f"the loss of crossgrad_regularize is {loss!r:.60}, no finite scalar")
+            require(good, f"the loss of crossgrad_regularize is {loss!r:.60}, not a finite scalar")
     after = AfterStepContext(**fields, means_lr=1e-4, edited=False)
     for answer in hooks.crossgrad_after_step(context=after):
         _require_answer(answer, DensifyResult)
@@ -304,10 +305,13 @@ def _require_usable(hooks: Hooks, run: DensifierRun, step: int, scale: float) ->
 
 
 def _require_answer(answer: Answer, kind: type[Answer]) -> None:
-    if not isinstance(answer, kind):  # Formatting the answer takes long, so it is not done before.
-        raise ContractError(f"a hook answers {answer!r:.60}, not {kind.__name__}")
+    # Format the answer only after a failure, because formatting takes long.
+    if not isinstance(answer, kind):
+        raise ContractError(f"a hook returned {answer!r:.60}, not {kind.__name__}")
     for name, state in answer.states.items():
-        require(isinstance(state, PluginState), f"the state of {name} is {state!r}, no PluginState")
+        require(
+            isinstance(state, PluginState), f"the state of {name} is {state!r}, not a PluginState"
+        )
         revived(state)
 
 
@@ -403,13 +407,15 @@ def nothing_piles_up(make: Make[Observer]) -> None:
             hooks.crossgrad_model_ready(model=model)
             if step % _BLOCK == 0:
                 kept.append(memory())
-    # Memory that it allocates once, such as a buffer, is allocated in the first steps.
+    # Ignore the first steps, in which the observer allocates memory that it reuses, such as a
+    # buffer.
     grown = min(later - earlier for earlier, later in pairwise(kept[1:])) / _BLOCK
     require(
         grown <= _KEPT,
-        f"the observer keeps {grown / 1e6:.1f} MB more after each step (crossgrad_step_end, "
-        f"crossgrad_model_ready, wrappers); expected at most {_KEPT / 1e6:g} MB, so that 30,000 "
-        "steps fit into memory: keep sums, or write to the run's folder",
+        f"the observer uses {grown / 1000000.0:.1f} MB more memory after each step "
+        "(crossgrad_step_end, crossgrad_model_ready, wrappers); expected at most "
+        f"{_KEPT / 1000000.0:g} MB, so that 30,000 steps fit into memory: keep sums, "
+        "or write to the run's folder",
     )
 
 
@@ -425,9 +431,9 @@ def steps_are_not_held_up(make: Make[Observer]) -> None:
     for name in _ON_THE_CLOCK & seconds.keys():
         require(
             seconds[name] <= _SLOW,
-            f"{name} takes {seconds[name]:.2f} s at the fastest of {_CALLS} calls, with 40 "
-            f"primitives and 24 x 16 pixels; expected at most {_SLOW:g} s: do what takes long in "
-            "some steps only, or in an event, which is off the clock",
+            f"the fastest of {_CALLS} calls of {name} takes {seconds[name]:.2f} s, with "
+            f"40 Gaussians and 24 x 16 pixels; expected at most {_SLOW:g} s: do slow work "
+            "only in some steps, or in an event, whose time is not counted",
         )
 
 

@@ -80,11 +80,11 @@ def _families(draw: Array) -> Iterator[tuple[str, Array]]:
     ramp = np.arange(views)[:, None]
     yield "usual", draw
     yield "zero", np.zeros_like(draw)
-    yield "one view zero", np.where(ramp == 0, 0.0, draw)
-    yield "all but one view zero", np.where(ramp == views - 1, draw, 0.0)
+    yield "one view without gradient", np.where(ramp == 0, 0.0, draw)
+    yield "gradients in one view only", np.where(ramp == views - 1, draw, 0.0)
     yield "equal", np.repeat(draw[:1], views, axis=0)
     yield "opposite", draw[:1] * (-1.0) ** ramp
-    yield "parallel of other length", draw[:1] * (1.0 + ramp)
+    yield "parallel gradients of different length", draw[:1] * (1.0 + ramp)
     yield "two dimensions", np.where(np.arange(_SIZE) < 2, draw, 0.0)  # noqa: PLR2004
     yield "length ratio 1e6", draw * 10.0 ** (6.0 * (ramp % 2))
     yield "very long", draw * 1e30
@@ -107,7 +107,7 @@ def _matrix_operator(make: Make[Operator]) -> MatrixOperator:
     """
     operator = make()
     if not isinstance(operator, MatrixOperator):
-        raise cannot_tell("it needs the gradients themselves and has no matrix")
+        raise cannot_tell("it needs the gradients themselves and returns no matrix")
     return operator
 
 
@@ -147,7 +147,7 @@ def one_block_is_enough(make: Make[Operator]) -> None:
         alone, _ = transformed(operator, _only(case, 0))
         require(
             np.shape(alone)[0] == 1 and np.allclose(alone[0], matrices[0], rtol=_TOLERANCE),
-            f"K = {views}: the first block's matrix depends on the other blocks",
+            f"K = {views}: the first block's matrix depends on other blocks",
         )
 
 
@@ -179,7 +179,7 @@ def inputs_stay_untouched(make: Make[Operator]) -> None:
             same = np.array_equal(getattr(case.context, name), getattr(before.context, name))
             require(same, f"transform changes context.{name}")
         require(np.array_equal(case.gramians, before.gramians), "transform changes the Gramians")
-        require(same_state(state, kept), "transform changes the state that it was given")
+        require(same_state(state, kept), "transform changes the state that it received")
 
 
 def same_seed_same_answer(make: Make[Operator]) -> None:
@@ -189,8 +189,14 @@ def same_seed_same_answer(make: Make[Operator]) -> None:
         with global_randomness_untouched():
             one, one_state = transformed(operator, operator_case(views))
             other, other_state = transformed(_matrix_operator(make), operator_case(views))
-        require(np.array_equal(one, other), f"K = {views}: two calls with one seed differ")
-        require(same_state(one_state, other_state), f"K = {views}: two calls leave two states")
+        require(
+            np.array_equal(one, other),
+            f"K = {views}: two calls with the same seed return different results",
+        )
+        require(
+            same_state(one_state, other_state),
+            f"K = {views}: two calls with the same seed return different states",
+        )
 
 
 def state_survives_a_checkpoint(make: Make[Operator]) -> None:
@@ -204,8 +210,8 @@ def state_survives_a_checkpoint(make: Make[Operator]) -> None:
             again, copy = transformed(operator, case, revived(copy), step)
             require(
                 np.array_equal(matrices, again),
-                f"K = {views}, step {step}: the answer differs after a checkpoint; keep everything "
-                "that is remembered in the returned state",
+                f"K = {views}, step {step}: the result differs after a checkpoint; keep all "
+                "state in the returned state",
             )
 
 
@@ -219,7 +225,7 @@ def one_view_keeps_its_direction(make: Make[Operator]) -> None:
     for family, weight, present in zip(case.families, weights, case.context.present, strict=True):
         require(
             weight[0] > 0.0 or not present[0],
-            f"gradients: {family}: the only view has the weight {weight[0]}, not a positive one",
+            f"gradients: {family}: the only view has the weight {weight[0]}, which is not positive",
         )
 
 
@@ -232,14 +238,14 @@ def scales_with_the_gradients(make: Make[Operator]) -> None:
         again = transformed(operator, scaled)[0].sum(axis=1)
         lengths = np.sqrt(np.einsum("bkk->bk", case.gramians))
         for family, one, other, length in zip(case.families, weights, again, lengths, strict=True):
-            # The error is relative to the longest summand, because rounding is.
+            # The error is relative to the longest summand, because rounding errors are.
             error = np.abs((one - other) * length).max()
             size = np.abs(one * length).max()
             require(
                 error <= _TOLERANCE * size,
                 f"K = {views}, gradients: {family}: the weights {one.tolist()} become "
-                f"{other.tolist()} for gradients {_SCALE:g} times as long; compare lengths with "
-                "each other, never with a constant",
+                f"{other.tolist()} if all gradients are {_SCALE:g} times as long; compare "
+                "lengths with each other, never with a constant",
             )
 
 
@@ -262,10 +268,10 @@ def views_that_are_alike_count_alike(make: Make[Operator]) -> None:
                 raise cannot_tell("its weights depend on random numbers")
             require(
                 np.ptp(weights) <= _SOLVED * np.abs(weights).max(),
-                f"K = {views}, gradients of one length with the cosine {cosine:g}, and equal "
-                f"labels, losses and distances: transform gives the views the weights "
-                f"{weights.tolist()}; expected equal ones: tell views apart by labels, losses or "
-                "Gramians, never by their place in the step",
+                f"K = {views}, gradients of equal length with the cosine {cosine:g}, and "
+                "equal labels, losses and distances: transform returns the weights "
+                f"{weights.tolist()}; expected equal weights: distinguish views by labels, "
+                "losses or Gramians, never by their position in the step",
             )
 
 
@@ -297,13 +303,14 @@ def what_it_reads_is_declared(make: Make[Operator]) -> None:
             other = OperatorCase(case.families, case.gramians, replace(case.context, labels=labels))
             require(
                 np.array_equal(transformed(operator, other)[0], matrices),
-                f"K = {views}: other labels change the matrices, and reads_labels() is False",
+                f"K = {views}: other labels change the matrices, although reads_labels() is False",
             )
         if isinstance(operator, GramianOperator) and not operator.reads_gramians():
             turned = OperatorCase(case.families, case.gramians[:, ::-1, ::-1], case.context)
             require(
                 np.array_equal(transformed(operator, turned)[0], matrices),
-                f"K = {views}: other Gramians change the matrices, and reads_gramians() is False",
+                f"K = {views}: other Gramians change the matrices, although reads_gramians() "
+                "is False",
             )
 
 

@@ -51,7 +51,7 @@ def renders_have_the_shape(make: Make[Rasterizer]) -> None:
     _shape("alpha", render.alpha, HEIGHT, WIDTH)
     _shape("screen.radii", render.screen.radii, len(gaussians))
     require(render.screen.radii.dtype == torch.int32, "screen.radii is not int32")
-    require(render.image.dtype == torch.float32, "float32 Gaussians give another type of image")
+    require(render.image.dtype == torch.float32, "float32 Gaussians give an image of another type")
     if "depth" in rasterizer.provides:
         _shape("depth", render.depth, HEIGHT, WIDTH)
     if "pixels" in rasterizer.provides:
@@ -64,9 +64,9 @@ def the_background_shows_through(make: Make[Rasterizer]) -> None:
     gaussians = moved(sample_gaussians(), device_of(rasterizer))
     black, white = _drawn(rasterizer, gaussians), _drawn(rasterizer, gaussians, 1.0)
     error = (white.image - black.image - (1.0 - black.alpha)[..., None]).detach().abs().max()
-    require(error < _ROUNDING, f"the background enters with an error of {float(error):.2g}")
+    require(error < _ROUNDING, f"the background is added with an error of {float(error):.2g}")
     inside = (black.alpha >= 0.0).all() and (black.alpha <= 1.0).all()
-    require(inside, "alpha leaves [0, 1]")
+    require(inside, "alpha is outside [0, 1]")
 
 
 def nothing_to_draw_is_no_error(make: Make[Rasterizer]) -> None:
@@ -93,7 +93,7 @@ def gradients_reach_every_input(make: Make[Rasterizer]) -> None:
         _drawn(rasterizer, gaussians, backward=True)
         for name, tensor in tensors_of(gaussians).items():
             gradient = tensor.grad
-            require(gradient is not None, f"{name} gets no gradient")
+            require(gradient is not None, f"{name} receives no gradient")
             if gradient is not None:
                 require(gradient.isfinite().all(), f"the gradient of {name} is not finite")
                 require(gradient.any(), f"the gradient of {name} is zero")
@@ -129,9 +129,12 @@ def statistics_are_filled(make: Make[Rasterizer]) -> None:
         count = screen.count or torch.zeros_like
         third = torch.arange(HEIGHT * WIDTH, device=visible.device).view(HEIGHT, WIDTH) % 3 == 0
         whole, parts = count(third | True), count(third) + count(~third)
-        require(whole.any() and torch.equal(whole, parts), "screen.count counts no or other pixels")
+        require(
+            whole.any() and torch.equal(whole, parts),
+            "screen.count does not count the expected pixels",
+        )
         same = screen.pixels is None or torch.equal(whole, screen.pixels)
-        require(same, "screen.count of all pixels is not screen.pixels")
+        require(same, "screen.count with all pixels marked differs from screen.pixels")
 
 
 def _directions_are_of_pixels(screen: Screen) -> None:
@@ -153,7 +156,7 @@ def _directions_are_of_pixels(screen: Screen) -> None:
 def same_input_same_bits(make: Make[Rasterizer]) -> None:
     """Two renders and their gradients are equal to the last bit, and inputs do not change."""
     if not make().deterministic:
-        raise cannot_tell("it says that its bits differ from run to run")
+        raise cannot_tell("the rasterizer declares that its bits differ between runs")
     results = []
     original = sample_gaussians(harmonics=True)
     for _ in range(2):
@@ -168,7 +171,7 @@ def same_input_same_bits(make: Make[Rasterizer]) -> None:
     for name, one in results[0].items():
         other = results[1][name]
         same = one is not None and other is not None and torch.equal(one, other)
-        require(same, f"two renders of one input differ in {name}")
+        require(same, f"two renders of the same input differ in {name}")
 
 
 def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
@@ -177,14 +180,18 @@ def dilations_of_gaussians_are_heeded(make: Make[Rasterizer]) -> None:
     try:
         wider = type(rasterizer)(**{**rasterizer.model_dump(), "dilation": 1.0})
     except ValidationError:
-        raise cannot_tell("it has one dilation and no other") from None
+        raise cannot_tell("the rasterizer supports only one dilation") from None
     some = moved(sample_gaussians(harmonics=False), device_of(rasterizer))
     with torch.no_grad():
         plain, own = (_drawn(each, some).image for each in (rasterizer, wider))
         wide = _drawn(rasterizer, replace(some, dilation=1.0)).image
-    require(not torch.equal(plain, wide), "a dilation that Gaussians bring changes nothing")
+    require(not torch.equal(plain, wide), "the dilation of the Gaussians has no effect")
     error = float((own - wide).abs().max())
-    require(error < _ROUNDING, f"it changes pixels by {error:.2g} more than its own of that size")
+    require(
+        error < _ROUNDING,
+        f"the dilation of the Gaussians changes pixels by {error:.2g} more than the "
+        "same dilation of the rasterizer",
+    )
 
 
 def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
@@ -210,15 +217,15 @@ def rows_on_demand_are_asked_for(make: Make[Rasterizer]) -> None:
     demand = OnDemand(frozenset(tensors), bring)
     plain = _drawn(rasterizer, some, backward=True)
     render = _drawn(rasterizer, replace(late, on_demand=demand), backward=True)
-    require(torch.equal(render.image, plain.image), "rows on demand give another image")
+    require(torch.equal(render.image, plain.image), "sparse rows give another image")
     unseen = not any(row % 2 == 0 for row in asked)
-    require(len(set(asked)) == len(asked) and unseen, f"asked for the rows {asked}")
+    require(len(set(asked)) == len(asked) and unseen, f"the rows {asked} were requested")
     for name, tensor in tensors.items():
         gradient, expected = tensor.grad, getattr(some, name).grad
         good = gradient is not None and gradient.is_sparse
         require(good, f"the gradient of {name} is not sparse")
         same = gradient is not None and torch.equal(gradient.to_dense(), expected)
-        require(same, f"rows on demand give another gradient of {name}")
+        require(same, f"sparse rows give another gradient of {name}")
 
 
 def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
@@ -228,7 +235,7 @@ def speed_says_where_it_runs(make: Make[Rasterizer]) -> None:
         speed = rasterizer.speed(device)
         require(
             speed == 0.0 or (speed > 0.0 and device in rasterizer.devices),
-            f"speed({device!r}) is {speed}, and devices are {sorted(rasterizer.devices)}",
+            f"speed({device!r}) is {speed}, but the devices are {sorted(rasterizer.devices)}",
         )
 
 

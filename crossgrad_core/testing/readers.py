@@ -15,9 +15,9 @@ def foreign_folders_are_not_accepted(make: Make[Reader]) -> None:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "notes.txt"
         for path, what in ((Path(folder), "an empty"), (Path(folder) / "gone", "a missing")):
-            require(make().accepts(path) is False, f"accepts() takes {what} folder")
+            require(make().accepts(path) is False, f"accepts() returns True for {what} folder")
         file.write_text("no scene")
-        require(make().accepts(file) is False, "accepts() takes a text file")
+        require(make().accepts(file) is False, "accepts() returns True for a text file")
 
 
 def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
@@ -29,8 +29,8 @@ def foreign_folders_are_a_user_error(make: Make[Reader]) -> None:
             except UserError:
                 continue
             except Exception as error:
-                raise ContractError(f"reading {path} raises {error!r}, not a UserError") from error
-            raise ContractError(f"reading {path}, which is no scene, raises nothing")
+                raise ContractError(f"reading {path} raised {error!r}, not a UserError") from error
+            raise ContractError(f"reading {path}, which is not a scene, raised no error")
 
 
 def folders_stay_as_they_are(make: Make[Reader]) -> None:
@@ -41,7 +41,7 @@ def folders_stay_as_they_are(make: Make[Reader]) -> None:
             make().read(Path(folder), SceneOptions.model_validate({}))
         except UserError:
             left = sorted(path.name for path in Path(folder).iterdir())
-            require(not left, f"the reader leaves files behind: {left}")
+            require(not left, f"the reader does not remove its files: {left}")
 
 
 READER_CHECKS: tuple[Check[Reader], ...] = (

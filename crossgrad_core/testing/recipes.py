@@ -21,18 +21,18 @@ def decides_every_setting(make: Make[Recipe]) -> None:
     for steps in (30, 3_000, 60_000):
         names = [row.setting for row in make().decide(_facts(steps))]
         missing = [name for name in DECIDED if name not in names]
-        require(not missing, f"no row for {listed(missing)}, in a run of {steps} steps")
+        require(not missing, f"no row for {listed(missing)} in a run of {steps} steps")
         twice = sorted({name for name in names if names.count(name) > 1})
-        require(not twice, f"more than one row for {listed(twice)}, in a run of {steps} steps")
+        require(not twice, f"more than one row for {listed(twice)} in a run of {steps} steps")
 
 
 def gives_a_reason_in_one_line(make: Make[Recipe]) -> None:
     """Each row gives a reason, and all of its texts fit in one line."""
     for row in make().decide(_facts(3_000)):
         require(isinstance(row, Decision), f"a row is {type(row).__name__}, not a Decision")
-        require(row.because, f"the row of {row.setting} says no reason")
+        require(row.because, f"the row of {row.setting} contains no reason")
         texts = (row.setting, row.because, row.evidence, row.override)
-        require("\n" not in "".join(texts), f"a text of {row.setting} has several lines")
+        require("\n" not in "".join(texts), f"a text of {row.setting} has more than one line")
 
 
 def names_settings_that_exist(make: Make[Recipe]) -> None:
@@ -40,14 +40,14 @@ def names_settings_that_exist(make: Make[Recipe]) -> None:
     settings = [*(row.setting for row in make().decide(_facts(3_000))), *make().settings]
     names = {setting.partition(".")[0] for setting in settings}
     unknown = sorted(names - RunConfig.model_fields.keys())
-    require(not unknown, f"no such setting: {listed(unknown)}")
+    require(not unknown, f"unknown settings: {listed(unknown)}")
 
 
 def decides_the_same_again(make: Make[Recipe]) -> None:
     """The same facts give the same rows, in the same order."""
     with global_randomness_untouched():
         first, second = (make().decide(_facts(3_000)) for _ in range(2))
-    require(first == second, "the rows differ from one call to the next")
+    require(first == second, "two calls return different rows")
 
 
 def _facts(steps: int) -> Facts:

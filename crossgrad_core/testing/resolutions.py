@@ -57,8 +57,10 @@ def every_view_has_a_scale(make: Make[Resolution]) -> None:
         scales = run.take_step(step)
         views = len(_draw(step).views)
         good = isinstance(scales, tuple) and all(isinstance(scale, float) for scale in scales)
-        require(good, f"scales() answers {scales!r}, not a tuple of floats")
-        require(len(scales) == views, f"{views} views were drawn and get {len(scales)} scales")
+        require(good, f"scales() returns {scales!r}, not a tuple of floats")
+        require(
+            len(scales) == views, f"{views} views were drawn but {len(scales)} scales were returned"
+        )
         require(all(0.0 < scale <= 1.0 for scale in scales), f"scales {scales} are not in (0, 1]")
 
 
@@ -68,7 +70,7 @@ def same_seed_same_scales(make: Make[Resolution]) -> None:
         one, other = (
             [run.take_step(step) for step in _STEPS] for run in (_Run(make()), _Run(make()))
         )
-    require(one == other, "two runs with one seed have different scales")
+    require(one == other, "two runs with the same seed have different scales")
 
 
 def resumes_exactly(make: Make[Resolution]) -> None:
@@ -80,8 +82,8 @@ def resumes_exactly(make: Make[Resolution]) -> None:
         one, other = whole.take_step(step), broken.take_step(step)
         require(
             one == other,
-            f"step {step}: an uninterrupted run has the scales {one}, a resumed one {other}; keep "
-            "everything that is remembered in the returned state",
+            f"step {step}: an uninterrupted run has the scales {one}, a resumed run "
+            f"{other}; keep all state in the returned state",
         )
 
 
@@ -92,7 +94,7 @@ def old_states_stay_untouched(make: Make[Resolution]) -> None:
         old = run.state
         kept = revived(old)
         run.take_step(step)
-        require(same_state(old, kept), "scales changes the state that it was given")
+        require(same_state(old, kept), "scales changes the state that it received")
 
 
 def states_stay_bounded(make: Make[Resolution]) -> None:
@@ -108,7 +110,10 @@ def pixels_add_up(make: Make[Resolution]) -> None:
     resolution, schedule = make().fitted_to(sample_scene()), Schedule.for_run(STEPS)
     for before, after in pairwise((0, *_STEPS)):
         pixels = resolution.pixels(schedule, after) - resolution.pixels(schedule, before)
-        told = f"pixels() grows by {pixels} from step {before} to step {after}, each of one view"
+        told = (
+            f"pixels() increases by {pixels} from step {before} to step {after}, with one "
+            "view per step"
+        )
         require(0.0 < pixels <= after - before + 1e-6 * after, told)
 
 

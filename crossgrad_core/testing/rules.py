@@ -29,7 +29,8 @@ from crossgrad_core.training.start import first_state
 from crossgrad_core.training.state import TrainState
 from crossgrad_core.training.step import final_edits
 
-#: Steps of a run, and the step after which it stops. Averages and tails are active by then.
+#: Number of steps of a run, and the step after which it stops. Averages and learning-rate tails are
+#: active by then.
 _STEPS, _STOP = 8, 6
 
 
@@ -53,17 +54,17 @@ def goes_on_from_a_checkpoint(make: Make[Rule]) -> None:
         for each in (state, again):
             _steps(setup, each, _STEPS)
             for _ in final_edits(setup, each):
-                require(each.primitives(setup), "no primitive is left at the end of a run")
+                require(each.primitives(setup), "no Gaussian is left at the end of a run")
     for name, tensor in state.parameters.items():
         same = torch.equal(tensor, again.parameters[name])
-        require(same, f"a resumed run differs in {name}: keep what a rule remembers in its state")
+        require(same, f"a resumed run differs in {name}: keep all state of a rule in its state")
 
 
 def says_why_it_would_do_nothing(make: Make[Rule]) -> None:
     """`unused` returns a text: the reason why the rule would have no effect, or an empty text."""
     setup = _setup(make)
     reason = make().unused(setup.backbone, setup.scene)
-    require(isinstance(reason, str), f"unused() answers {reason!r}, not a text")
+    require(isinstance(reason, str), f"unused() returns {reason!r}, not a string")
 
 
 def _setup(make: Make[Rule]) -> Setup:

@@ -50,7 +50,7 @@ def default_views_are_admitted(make: Make[Sampler]) -> None:
     sampler = make()
     require(
         sampler.view_counts.admits(sampler.resolved_views),
-        f"the usual K is {sampler.resolved_views}, but the sampler needs {sampler.view_counts}",
+        f"the default K is {sampler.resolved_views}, but the sampler needs {sampler.view_counts}",
     )
 
 
@@ -67,13 +67,13 @@ def draws_are_training_views(make: Make[Sampler]) -> None:
 
 
 def _require_good(draw: ViewSample, counts: frozenset[int], available: int) -> None:
-    require(isinstance(draw, ViewSample), f"the sampler answers {draw!r}, not a Draw and a state")
+    require(isinstance(draw, ViewSample), f"the sampler returns {draw!r}, not a Draw and a state")
     require(
         isinstance(draw.views, tuple) and all(type(view) is int for view in draw.views),
         f"the drawn views {draw.views!r} are not a tuple of plain integers",
     )
     views = len(draw.views)
-    require(views in counts, f"{views} views were drawn; `counts` says {sorted(counts)}")
+    require(views in counts, f"{views} views were drawn, but `counts` contains {sorted(counts)}")
     require(
         all(0 <= view < available for view in draw.views),
         f"the drawn views {draw.views} are not all positions in 0 .. {available - 1}",
@@ -88,14 +88,14 @@ def draws_hand_on_the_groups(make: Make[Sampler]) -> None:
     """If the training views have groups, every sample has labels: operators may need them."""
     sampler = make()
     if sampler.default_grouping is not None or sampler.own_labels:
-        raise cannot_tell("it has groups of its own choice")
+        raise cannot_tell("it chooses its own groups")
     regimes = tuple(view.regime for view in sample_scene().train_views)
     run = replace(sampler_run(sampler), groups=regimes)
     for draw in run.draws(_AFTER):
         require(
             draw.labels is not None,
-            "context.groups is given, and sample answers a ViewSample without labels, so that no "
-            "operator can tell the groups apart; expected a label for each view, such as "
+            "context.groups is set, but sample returns a ViewSample without labels, so "
+            "that no operator knows the groups; expected a label for each view, such as "
             "context.groups[view]",
         )
 
@@ -109,7 +109,9 @@ def every_view_comes(make: Make[Sampler]) -> None:
         missing -= set(draw.views)
         if not missing:
             return
-    require(not missing, f"the training views {sorted(missing)} never came in {_PATIENCE} steps")
+    require(
+        not missing, f"the training views {sorted(missing)} were not drawn in {_PATIENCE} steps"
+    )
 
 
 def same_seed_same_draws(make: Make[Sampler]) -> None:
@@ -117,7 +119,7 @@ def same_seed_same_draws(make: Make[Sampler]) -> None:
     with global_randomness_untouched():
         one = list(sampler_run(make()).draws(_AFTER))
         other = list(sampler_run(make()).draws(_AFTER))
-    require(one == other, "two runs with one seed draw different views")
+    require(one == other, "two runs with the same seed draw different views")
 
 
 def resumes_exactly(make: Make[Sampler]) -> None:
@@ -131,8 +133,8 @@ def resumes_exactly(make: Make[Sampler]) -> None:
         one, other = whole.draw(), broken.draw()
         require(
             one == other,
-            f"step {step}: an uninterrupted run draws {one.views}, a resumed one {other.views}; "
-            "keep everything that is remembered in the returned state",
+            f"step {step}: an uninterrupted run draws {one.views}, a resumed run "
+            f"{other.views}; keep all state in the returned state",
         )
 
 
@@ -143,7 +145,7 @@ def old_states_stay_untouched(make: Make[Sampler]) -> None:
         old = run.state
         kept = revived(old)
         run.draw()
-        require(same_state(old, kept), "sample changes the state that it was given")
+        require(same_state(old, kept), "sample changes the state that it received")
 
 
 def states_stay_bounded(make: Make[Sampler]) -> None:

@@ -17,9 +17,9 @@ from crossgrad_core.training.start import first_state, unwatched
 from crossgrad_core.training.state import ClockKind, TrainState
 
 #: Increase of the mean cost of a step per density control edit, in units of a step at the start.
-#: Chosen from runs with four edits; the clock corrects it during a run.
+#: The value comes from runs with four edits; during a run, time measurements correct it.
 COST_PER_EDIT = 0.2
-#: Largest number of counted edits, because growth slows down.
+#: Maximum number of edits that are counted, because growth slows down.
 COUNTED_EDITS = 5
 #: Number of pixels that cost as much time as one Gaussian. Source:
 #: `benchmarks/grids/two_views_tuning.yaml`.
@@ -78,7 +78,8 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
         return 1.0
     ahead = schedule.edits(step)
     if ahead and setup.numbers.growth == "budget":
-        # The limit is needed for budgets that no run reaches, as near the published length.
+        # The limit is needed for time budgets that no run uses up, for example near the published
+        # length.
         return min(1.0 + COST_PER_EDIT * COUNTED_EDITS, _along_curve(setup, crowd, schedule, step))
     done = schedule.edits_before + schedule.edits() - ahead
     return 1.0 + COST_PER_EDIT * min(ahead, max(0, COUNTED_EDITS - done))
@@ -87,7 +88,7 @@ def growth_ahead(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step:
 def _along_curve(setup: Setup, crowd: PrimitiveCounts, schedule: Schedule, step: int) -> float:
     """Return the same ratio if growth follows the curve to its budget."""
     cameras = [view.camera for view in setup.train_views]
-    # Cost of a view without primitives, in units of primitives.
+    # Cost of a view without Gaussians, in units of Gaussians.
     empty = fmean(camera.width * camera.height for camera in cameras) / PIXELS_PER_PRIMITIVE
     cost, at, count = 0.0, step, crowd.present
     for edit in schedule.edit_steps(step):
@@ -106,9 +107,9 @@ PROBE_SHARE = 0.01
 _TRIES = 8
 #: Share of the budget between two readings of the clock.
 LOOK_SHARE = 0.02
-#: The length changes only if the difference exceeds this share of the remaining steps.
+#: The length changes only if the difference is larger than this share of the remaining steps.
 TOLERANCE = 0.02
-#: A step that no run reaches, and an earlier step from which on photos have their full size.
+#: A step that no run reaches, and an earlier step after which photos have their full size.
 _NEVER = 10**9
 _FULL_SIZE = _NEVER - _NEVER // 100
 #: Weight of the newest measurement in the smoothed cost of a step. Smoothing is needed because
@@ -124,7 +125,7 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
     Returns:
         The number of steps, a note with the evidence, and the run's `pixel_share`.
     """
-    _LOG.info("measuring the time of a step, to plan %g s of training", seconds)
+    _LOG.info("timing a few steps to plan %g s of training", seconds)
     probed = replace(unwatched(setup), schedule=_without_edits(setup.schedule))
     state, pace, share = first_state(unwatched(setup)), setup.schedule.pace, setup.pixel_share
     state.step = _FULL_SIZE
@@ -149,10 +150,10 @@ def steps_for(setup: Setup, seconds: float) -> tuple[int, str, float]:
         fits = fitting(share)
     total = min(fits, most_steps(setup))
     if total < fits:
-        note += f", of which {fits} fit into that time; the bound on views allows {total}"
+        note += f", of which {fits} fit into that time; the limit on views allows {total}"
     unit = " of CPU time" if setup.config.clock == "cpu" else ""
     text = f"{total} steps planned for {seconds:g} s{unit}: {note}; "
-    return total, f"{text}the length follows the clock as the run goes", share
+    return total, f"{text}the number of steps is adapted during the run", share
 
 
 def most_steps(setup: Setup) -> int:
@@ -243,7 +244,7 @@ class Timed:
     def due(self, state: TrainState) -> bool:
         """Return True after a number of steps and a share of the budget."""
         if state.rewinds > self._rewinds:
-            # A length is recorded with its step, so this step must occur only once.
+            # A length is recorded together with its step, so each step may occur only once.
             self._rewinds, self._next = state.rewinds, self._seen + 1
             self._look(state)
         self._seen = state.step
@@ -253,7 +254,7 @@ class Timed:
 
     def revised(self, setup: Setup, state: TrainState) -> Setup:
         """Return the setup with the length that now fits, recorded in its configuration."""
-        # Measured per view, because the number of views per step may change.
+        # Measure the cost per view, because the number of views per step may change.
         seconds = state.clock.trained(self._kind) - self._clock
         newest = seconds / views_of(setup, setup.schedule, self._step, state.step)
         before = newest if self._each is None else self._each
@@ -319,7 +320,9 @@ def _length_note(setup: Setup) -> tuple[str, ...]:
     planned, total = setup.config.steps, setup.schedule.total
     if planned is None or planned == total:
         return ()
-    return (f"the length followed the clock: {total} steps instead of {planned}",)
+    return (
+        (f"the number of steps was adapted to the time budget: {total} steps instead of {planned}"),
+    )
 
 
 def _told(before: Setup, after: Setup) -> Setup:
@@ -328,7 +331,10 @@ def _told(before: Setup, after: Setup) -> Setup:
     if was and not now:
         schedule = after.schedule
         start, end = map(schedule.step_of, (schedule.densify_from, schedule.densify_until))
-        text = f"density control after all: in {schedule.total} steps it lasts from step "
+        text = (
+            f"density control is used after all: in a run of {schedule.total} steps it "
+            "acts from step "
+        )
         before.hook.crossgrad_log(text=f"{text}{start} to step {min(end, schedule.total)}")
     elif now and not was:
         before.hook.crossgrad_log(text=now[0])
@@ -357,7 +363,8 @@ def _fitting(cost: Callable[[int], float], affordable: float) -> int:
         affordable: Largest cost, in full-size views.
     """
     fits, too_many = 1, max(2, ceil(affordable) + 1)
-    while cost(too_many) <= affordable and too_many < _NEVER:  # Views of less than full size.
+    # These views have less than full size.
+    while cost(too_many) <= affordable and too_many < _NEVER:
         too_many *= 2
     while too_many - fits > 1:
         steps = (fits + too_many) // 2

@@ -32,8 +32,11 @@ from crossgrad_core.training.views import photo_camera
 
 #: Messages at the first and at the second signal; the third signal ends the process.
 _WORDS = (
-    "stopping: what there is gets saved and evaluated first (once more: only saved)",
-    "stopping: what there is gets saved first (once more: ends at once)",
+    (
+        "stopping: the current state is saved and evaluated first (press again to "
+        "skip the evaluation)"
+    ),
+    "stopping: the current state is saved first (press again to end at once)",
 )
 
 
@@ -73,7 +76,7 @@ class Stopper:
         try:
             for number in signal_names():
                 before[number] = signal.signal(number, self._handle)
-        except ValueError:  # Signals can be handled in the main thread only.
+        except ValueError:  # Python handles signals only in the main thread.
             yield self
             return
         try:
@@ -142,7 +145,7 @@ class Prefetcher:
             self._follow(state)
             self._draw(state)
             views = [setup.train_views[index] for draw in self._draws for index in draw]
-        except Exception:  # The step itself will say what is wrong.
+        except Exception:  # The step will report the error.
             self._blind = True
             return
         scale = max(state.last.scales, default=1.0) if state.last is not None else 1.0
@@ -179,12 +182,13 @@ class Prefetcher:
         return len(self._draws) >= _STEPS and sum(map(len, self._draws)) >= _VIEWS
 
 
-#: Why the loop returned.
+#: Reason why the loop returned.
 Ending = Literal["finished", "stopped", "paused"]
-#: Steps between checks of all parameters. Losses and gradients are checked in every step. A bad
-#: parameter that affects neither (of a Gaussian that is not drawn any more) is found later.
+#: Number of steps between checks of all parameters. Losses and gradients are checked in every step.
+#: A bad parameter that affects neither, for example of a Gaussian that is no longer rendered, is
+#: found later.
 CHECK_EVERY = 10
-#: Steps between copies of the last good state; a multiple of `CHECK_EVERY`.
+#: Number of steps between copies of the last good state; a multiple of `CHECK_EVERY`.
 SNAPSHOT_EVERY = 100
 
 
@@ -288,7 +292,7 @@ def timed_step(setup: Setup, state: TrainState) -> StepRecord:
     setup.photos_ahead.taken_cpu()
     record = take_step(setup, state)
     if setup.config.clock == "cpu" or looks_after(setup, state.step):
-        state.late.finish()  # On this step's clock.
+        state.late.finish()  # Count the time for this step.
     state.laps.leave_out(0.0, setup.photos_ahead.taken_cpu())
     state.laps.lap("other")
     state.clock.count(state.laps)
@@ -317,7 +321,8 @@ def _rewind(
     if rewound_before:
         raise TrainingFailedError(f"{error}, for the second time") from error
     setup.hook.crossgrad_log(
-        text=f"{error}: rewound to step {state.step}, the last good state; random streams renewed"
+        text=f"{error}: training returned to step {state.step}, the last finite state, "
+        "with new random numbers"
     )
     sink.rewind(setup, state.step)
 
@@ -326,8 +331,8 @@ def _tell_held_back(setup: Setup, record: StepRecord) -> None:
     held_back = record.counts.get("held_back", 0)
     if held_back > 0 and setup.numbers.growth == "unbounded":
         setup.hook.crossgrad_log(
-            text=f"step {record.step}: growth held back by {held_back} primitives "
-            "(--max-gaussians or the memory guard)"
+            text=f"step {record.step}: {held_back} Gaussians were not added (--max-gaussians "
+            "or the memory guard)"
         )
 
 

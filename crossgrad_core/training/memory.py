@@ -10,9 +10,10 @@ from torch import Tensor
 
 from crossgrad_core.contract.contexts import ViewRecord
 
-#: Copies of the parameters that always exist: parameters and two moments, now and in the snapshot.
+#: Number of copies of the parameters that always exist: parameters and two moments, in the state
+#: and in the snapshot.
 STANDING = 6
-#: Further copies during an edit, when no graph exists: the new parameters and moments.
+#: Number of further copies during an edit, when no graph exists: the new parameters and moments.
 EDIT = 3
 #: Memory of the graph of one view until its backward pass ends, in units of the parameters or of
 #: the decoded tensors of the view, whichever is larger. Measured with the numba rasterizer: 2.7.

@@ -24,11 +24,14 @@ def mode_note(name: str, grouping: Grouping, scene: Scene) -> tuple[str, ...]:
         return ()
     found = bimodality(quantity.values[np.isfinite(quantity.values)])
     figure = found.deciding
-    # The figure is NaN if all values are equal or there are too few values.
+    # The coefficient is NaN if all values are equal or there are too few values.
     if not figure < ONE_MODE:
         return ()
     return (
-        f"grouping {name} splits what has one mode: the bimodality of {quantity.name} is "
-        f"{figure:.2f} over {found.size} training views (below {ONE_MODE}), so the split is "
-        f"arbitrary there; sampler {SAMPLER} needs none",
+        (
+            f"grouping {name} splits values that form only one group: the bimodality of "
+            f"{quantity.name} is {figure:.2f} over {found.size} training views (below "
+            f"{ONE_MODE}), so that the split is arbitrary; sampler {SAMPLER} needs no "
+            "groups"
+        ),
     )

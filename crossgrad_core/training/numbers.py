@@ -38,9 +38,9 @@ class Numbers:
         values = {each.name: getattr(config, each.name) for each in fields(cls)}
         if missing := [name for name, value in values.items() if value is None]:
             raise UserError(
-                "settings that a run needs have no value",
+                "some settings that the run needs have no value",
                 where=listed(missing),
                 expected="a value from the user or from the recipe",
-                todo="set them, or choose a --recipe that decides them",
+                todo="set them, or choose a --recipe that sets them",
             )
         return cls(**values)

@@ -24,11 +24,11 @@ from crossgrad_core.training.setup import Setup
 from crossgrad_core.training.state import NonFiniteError, TrainState
 from crossgrad_core.wording import listed
 
-#: The file in a run's folder.
+#: Name of the file in a run's folder.
 PHOTO_VALUES: Final = "exposure.json"
 #: Version of the format; increased when an older reader could misread a newer file.
 PHOTO_VALUES_FORMAT: Final = 1
-_TODO = "name the exposure.json of a run, or leave --exposure-from out"
+_TODO = "give the exposure.json of a run, or leave --exposure-from out"
 
 
 def write_values(
@@ -81,13 +81,13 @@ def _content(path: Path) -> dict[str, Any]:
         content = read_json(path)
     except (FileNotFoundError, ValueError) as error:
         raise UserError(
-            "the values of photos cannot be read", where=path, found=str(error), todo=_TODO
+            "the file of photo parameters cannot be read", where=path, found=str(error), todo=_TODO
         ) from error
     if not isinstance(content, dict) or not _is_of_photos(content):
         raise UserError(
             "the file does not contain parameters of photos",
             where=path,
-            expected=f"an object with the format {PHOTO_VALUES_FORMAT} and photos",
+            expected=f"an object with the fields format ({PHOTO_VALUES_FORMAT}) and photos",
             found=str(list(content))[:80] if isinstance(content, dict) else type(content).__name__,
             todo=_TODO,
         )
@@ -111,7 +111,7 @@ def _value(path: Path, exposure: object, plain: object, like: Tensor) -> Tensor:
 
 def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserError:
     return UserError(
-        "the values of photos do not fit the exposure of the run",
+        "the photo parameters in the file belong to another exposure model",
         where=path,
         expected=expected,
         found=f"{found}, written by exposure {exposure}",
@@ -119,7 +119,7 @@ def _misfit(path: Path, exposure: object, expected: str, found: str) -> UserErro
     )
 
 
-#: The name among the states of plugins.
+#: Name of this state among the states of plugins.
 STATE = "photos"
 _VALUE, _FIRST, _SECOND, _COUNT = "value", "exp_avg", "exp_avg_sq", "count"
 #: Name -> leaf [...] of one photo.
@@ -137,7 +137,7 @@ def started(setup: Setup) -> PluginState | None:
         return None
     starts = {name: each.first() for name, each in parameters.items()}
     for name, start in starts.items():
-        _check(setup, f"starts parameter {name} with", start)
+        _check(setup, f"initializes parameter {name} with", start)
     tensors = {}
     for name, each in (known_starts(setup) or starts).items():
         start = each.detach().to(setup.device).clone(memory_format=torch.contiguous_format)
@@ -166,7 +166,7 @@ def known_starts(setup: Setup) -> Mapping[str, Tensor]:
     rows = [row for row, name in enumerate(names) if name in known]
     if not rows:
         raise UserError(
-            "the file has values of no training photo",
+            "the file contains no values for the training photos",
             where=path,
             expected=f"photos such as {names[0]}",
             found=listed(list(known)[:3]),
@@ -190,9 +190,9 @@ def check_photos_are(setup: Setup, state: TrainState) -> None:
     names = [view.name for view in setup.train_views] if setup.per_photo else []
     if held != names:
         raise UserError(
-            "the checkpoint holds values of other photos than those that are trained on",
+            "the checkpoint contains values of photos that the run does not train on",
             where=f"exposure {setup.selection.names['exposure']}",
-            todo="go on with the photos and the split of that run",
+            todo="resume with the same photos and the same split",
         )
 
 
@@ -243,7 +243,7 @@ def take_photo_step(
         return
     held = state.states[STATE]
     tensors = {name: tensor.clone() for name, tensor in held.tensors.items()}
-    # A checkpoint may have put it on the GPU, where each step would wait for it.
+    # A checkpoint may have moved it to the GPU, where each step would wait for it.
     tensors[_COUNT] = tensors[_COUNT].cpu()
     rates = {name: each.lr.at(progress) for name, each in setup.per_photo.items()}
     for row, gradients in _summed(taken).items():
@@ -303,7 +303,7 @@ def _check(setup: Setup, does: str, value: Tensor) -> None:
     if right and _is_finite(value):
         return
     raise UserError(
-        f"exposure {setup.selection.names['exposure']} {does} what cannot be values of photos",
+        f"exposure {setup.selection.names['exposure']} {does} invalid photo parameters",
         expected=f"finite float32 tensors of {photos} rows, one for each training photo",
         found=f"{value.dtype} of shape {list(value.shape)}",
         todo="choose another --exposure, or repair the plugin",

@@ -12,7 +12,7 @@ from crossgrad_core.wording import listed
 #: Columns of positions, of the logarithms of standard deviations, and of rotations.
 _AXES: Final = (3, 3, 4)
 
-#: The learning rate of a tensor that learns in one of n steps is multiplied by n to this power.
+#: If a tensor learns in one of n steps, its learning rate is multiplied by n to this power.
 RESTED: Final = 0.5
 
 
@@ -33,7 +33,7 @@ def check_axes(setup: Setup, parameters: Parameters) -> None:
     found = [tuple(parameters[each].shape) if each in parameters else None for each in names]
     if found != [(rows, columns) for columns in _AXES]:
         raise UserError(
-            "the axes that the backbone names are none of Gaussians",
+            "the axes that the backbone names do not have the shapes of Gaussians",
             where=f"backbone {setup.selection.names['backbone']}, axes {listed(names)}",
             expected=f"tensors {listed(f'[N, {columns}]' for columns in _AXES)}",
             found=listed(map(str, found)),

@@ -57,7 +57,7 @@ def eval_parameters(setup: Setup, state: TrainState) -> Parameters:
     for name, tensor in (item for answer in answers for item in answer.items()):
         if name not in shown or tensor.shape != shown[name].shape:
             raise wrong_answer(
-                hook, "tensors of the names and shapes of parameters", f"{name}: {tensor.shape}"
+                hook, "tensors with the names and shapes of parameters", f"{name}: {tensor.shape}"
             )
         shown[name] = tensor
     return shown

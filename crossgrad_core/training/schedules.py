@@ -13,7 +13,7 @@ from crossgrad_core.training.setup import Setup
 #: The highest degree of harmonics.
 MOST_DEGREES: Final = 3
 
-#: Times of density control that the user may set.
+#: Times of density control that the user can set.
 _EDITS = ("densify_from", "densify_until", "densify_every")
 
 
@@ -45,7 +45,7 @@ def schedule_of(
         sh_wait=round(numbers.sh_start * length),
         **edits,
     )
-    # Settings of the user do not change with the length.
+    # Settings of the user do not change with the length of the run.
     return replace(schedule, min_refinements=0) if edits else schedule
 
 
@@ -67,6 +67,8 @@ def growth_note(setup: Setup) -> tuple[str, ...]:
         return ()
     start, end, unit = schedule.densify_from, schedule.densify_until, schedule.counting.unit
     return (
-        f"no density control: in {schedule.total} steps it would begin after {start} {unit} and "
-        f"end before {end}; --set densify_from=N forces it",
+        (
+            f"no density control: in a run of {schedule.total} steps it would begin after "
+            f"{start} {unit} and end before {end}; --set densify_from=N forces it"
+        ),
     )

@@ -108,8 +108,8 @@ class OperatorScale:
 
     def _not_finite(self, name: str, views: int) -> UserError:
         return UserError(
-            f"operator {type(self._operator).__name__} gives {views} equal gradients a weight that "
-            "is not finite",
+            f"operator {type(self._operator).__name__} returned a weight that is not "
+            f"finite for {views} equal gradients",
             where=f"block of {name}",
             expected="finite weights for finite gradients",
             todo="use another operator, or report this to the operator's author",
@@ -326,7 +326,9 @@ class Setup:
         answers: list[Mapping[str, int]] = hook(blocks=self.trained_blocks)
         found = {name: every for answer in answers for name, every in answer.items()}
         if wrong := {n: e for n, e in found.items() if n not in trained or int(e) != e or e < 1}:
-            raise wrong_answer(hook, "tensors that learn, each with a number from 1 on", str(wrong))
+            raise wrong_answer(
+                hook, "trained tensors, each with a number of at least 1", str(wrong)
+            )
         return found
 
     def resting(self, step: int) -> frozenset[str]:

@@ -116,10 +116,10 @@ if __name__ == "__main__":
 _LOG = logging.getLogger(__name__)
 #: Number of random initial points (`--init random`).
 RANDOM_POINTS = 20_000
-#: Share of the bound on primitives at the start of a run whose points would make more
-#: (docs/schedules.md), and the name of the state that stores the original number.
+#: Maximum share of --max-gaussians at the start of a run whose points would give more Gaussians
+#: (docs/schedules.md), and the name of the state that stores the number without this limit.
 BEGINNING, THINNED = 2 / 3, "thinned"
-#: Largest share of points that another attempt keeps.
+#: Maximum share of points that the next attempt keeps.
 _LESS = 0.8
 
 
@@ -131,7 +131,8 @@ def first_state(setup: Setup) -> TrainState:
     parameters = ordered(parameters, setup.blocks, setup.backbone.positions)
     trained = {name for block in setup.trained_blocks for name in block.tensors}
     parameters = {
-        # Contiguous, as from a checkpoint, because another memory layout changes the rounding.
+        # Make the tensors contiguous, as after a checkpoint, because another memory layout changes
+        # the rounding.
         name: tensor.detach().to(setup.device).contiguous().requires_grad_(name in trained)
         for name, tensor in parameters.items()
     }
@@ -175,7 +176,7 @@ def initial_parameters(setup: Setup, rng: np.random.Generator) -> tuple[Paramete
     while made > bound and share * len(begun.points) >= 1.0:
         parameters = _made(setup, setup.backbone.create(thinned(begun, share, rng), rng), "create")
         made = primitives_of(setup.blocks, parameters)
-        # If the number of primitives per point is not 1, this takes more than one attempt.
+        # If the number of Gaussians per point is not 1, several attempts are needed.
         share *= min(_LESS, wanted / made)
     return parameters, present
 
@@ -191,12 +192,12 @@ def _begun(setup: Setup) -> Scene:
         begun = initializer.begun(scene)
         wrong = _misfit(begun, len(scene.points))
     except ValueError as error:
-        initializer.more_points(scene)  # An error of the initializer itself is raised here.
+        initializer.more_points(scene)  # This raises errors of the initializer itself.
         wrong = in_one_line(error)
     if not wrong:
         return begun
     raise UserError(
-        f"initializer {setup.selection.names['initializer']} adds what cannot be points",
+        f"initializer {setup.selection.names['initializer']} returned invalid points",
         where=f"{type(initializer).__name__}.more_points",
         expected="finite positions [N, 3], colors [N, 3], sizes [N] above 0 or NaN, opacities [N] "
         "in (0, 1) or NaN",
@@ -217,9 +218,9 @@ def _misfit(begun: Scene, known: int) -> str:
     if not np.isfinite(points).all():
         return "a position that is not finite"
     sizes, opacities = sizes[known:], opacities[known:]
-    # NaN leaves the size or the opacity to the backbone.
+    # NaN means that the backbone chooses the size or the opacity.
     if not (((sizes > 0.0) & np.isfinite(sizes)) | np.isnan(sizes)).all():
-        return "a size that is no number above 0"
+        return "a size that is not a number above 0"
     inside = (opacities > 0.0) & (opacities < 1.0) | np.isnan(opacities)
     return "" if inside.all() else "an opacity that is not between 0 and 1"
 
@@ -238,11 +239,12 @@ def _made(setup: Setup, answer: object, method: str) -> Parameters:
     have = [name for name, tensor in parameters.items() if isinstance(tensor, Tensor)]
     if not set(wanted) <= set(have):
         raise UserError(
-            f"{type(setup.backbone).__name__}.{method} makes other tensors than its blocks name",
+            f"{type(setup.backbone).__name__}.{method} returned tensors with other names "
+            "than its blocks use",
             where=f"backbone {setup.selection.names['backbone']}",
             expected=listed(wanted),
             found=listed(have) or "none",
-            todo="repair the plugin, or choose another one",
+            todo="repair the plugin, or choose another backbone",
         )
     return parameters
 
@@ -272,13 +274,18 @@ def start_notes(setup: Setup, state: TrainState) -> tuple[str, ...]:
         if not isinstance(most, int) or not most or present <= most:
             return ()
         return (
-            f"start: {present:,} primitives, more than --max-gaussians {most:,}: a PLY is taken "
-            "as it is, and none is added",
+            (
+                f"start: {present:,} Gaussians, more than --max-gaussians {most:,}: a PLY is "
+                "used unchanged, and no Gaussians are added"
+            ),
         )
     start, crowd = kept.values["start"], kept.values["of"]
     return (
-        f"start: {start:,} primitives instead of {crowd:,}, from points drawn at random: "
-        f"--max-gaussians is less than all points would make",
+        (
+            f"start: {start:,} Gaussians instead of {crowd:,}, from randomly drawn "
+            "points: --max-gaussians is smaller than the number of Gaussians from all "
+            "points"
+        ),
     )
 
 

@@ -28,7 +28,7 @@ from crossgrad_core.training.rngs import make_streams, restored_streams, stream_
 from crossgrad_core.training.setup import Setup
 from crossgrad_core.wording import listed
 
-#: Unit of a time budget: wall-clock seconds, or CPU seconds of the process.
+#: Clock of a time budget: wall-clock seconds, or CPU seconds of the process.
 ClockKind = Literal["wall", "cpu"]
 Phase = Literal[
     "photos",
@@ -237,18 +237,20 @@ class TrainState:
                 raise UserError(
                     f"a checkpoint cannot hold the state of plugin {name}",
                     where=f"{hook.name}, {wrong}",
-                    expected="plain numbers, texts, lists and dictionaries with texts as keys in "
-                    "`values`, dense tensors of the run elsewhere",
+                    expected="plain numbers, strings, lists and dictionaries with string keys in "
+                    "`values`; dense tensors of the run in `tensors`",
                     todo="repair the plugin (docs/hooks.md)",
                 )
         taken = TAKEN.intersection(states)
         stolen = taken - SLOTS.intersection(_answering(hook)) if taken else taken
         if stolen:
             raise UserError(
-                f"a plugin answers with a state called {min(stolen)!r}, which belongs to crossgrad",
+                f"a plugin stores its state under the name {min(stolen)!r}, which is reserved "
+                "for crossgrad",
                 where=f"{hook.name}, one of {listed(_answering(hook))}",
-                expected=f"a name of its own, none of {listed(sorted(TAKEN))}",
-                todo="repair the plugin: states go by the plugin's name (docs/hooks.md)",
+                expected=f"another name than {listed(sorted(TAKEN))}",
+                todo="repair the plugin: use the plugin's name as the key of its state "
+                "(docs/hooks.md)",
             )
         self.states.update(states)
 
@@ -261,7 +263,7 @@ def unsavable(new: PluginState, device: str, known: PluginState = EMPTY_STATE) -
     for kind in ("values", "tensors", "per_primitive"):
         have = getattr(known, kind)
         for name, value in getattr(new, kind).items():
-            wrong = "" if isinstance(name, str) else "the key is no text"
+            wrong = "" if isinstance(name, str) else "the key is not a string"
             if name not in have:
                 wrong = wrong or (no_json(value) if kind == "values" else _odd(value, device))
             if wrong:
@@ -296,7 +298,7 @@ def _answering(hook: HookCaller) -> list[str]:
 
 def _no_states(hook: HookCaller, what: str, expected: str, found: object) -> UserError:
     return UserError(
-        f"a plugin answers with something else for {what}",
+        f"a plugin returned a value of a wrong type for {what}",
         where=f"{hook.name}, one of {listed(_answering(hook))}",
         expected=expected,
         found=type(found).__name__,
@@ -475,15 +477,17 @@ def check_start(state: TrainState) -> None:
         for name, tensor in tensors.items():
             if not is_finite(tensor):
                 raise TrainingFailedError(
-                    f"{kind} {name} is not finite in the state of step {state.step} that training "
-                    f"was to go on from; {_way_out(state.step)}"
+                    f"{kind} {name} is not finite in the state of step {state.step}, from which "
+                    f"training would continue; {_way_out(state.step)}"
                 )
 
 
 def _way_out(step: int) -> str:
     if step == 0:
-        return "look at the Gaussians of --init, or at what changes the first parameters"
-    return f"remove checkpoints/step-{step:06d} to go on from an earlier one, where there is one"
+        return "check the Gaussians of --init, and plugins that change the first parameters"
+    return (
+        f"remove checkpoints/step-{step:06d} to resume from an earlier checkpoint, if there is one"
+    )
 
 
 def check_dropped(setup: Setup, state: TrainState, record: StepRecord) -> None:
@@ -566,5 +570,6 @@ def is_whole(state: TrainState) -> bool:
     """Return True if all parameters are finite; False if they are not or cannot be checked."""
     try:
         return are_parameters_finite(state)
-    except Exception:  # The last step failed, there is no memory for the check, or the GPU failed.
+    except Exception:
+        # The last step failed, the check needs more memory than available, or the GPU failed.
         return False

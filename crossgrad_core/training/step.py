@@ -113,7 +113,7 @@ def labels_of(rule: GroupingRule, scene: Scene, name: str) -> tuple[str, ...]:
     if len(labels) == len(views):
         return labels
     raise UserError(
-        f"grouping {name} does not label each view",
+        f"grouping {name} returned a wrong number of labels",
         found=f"{len(labels)} labels of {len(views)} training views",
         todo="choose another --grouping, or repair the plugin",
     )
@@ -152,7 +152,8 @@ def observed_views(
     return (*records, observe_view(setup, state, draw, scales_of(setup, state, draw)[0]))
 
 
-#: Fewest primitives that are sorted; with 59 parameters each, parameters and moments take 12 MB.
+#: Minimum number of Gaussians that are sorted; with 59 parameters each, parameters and moments use
+#: 12 MB.
 FEWEST_SORTED = 2**14
 #: Bits of a coordinate in a code of 63 bits, and cells per unit of the local frame. The cameras
 #: span about one unit; positions farther away than 128 units are clamped to the border cells.
@@ -222,11 +223,11 @@ def apply_edit(setup: Setup, state: TrainState, edit: Edit) -> bool:
 def _check_edit(setup: Setup, state: TrainState, edit: Edit) -> None:
     if misfit := misfit_of(edit, setup.blocks, state.tensors):
         raise UserError(
-            "a plugin's edit does not fit the primitives",
+            "a plugin's edit does not match the Gaussians",
             where=f"step {state.step}, densifier {setup.selection.names['densifier']} or a plugin "
             "that acts after steps",
             found=misfit,
-            todo="repair the plugin; `crossgrad plugins check` looks at its edits",
+            todo="repair the plugin; `crossgrad plugins check` tests its edits",
         )
 
 
@@ -289,9 +290,9 @@ def _gathered(name: str, old: PluginState, source: Tensor, fresh: Tensor, rows: 
     for key, tensor in old.per_primitive.items():
         if tensor.shape[:1] != (rows,):
             raise UserError(
-                f"the state of plugin {name} does not fit the primitives",
+                f"the state of plugin {name} does not match the Gaussians",
                 where=f"per_primitive, {key}",
-                expected=f"a row for each of {rows} primitives, as they were before the edit",
+                expected=f"one row for each of the {rows} Gaussians before the edit",
                 found=f"shape {list(tensor.shape)}",
                 todo="repair the plugin (docs/hooks.md)",
             )
@@ -378,11 +379,12 @@ def _sample(setup: Setup, state: TrainState) -> ViewSample:
         views = tuple(map(int, views))
         return replace(answer.draw, views=views, labels=_labels(setup, state, answer.draw))
     raise UserError(
-        "the sampler draws other views, or another number of them, than it says",
+        "the sampler drew other views, or another number of views, than it announced",
         where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
         expected=f"{listed(map(str, sorted(counts)))} views, positions from 0 to {photos - 1}",
         found=f"{len(views)} views: {views}",
-        todo="choose another --sampler, or let the plugin's `counts` name every number",
+        todo="choose another --sampler, or list every possible number of views in the "
+        "plugin's `counts`",
     )
 
 
@@ -395,9 +397,9 @@ def _labels(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[str, ...
     if len(given) == len(draw.views) and all(isinstance(each, str) for each in given):
         return tuple(map(str, given))
     raise UserError(
-        "the sampler does not label each view that it draws",
+        "the sampler returned a wrong number of labels",
         where=f"sampler {setup.selection.names['sampler']}, step {state.step}",
-        expected=f"{len(draw.views)} texts, or None for no labels",
+        expected=f"{len(draw.views)} strings, or None for no labels",
         found=repr(labels),
         todo="choose another --sampler, or repair the plugin",
     )
@@ -424,10 +426,11 @@ def _aggregate(setup: Setup, state: TrainState, context: AggregateContext) -> Ag
     wanted = {name: state.tensors[name] for b in setup.trained_blocks for name in b.tensors}
     if misfit := _misfit(answer, wanted):
         raise UserError(
-            "the aggregated gradients do not fit the parameters",
+            "the aggregated gradients do not match the parameters",
             where=f"operator {setup.selection.names['operator']} or a plugin that wraps it, "
             f"step {state.step}",
-            expected="for each tensor that learns None, or a gradient of its shape and type",
+            expected="for each tensor, a gradient of its shape and type; None if the tensor does "
+            "not learn",
             found=misfit,
             todo="choose another --operator, or repair the plugin (docs/hooks.md)",
         )
@@ -463,7 +466,7 @@ def _finish(
         _optimize(setup, state, rendered, gradients, scale)
         gradients.clear()
         if setup.schedule.densifies(state.step):
-            # Background steps hold gradients, and an edit needs their memory.
+            # Background steps keep gradients in memory, which an edit needs.
             state.late.finish()
         edit, edited = _densify(setup, state, rendered)
     else:

@@ -130,9 +130,9 @@ def _fitting(weights: object, context: PixelContext, hook: HookCaller) -> Tensor
             least = f", the least {float(weights.min()):g}"
     who = listed(each.plugin_name for each in hook.get_hookimpls())
     raise UserError(
-        "a plugin weighs pixels in a way that no loss can use",
+        "a plugin returned invalid pixel weights",
         where=f"hook crossgrad_pixel_weights of {who}, photo {context.view.name}",
-        expected=f"finite numbers of 0 or more, floating point, {list(shape)}",
+        expected=f"finite floating-point numbers of at least 0, with shape {list(shape)}",
         found=f"{found}{least}",
         todo="repair the plugin, or run without it",
     )
@@ -311,9 +311,9 @@ def scales_of(setup: Setup, state: TrainState, draw: ViewSample) -> tuple[float,
     ):
         return tuple(map(float, scales))  # A checkpoint cannot contain NumPy numbers.
     raise UserError(
-        "the resolution does not give each view a scale",
+        "the resolution returned a wrong scale for a view",
         where=f"resolution {setup.selection.names['resolution']}, step {state.step}",
-        expected=f"{len(draw.views)} numbers above 0 and at most 1",
+        expected=f"{len(draw.views)} numbers, each above 0 and at most 1",
         found=repr(scales),
         todo="choose another --resolution, or repair the plugin",
     )
@@ -649,8 +649,8 @@ def _check(setup: Setup, view: int, scale: float) -> None:
     if 0 <= view < count and 0.0 < scale <= 1.0:
         return
     raise UserError(
-        "a plugin asked for a render that there cannot be",
+        "a plugin requested a render that is not possible",
         expected=f"a training view from 0 to {count - 1}, and a scale above 0 and at most 1",
         found=f"view {view}, scale {scale}",
-        todo="repair the plugin that asks",
+        todo="repair the plugin that requests the render",
     )

@@ -46,7 +46,7 @@ def thin_tracks(source: pycolmap.Reconstruction) -> dict[int, list[tuple[int, in
     kept = {}
     for point_id, point in sorted(source.points3D.items()):
         elements = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
-        # A different start in each track keeps the same share for every photo.
+        # Each track starts at another photo, so that every photo keeps the same share.
         kept[point_id] = elements[point_id % min(len(elements), KEPT_SHARE) :: KEPT_SHARE]
     return kept
 

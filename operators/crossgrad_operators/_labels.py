@@ -14,7 +14,7 @@ def labels_of(context: OperatorContext, operator: str) -> tuple[str, ...]:
     """
     if context.labels is None:
         raise UserError(
-            f"operator {operator} needs to know which group each view comes from",
+            f"operator {operator} needs the group of each view",
             expected="views with labels",
             found="views without labels",
             todo="choose a sampler that draws from groups, such as near-far",
@@ -31,15 +31,19 @@ def label_objections(
     if selection.sampler.own_labels:
         source, given = f"sampler {sampler}", selection.sampler.own_labels
     elif grouping is not None:
-        # A grouping by folders or lists reads its labels from the scene and declares none.
+        # A grouping by folders or lists takes its labels from the scene and declares none.
         source = f"grouping {selection.names['grouping']}"
         given = grouping.labels if selection.labels is None else selection.labels
     else:
-        return [f"operator {name} needs labelled views; sampler {sampler} draws from no groups"]
+        return [
+            (f"operator {name} needs labelled views, but sampler {sampler} draws without groups")
+        ]
     if not given or set(needed.values()) <= set(given):
         return []
     wanted = " and ".join(f"{label} (operator.{option})" for option, label in needed.items())
     return [
-        f"operator {name} looks for views labelled {wanted}; {source} gives {', '.join(given)}: "
-        "set these options to labels that there are"
+        (
+            f"operator {name} needs views labelled {wanted}, but {source} makes "
+            f"{', '.join(given)}: set these options to existing labels"
+        )
     ]

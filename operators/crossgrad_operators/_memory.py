@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crossgrad_core.plugin import OperatorContext, PluginState
 
-#: With more Gramians than this, the Gramians belong to single primitives.
+#: If there are more Gramians than this, each Gramian belongs to one Gaussian.
 _BLOCKS = 64
 
 

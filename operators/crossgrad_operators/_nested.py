@@ -37,12 +37,13 @@ def operator_of(value: object) -> MatrixOperator:
 def _checked(operator: Operator) -> MatrixOperator:
     if not isinstance(operator, MatrixOperator):
         raise ValueError(  # noqa: TRY004 - pydantic turns it into an error of validation
-            f"{component_name(operator)} needs the gradients themselves, and can only stand alone"
+            f"{component_name(operator)} reads the gradients themselves and cannot be "
+            "used inside another operator"
         )
     if isinstance(operator, GramianOperator) and operator.granularity != "block":
         raise ValueError(
-            f"{component_name(operator)} cannot have a granularity of its own here; set it on the "
-            "whole"
+            f"{component_name(operator)} cannot have its own granularity here; set the "
+            "granularity on the outer operator"
         )
     return operator
 

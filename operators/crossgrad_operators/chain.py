@@ -41,7 +41,9 @@ class Chain(GramianOperator):
     links, the chain equals `sum`.
     """
 
-    links: tuple[OperatorField, ...] = Field((), description="operators, the first one first")
+    links: tuple[OperatorField, ...] = Field(
+        (), description="operators in the order in which they are applied"
+    )
 
     @override
     def is_identity(self, views: int) -> bool:
@@ -132,8 +134,8 @@ def _remainders(
 
 def _reshaped(link: MatrixOperator, rows: int, views: int) -> UserError:
     return UserError(
-        f"operator {component_name(link)} cannot be followed by another one",
-        expected=f"as many directions as views, {views}",
+        f"operator {component_name(link)} must be the last operator of a chain",
+        expected=f"one direction for each of the {views} views",
         found=str(rows),
-        todo="put it last in the chain",
+        todo="move it to the end of the chain",
     )

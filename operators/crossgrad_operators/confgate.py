@@ -30,14 +30,22 @@ class ConfGate(GramianOperator):
     identity_at_one: ClassVar[bool] = True
     variant: Literal["v2", "low"] = Field("v2", description="v2: tau 0.9; low: tau 0.6")
     tau: float | None = Field(
-        None, gt=0, lt=1, description="probability of conflict from which to project; over variant"
+        None,
+        gt=0,
+        lt=1,
+        description="probability of conflict above which gradients are projected; overrides "
+        "variant",
     )
     beta: float = Field(0.99, ge=0, lt=1, description="decay of the averages per step")
-    warmup: int = Field(100, ge=0, description="updates of a pair before it may be projected")
+    warmup: int = Field(100, ge=0, description="updates of a pair before the pair may be projected")
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Return the options without an effect; see `HasUnusedOptions`."""
-        return {} if self.tau is None else {"variant": "tau wins over it; leave one of the two out"}
+        return (
+            {}
+            if self.tau is None
+            else {"variant": "tau overrides it; leave out one of the two options"}
+        )
 
     @override
     def transform(

@@ -47,9 +47,7 @@ class CAGrad(Weighting):
 
     identity_at_one: ClassVar[bool] = True
     c: float = Field(0.5, ge=0, description="radius of the search, as a share of |g_0|")
-    rescale: Literal["none", "1+c", "1+c^2"] = Field(
-        "none", description="what the direction is divided by"
-    )
+    rescale: Literal["none", "1+c", "1+c^2"] = Field("none", description="divisor of the direction")
 
     @override
     def reads_gramians(self) -> bool:
@@ -59,7 +57,7 @@ class CAGrad(Weighting):
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.c > 0:
             return {}
-        return {"rescale": "it divides by 1 where c = 0; leave it out"}
+        return {"rescale": "it has an effect only if c > 0; leave the option out"}
 
     @override
     def weights(

@@ -64,16 +64,16 @@ class Dispatch(GramianOperator):
     """
 
     variant: Literal["geometry-confgate", "geometry-projection"] = Field(
-        "geometry-confgate", description="what serves blocks without a rule"
+        "geometry-confgate", description="operator for blocks without a rule"
     )
     rules: Annotated[tuple[Rule, ...], BeforeValidator(_rules), PlainSerializer(_as_mapping)] = (
         Field((), description="block or kind (geometry, appearance, neutral) -> operator")
     )
     opacity: Literal["appearance", "geometry"] = Field(
-        "appearance", description="which kind the opacity block is of"
+        "appearance", description="kind of the opacity block"
     )
     neutral: Literal["appearance", "geometry"] = Field(
-        "appearance", description="the kind whose variant serves blocks of neither kind"
+        "appearance", description="kind whose variant is used for neutral blocks"
     )
 
     @override
@@ -104,16 +104,16 @@ class Dispatch(GramianOperator):
         keys = {self._key(name, kind, ruled) for name, kind in given}
         idle: dict[str, str] = {}
         if not keys - ruled:
-            idle["variant"] = "the rules serve every block; leave it out"
+            idle["variant"] = "the rules apply to every block; leave the option out"
         if not any(name in _OPACITY and name not in ruled for name, _ in given):
-            idle["opacity"] = "no block of opacities is left to a kind; leave it out"
+            idle["opacity"] = "no opacity block uses the operator of a kind; leave the option out"
         if "neutral" not in keys - ruled:
-            idle["neutral"] = "the variant serves no block of neither kind; leave it out"
+            idle["neutral"] = "the variant applies to no neutral block; leave the option out"
         if ruled - keys:
             names = ", ".join(sorted(ruled - keys))
             idle["rules"] = (
-                f"the rule for {names} serves no Gramian; under granularity {self.granularity} "
-                f"there are {', '.join(name for name, _ in given)}"
+                f"the rule for {names} applies to no Gramian; with granularity "
+                f"{self.granularity} the Gramians are {', '.join((name for name, _ in given))}"
             )
         return {**idle, **inner_idle(selection, "rules", [rule.operator for rule in self.rules])}
 
@@ -157,13 +157,16 @@ class Dispatch(GramianOperator):
         ]
         if self.granularity == "global":
             reasons.append(
-                "dispatch serves blocks apart, and granularity global makes one Gramian of all"
+                "dispatch applies different operators to blocks, but granularity global "
+                "makes one Gramian of all blocks"
             )
         blocks = [block.name for block in selection.backbone.trained_blocks()]
         for rule in self.rules:
             if rule.block not in (*_KINDS, *blocks):
                 known = ", ".join((*_KINDS, *blocks))
-                reasons.append(f"dispatch has a rule for {rule.block!r}; there are {known}")
+                reasons.append(
+                    f"dispatch has a rule for {rule.block!r}, but the blocks and kinds are {known}"
+                )
         return reasons
 
     def _operators(self) -> dict[str, MatrixOperator]:

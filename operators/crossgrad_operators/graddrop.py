@@ -55,6 +55,6 @@ def _one_sign(views: Sequence[Tensor], generator: torch.Generator) -> Tensor:
         positive += gradient.clamp(min=0)
         negative -= gradient.clamp(max=0)
     draws = torch.rand(first.shape, generator=generator, dtype=dtype, device=first.device)
-    # 1 / (1 + n / p) equals p / (p + n) without overflow of p + n. For 0 / 0 the result is zero.
+    # 1 / (1 + n / p) equals p / (p + n), but p + n cannot overflow. For 0 / 0 the result is zero.
     keep = draws < 1 / (1 + negative / positive)
     return torch.where(keep, positive, -negative).to(first.dtype)

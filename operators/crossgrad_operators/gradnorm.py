@@ -38,9 +38,11 @@ class GradNorm(GramianOperator):
 
     identity_at_one: ClassVar[bool] = True
     default_grouping: ClassVar[str | None] = "radial"
-    alpha: float = Field(1.5, ge=0, description="how strongly slow groups are favoured")
-    lr: float = Field(0.025, gt=0, description="step of log w")
-    baseline: int = Field(50, ge=1, description="losses that make up a group's loss at the start")
+    alpha: float = Field(1.5, ge=0, description="exponent that increases the weight of slow groups")
+    lr: float = Field(0.025, gt=0, description="learning rate of log w")
+    baseline: int = Field(
+        50, ge=1, description="number of losses that define a group's initial loss"
+    )
     decay: float = Field(0.99, ge=0, lt=1, description="decay of the average loss per view")
 
     @override
@@ -51,7 +53,9 @@ class GradNorm(GramianOperator):
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.alpha > 0:
             return {}
-        return dict.fromkeys(("baseline", "decay"), "alpha = 0 looks at no losses; leave it out")
+        return dict.fromkeys(
+            ("baseline", "decay"), "alpha = 0 uses no losses; leave the option out"
+        )
 
     @override
     def transform(

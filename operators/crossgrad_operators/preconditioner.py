@@ -7,7 +7,7 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import MatrixOperator, OperatorContext, PluginState, diagonals
 
-#: Bounds of r / r_ref, so that a camera at the centroid keeps some weight.
+#: Limits of r / r_ref, so that a camera at the centroid keeps some weight.
 _BOUNDS = (1e-2, 1e2)
 
 
@@ -22,7 +22,7 @@ class Preconditioner(MatrixOperator):
 
     geometry: float = Field(2.0, description="exponent d for means, scales and rotations")
     appearance: float = Field(1.0, description="exponent d for opacity and colour")
-    neutral: float = Field(1.0, description="exponent d for blocks of neither kind")
+    neutral: float = Field(1.0, description="exponent d for neutral blocks")
 
     @override
     def transform(

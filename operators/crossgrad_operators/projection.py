@@ -10,7 +10,8 @@ from typing_extensions import override
 
 from crossgrad_core.plugin import GramianOperator, OperatorContext, PluginState, Selection
 
-#: For a unit roundoff of the gradients below this, float64 Gramians are not finer than gradients.
+#: If the unit roundoff of the gradients is below this, float64 Gramians are not more precise than
+#: the gradients.
 NARROW = 1e-12
 
 
@@ -70,8 +71,12 @@ class Soft(GramianOperator):
     """
 
     identity_at_one: ClassVar[bool] = True
-    threshold: float = Field(0.0, ge=0, le=1, description="conflicts are cosines below minus this")
-    strength: float = Field(1.0, ge=0, le=1, description="share of the component that is removed")
+    threshold: float = Field(
+        0.0, ge=0, le=1, description="cosines below minus this value count as conflicts"
+    )
+    strength: float = Field(
+        1.0, ge=0, le=1, description="share of the conflicting component that is removed"
+    )
 
     @override
     def reads_gramians(self) -> bool:
@@ -81,7 +86,7 @@ class Soft(GramianOperator):
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.strength > 0:
             return {}
-        return {"threshold": "nothing is taken away where strength = 0; leave it out"}
+        return {"threshold": "strength = 0 removes nothing; leave the option out"}
 
     @override
     def transform(

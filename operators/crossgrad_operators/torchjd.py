@@ -36,11 +36,12 @@ class TorchJD(GramianOperator):
     """
 
     weighting: str = Field(
-        "AlignedMTL", description="name of a TorchJD weighting, with or without `Weighting`"
+        "AlignedMTL",
+        description="name of a TorchJD weighting, with or without the suffix `Weighting`",
     )
     options: Annotated[
         tuple[tuple[str, _Value], ...], BeforeValidator(_pairs), PlainSerializer(dict)
-    ] = Field((), description="the weighting's own arguments")
+    ] = Field((), description="arguments of the weighting")
 
     @override
     def reads_gramians(self) -> bool:
@@ -58,7 +59,7 @@ class TorchJD(GramianOperator):
 
         weights = np.zeros(gramians.shape[:2])
         rule = self._built()
-        # TorchJD draws from the global generator, which must be restored afterwards.
+        # TorchJD draws from the global generator, so restore the generator afterwards.
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             torch.manual_seed(int(rng.integers(2**63)))
             for block, present in enumerate(context.present):
@@ -87,13 +88,13 @@ class TorchJD(GramianOperator):
                 f"TorchJD has no weighting named {self.weighting!r}",
                 where="operator.weighting",
                 expected=f"one of {', '.join(filter(None, known))}",
-                todo="choose one of these with --set operator.weighting=NAME",
+                todo="choose one of these weightings with --set operator.weighting=NAME",
             )
         if hasattr(found, "reset"):
             raise UserError(
-                f"TorchJD's {name} remembers earlier steps and could not be resumed",
+                f"TorchJD's {name} stores state between steps, so that a run could not be resumed",
                 where="operator.weighting",
-                todo="use crossgrad's own operator of that name, or another weighting",
+                todo="use crossgrad's operator of the same name, or another weighting",
             )
         return self._called(found)
 
@@ -102,7 +103,7 @@ class TorchJD(GramianOperator):
             return kind(**dict(self.options))
         except (ImportError, TypeError, ValueError) as error:
             raise UserError(
-                f"TorchJD's {kind.__name__} cannot be made",
+                f"TorchJD's {kind.__name__} cannot be created",
                 where="operator.options",
                 found=str(error),
                 todo=f"set the arguments of {kind.__name__}: --set 'operator.options={{...}}'",

@@ -127,7 +127,7 @@ def test_a_plugin_name_of_two_packages_is_marked_in_the_list(ran, third_party, m
     monkeypatch.syspath_prepend(third_party)
     rows = [row for row in ran("plugins")[1].splitlines() if row.startswith("  halving ")]
     assert len(rows) == 2
-    assert all("offered twice" in row for row in rows)
+    assert all("two packages offer this name" in row for row in rows)
 
 
 def test_list_and_check_report_an_entry_point_in_an_unknown_group(
@@ -138,12 +138,12 @@ def test_list_and_check_report_an_entry_point_in_an_unknown_group(
     monkeypatch.syspath_prepend(tmp_path / "site")
     out = ran("plugins")[1]
     assert (
-        "never read\n  lost  lost-package 1.0: there is no entry-point group crossgrad.operator"
-        in out
+        "never read\n  lost  lost-package 1.0: "
+        "the entry-point group crossgrad.operator does not exist" in out
     )
     assert "write crossgrad.operators" in out
     code, _, err = ran("plugins", "check", "lost-package")
-    assert code == 2 and "there is no entry-point group crossgrad.operator" in err
+    assert code == 2 and "the entry-point group crossgrad.operator does not exist" in err
 
 
 def test_check_fails_for_an_entry_point_in_an_unknown_group(ran, third_party, monkeypatch):
@@ -160,7 +160,7 @@ def test_a_package_for_another_version_is_marked_in_the_list(ran, tmp_path, monk
     dated = {"operators": {"dated": "made_up_cli:Halving"}}
     write_distribution(tmp_path, "dated-package", dated, requires="crossgrad<0.2")
     monkeypatch.syspath_prepend(tmp_path)
-    words = "refused where it is asked for: it requires crossgrad<0.2"
+    words = "cannot be chosen: it requires crossgrad<0.2"
     assert f"dated dated-package 1.0 {words}" in " ".join(ran("plugins", "list")[1].split())
 
 
@@ -208,7 +208,7 @@ def test_check_passes_a_good_package(ran, third_party, package):
     assert code == 0
     assert "half-package 1.0" in out
     assert "operator halving  pass" in out
-    assert "1 of 1 plugins keep the contract" in out
+    assert "1 of 1 plugins fulfil the contract" in out
 
 
 def test_check_fails_a_bad_package_and_prints_the_reasons(ran, third_party, monkeypatch):
@@ -217,12 +217,12 @@ def test_check_fails_a_bad_package_and_prints_the_reasons(ran, third_party, monk
     flat = " ".join(out.split())
     assert (code, err) == (1, "")
     assert "operator halving FAIL 1 of" in flat
-    assert "its name is free: 2 installed packages offer a" in flat
+    assert "its name is not used by another plugin: 2 installed packages offer a" in flat
     assert "operator absolute FAIL" in flat
     assert "scales with the gradients" in flat
     assert "compare lengths with each other" in flat
     assert "it can be loaded: ModuleNotFoundError: No module named 'made_up_lost'" in flat
-    assert "0 of 3 plugins keep the contract" in flat
+    assert "0 of 3 plugins fulfil the contract" in flat
     places = [line.strip() for line in out.splitlines() if line.startswith("      at ")]
     assert max(len(line) for line in out.splitlines() if line.strip() not in places) <= 80
     file = third_party.parent / "good" / "made_up_cli.py"
@@ -281,10 +281,10 @@ def test_an_import_error_of_a_plugin_is_reported_with_its_line(ran, tmp_path, mo
 @pytest.mark.parametrize(
     ("package", "words"),
     [
-        ("numpy", "package 'numpy' offers no plugins"),
+        ("numpy", "package 'numpy' contains no plugins"),
         ("crossgrda", "did you mean 'crossgrad'?"),
-        ("", "there is no installed package"),
-        ("..", "there is no installed package"),
+        ("", "no package named"),
+        ("..", "no package named"),
     ],
 )
 def test_check_refuses_a_package_without_plugins(ran, package, words):
@@ -339,7 +339,7 @@ def test_show_names_the_slot_that_contains_the_plugin(ran):
     code, _, err = ran("plugins", "show", "near-far", "--slot", "operators")
     assert code == 2
     assert "no plugin named 'near-far' among the operators" in err
-    assert "one among the samplers" in err
+    assert "a plugin with this name among the samplers" in err
 
 
 def test_a_bad_value_is_reported_without_messages_of_pydantic(ran):

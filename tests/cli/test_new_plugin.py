@@ -56,7 +56,7 @@ def test_a_generated_plugin_passes_the_checks_of_its_slot(ran, tmp_path, monkeyp
     assert list(installed(tmp_path / name, monkeypatch)) == [slot]
     code, out, _ = ran("plugins", "check", name)
     assert code == 0, out
-    assert "1 of 1 plugins keep the contract of their slot" in out
+    assert "1 of 1 plugins fulfil the contract of their slot" in out
 
 
 @pytest.mark.parametrize("slot", OFFERED)
@@ -123,9 +123,9 @@ def test_plugins_new_does_not_write_into_an_existing_folder(ran, tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Upper", "cannot be the name"),
-        ("class", "cannot be the name"),
-        ("../up", "cannot be the name"),
+        ("Upper", "is not a valid name"),
+        ("class", "is not a valid name"),
+        ("../up", "is not a valid name"),
         ("numpy", "an installed package numpy"),
         ("pcgrad", "crossgrad_operators.projection"),
     ],

@@ -184,7 +184,7 @@ def test_the_list_of_plugins_includes_commands(ran):
     assert "\ncommands\n" in out
     assert "  hello     made-up 1.0\n" in out
     assert "  diagnose  crossgrad" in out
-    assert "  run       made-up 1.0  never called: the core has a command of that name\n" in out
+    assert "  run       made-up 1.0  never called: the core has a command with this name\n" in out
     assert ran("plugins", "list", "--slot", "command")[1].startswith("commands\n  broken")
 
 

@@ -31,7 +31,7 @@ def test_options_that_a_resumed_run_ignores_are_named_as_the_user_typed_them(
     with pytest.raises(SystemExit, match="2"):
         main(["run", *arguments, "--resume", "runs/one", "-q"])
     rows = dict(line.split(":", 1) for line in capsys.readouterr().err.splitlines())
-    assert rows["error"].strip() == "a resumed run keeps its settings and its scene"
+    assert rows["error"].strip() == "settings and the scene cannot be changed when a run is resumed"
     assert rows["  where"].strip() == named
     assert "continue runs/one" in rows["  to do"] and "--resume out" in rows["  to do"]
 

@@ -264,7 +264,7 @@ def test_an_instance_contributes_only_the_options_that_were_given():
 
 
 def test_a_class_of_another_slot_is_refused_even_if_its_name_is_known():
-    with pytest.raises(UserError, match="Anchors cannot be chosen as a grouping"):
+    with pytest.raises(UserError, match="class Anchors cannot be used as a grouping"):
         settled(grouping=load("operators", "anchors"))
 
 
@@ -282,7 +282,7 @@ def test_a_component_given_twice_with_different_options_is_refused(tmp_path):
     twice = [{"name": "diagnostics", "every": 5}, {"name": "diagnostics", "every": 6}]
     path = written(tmp_path, "observers: [{name: diagnostics, every: 5}, diagnostics]")
     for given in ((None, {"observe": twice}, []), (path, {}, [])):
-        with pytest.raises(UserError, match="diagnostics comes twice"):
+        with pytest.raises(UserError, match="diagnostics is named twice"):
             parsed(merged(*given))
     assert len(settled(observe=["diagnostics", "diagnostics"]).observers) == 1
 
@@ -298,8 +298,8 @@ def test_options_of_an_observer_that_is_not_selected_are_refused():
         ("=3", "KEY=VALUE"),
         ("operator..c=3", "KEY=VALUE"),
         ("operator.c=[1", "not valid YAML"),
-        ("steps.c=1", "plain setting"),
-        ("steps.c.d=1", "plain setting"),
+        ("steps.c=1", "has no options of its own"),
+        ("steps.c.d=1", "has no options of its own"),
     ],
 )
 def test_malformed_assignments_are_refused(config, assignment, words):
@@ -314,7 +314,7 @@ def test_unknown_keys_are_passed_on_to_the_validation():
     ("text", "words"),
     [
         ("steps: [1\n", "line 2"),
-        ("- a\n- b\n", "holds no settings"),
+        ("- a\n- b\n", "contains no settings"),
         ("steps: 1\nsteps: 2\n", "'steps' occurs twice"),
     ],
 )

@@ -116,8 +116,8 @@ def test_quiet_prints_warnings_only(announced, capsys):
     announced(quiet=True)
     STAGES.info("loading kernels")
     LOG.info("compiling %s", "one")
-    LOG.warning("kernels cannot be kept")
-    assert capsys.readouterr().err == "note: kernels cannot be kept\n"
+    LOG.warning("kernels cannot be saved")
+    assert capsys.readouterr().err == "note: kernels cannot be saved\n"
 
 
 def test_an_error_is_printed_after_the_last_stage(announced, capsys, tmp_path):

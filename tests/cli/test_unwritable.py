@@ -103,7 +103,7 @@ def test_an_unwritable_default_folder_of_runs_is_reported_at_once(
     Path("runs").touch()
     with pytest.raises(SystemExit, match="2"):
         main(["run", str(scene), "-q"])
-    assert "runs is no folder" in capsys.readouterr().err
+    assert "runs is not a folder" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_reported_at_once(scene, tmp_path, monkeypatch, capsys):

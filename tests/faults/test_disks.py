@@ -8,7 +8,7 @@ import sys
 import pytest
 from crossgrad_faults import laws
 
-WORDS = {"full": "not enough disk space", "readonly": "cannot write here"}
+WORDS = {"full": "not enough disk space", "readonly": "cannot write to this path"}
 
 
 @pytest.mark.parametrize("what", WORDS)

@@ -55,7 +55,7 @@ def test_a_run_without_a_checkpoint_is_restarted_with_a_note(whole, killed):
                for name in theirs.parameters)  # fmt: skip
     assert ours.generators == theirs.generators
     assert measured(killed) == measured(whole)
-    words = "no checkpoint yet: the run begins again from its configuration"
+    words = "no checkpoint yet: the run starts again from its configuration"
     assert words in (killed / "log.txt").read_text()
     assert words in json.loads((killed / "summary.json").read_text())["notes"]
     assert {path.name for path in killed.iterdir()} == {path.name for path in whole.iterdir()}
@@ -71,7 +71,7 @@ def test_a_run_killed_before_its_metrics_file_is_restarted(whole, killed):
 def test_a_stop_step_in_the_past_or_after_the_end_is_refused(killed, stop):
     assert app.run({"stop_after": 2}, resume=killed, verbosity=-1) == 0
     before = (killed / "log.txt").read_bytes()
-    where = "past the step" if stop < 3 else "ends before the step"
+    where = "already passed" if stop < 3 else "after the end of the run"
     with pytest.raises(UserError, match=rf"{where}(.|\n)*a step from 3 to (.|\n)*found: +{stop}"):
         app.run({"stop_after": stop}, resume=killed, verbosity=-1)
     assert (killed / "log.txt").read_bytes() == before
@@ -79,7 +79,7 @@ def test_a_stop_step_in_the_past_or_after_the_end_is_refused(killed, stop):
 
 
 def test_a_restarted_run_keeps_its_settings(killed):
-    with pytest.raises(UserError, match="keeps its settings"):
+    with pytest.raises(UserError, match="settings cannot be changed"):
         app.run({"seed": 4}, resume=killed, verbosity=-1)
 
 
@@ -92,12 +92,14 @@ def test_a_run_killed_before_its_first_checkpoint_cannot_be_evaluated(killed):
             look(killed)
     with (
         locked(killed, "training"),
-        pytest.raises(UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first one"),
+        pytest.raises(
+            UserError, match=rf"process {os.getpid()}(.|\n)*wait for the first checkpoint"
+        ),
     ):
         evaluate.evaluate(killed)
 
 
 def test_a_new_run_into_the_folder_of_a_killed_run_is_refused(killed):
     settings = {"scene": "nowhere", "out": str(killed), "steps": 2}
-    with pytest.raises(UserError, match="continue that run with --resume"):
+    with pytest.raises(UserError, match="resume that run with --resume"):
         app.run(settings, verbosity=-1)

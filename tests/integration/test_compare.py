@@ -20,7 +20,7 @@ def test_compare_reads_the_folders_that_run_writes(tmp_path, capsys):
     assert ended("compare", str(tmp_path / "runs")) == 0
     printed = capsys.readouterr().out
     assert "views=2  views=1" in printed or "views=1  views=2" in printed
-    assert "one pair says nothing about noise" in printed
+    assert "one pair does not show the noise" in printed
 
     folder = tmp_path / "runs" / "compare"
     with (folder / "runs.csv").open(newline="") as file:

@@ -155,7 +155,7 @@ def test_a_scene_without_georeference_or_offset_writes_no_georef_file(tmp_path):
     np.testing.assert_allclose(positions, setup.scene.points, atol=1e-7)
     with pytest.raises(UserError, match="not georeferenced") as caught:
         export_scene(setup, state, tmp_path / "c.ply", coordinates="enu")
-    assert "neither its files nor its photos" in caught.value.found
+    assert "neither the scene files nor the photos" in caught.value.found
     assert not (tmp_path / "c.ply").exists()
 
 
@@ -168,15 +168,15 @@ def test_export_writes_next_to_the_files_of_the_run_and_overwrites_none(trained,
     new = {path.name for path in trained.iterdir()} - before.keys()
     assert {"point_cloud_utm.ply", "point_cloud_utm.georef.json"} <= new
     assert {name: (trained / name).read_bytes() for name in before} == before
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export.exported(trained, file_format=None, out=None, coordinates="utm")
-    with pytest.raises(UserError, match=r"no such coordinates(?s:.*)epsg:32633"):
+    with pytest.raises(UserError, match=r"coordinate system is unknown(?s:.*)epsg:32633"):
         export.exported(trained, file_format=None, out=None, coordinates="gauss")
 
 
 def test_an_existing_georef_file_next_to_a_named_output_is_not_replaced(trained, tmp_path):
     (tmp_path / "a.georef.json").write_text("mine")
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export.exported(trained, file_format=None, out=tmp_path / "a.ply", coordinates="enu")
     assert (tmp_path / "a.georef.json").read_text() == "mine"
 

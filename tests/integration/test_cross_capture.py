@@ -81,7 +81,7 @@ def test_a_ply_has_the_same_cross_capture_metrics_as_the_model(trained, scene, c
         assert mine.values["psnr"] == pytest.approx(other.values["psnr"], abs=0.02)
     evaluate.evaluate(trained, ply=trained / "point_cloud.ply", on=scene)
     printed = capsys.readouterr().out
-    assert "drawn on black" in printed and "left out: 7 of its views" in printed
+    assert "rendered on black" in printed and "left out: 7 of its views" in printed
     assert sorted(trained.rglob("*")) == before
 
 
@@ -100,14 +100,14 @@ def test_a_zoom_path_is_rendered_as_frames_and_a_video(trained, tmp_path, capsys
     (video,) = folder.glob("video.*")
     assert f"3 frames in {folder}, video {video}" in capsys.readouterr().out
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         render.render_path(trained, "zoom", frames=2, out=folder)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     # In the run's own folder a video takes the place of the one before.
     for frames in (3, 2):
         render.render_path(trained, "zoom", frames=frames, out=None)
     assert len(list((trained / "renders").glob("*/path_zoom/video.*"))) == 1
-    with pytest.raises(UserError, match="frames of a zoom path"):
+    with pytest.raises(UserError, match="applies only to a zoom path"):
         render.render_path(trained, "path.json", frames=2, out=None)
 
 
@@ -139,7 +139,7 @@ def test_captures_that_cannot_be_compared_are_refused(trained, scene, tmp_path):
         evaluate.evaluate(trained, on=only)
     away = {**PLACE, "offset": (4000.0, -20.0, 3.0)}
     far_away = write_tiny_scene(tmp_path / "away", views=3, **away)
-    with pytest.raises(UserError, match=r"lies elsewhere(.|\n)*0% of its points"):
+    with pytest.raises(UserError, match=r"does not overlap(.|\n)*0% of its points"):
         evaluate.evaluate(trained, on=far_away)
     with pytest.raises(UserError):
         evaluate.evaluate(trained, on=tmp_path / "nothing")
@@ -191,6 +191,6 @@ def test_captures_of_one_place_are_distinguished_from_captures_of_another_place(
 def test_a_capture_of_another_place_is_measured_with_a_warning(trained, scene, capsys, monkeypatch):
     monkeypatch.setattr(elsewhere_module, "_alike", lambda own, points: False)
     evaluate.evaluate(trained, on=scene)
-    assert "is it the same place" in capsys.readouterr().out
+    assert "both show the same place" in capsys.readouterr().out
     render.render(trained, split="test", out=None, on=scene)
-    assert "is it the same place" in capsys.readouterr().out
+    assert "both show the same place" in capsys.readouterr().out

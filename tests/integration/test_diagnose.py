@@ -109,9 +109,9 @@ def test_a_scene_is_diagnosed_on_a_short_vanilla_run(scene, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert "model: a vanilla run of" in printed
-    assert "not georeferenced: neither its files nor its photos" in printed
+    assert "not georeferenced: neither the scene files nor the photos" in printed
     assert "Sarle's bimodality" in printed
-    assert "no exposure needs a model" in printed
+    assert "the exposures need no model" in printed
     rows = table(tmp_path / "out")
     assert len({row["step"] for row in rows}) == 2
     assert {row["metric"] for row in rows} == {"plain", "adam"}
@@ -146,13 +146,13 @@ def test_the_conflict_signature_can_be_sampled_by(scene, tmp_path):
 
 
 def test_invalid_diagnose_requests_are_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="either a scene"):
+    with pytest.raises(UserError, match="both a scene and a run"):
         diagnose(scene, tmp_path, {}, QUICK, None)
     with pytest.raises(UserError, match="nosuch"):
         diagnose(scene, None, {}, Options(grouping=ComponentChoice(name="nosuch")), tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "diagnostics.csv").touch()
-    with pytest.raises(UserError, match="holds a report"):
+    with pytest.raises(UserError, match="already contains a report"):
         diagnose(scene, None, {}, QUICK, tmp_path / "b")
     with pytest.raises(UserError, match="not the folder of a run"):
         diagnose(None, tmp_path, {}, QUICK, tmp_path / "c")
@@ -163,8 +163,8 @@ def test_too_few_photos_are_refused_with_the_required_number(tmp_path, photos):
     scene = write_tiny_scene(tmp_path / "few", views=photos)
     with pytest.raises(UserError) as told:
         diagnose(scene, None, {"threads": 1}, QUICK, tmp_path / "out")
-    assert told.value.what == "too few training photos to be probed"
-    assert "4 at least" in told.value.expected and "sampler" not in told.value.todo
+    assert told.value.what == "too few training photos for a probe"
+    assert "at least 4" in told.value.expected and "sampler" not in told.value.todo
 
 
 @pytest.mark.parametrize("name", sorted(FILES - {"diagnostics.csv"}))
@@ -172,7 +172,7 @@ def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
     mine = tmp_path / name
     mine.write_text("mine")
     for options, out in ((QUICK, tmp_path), (replace(QUICK, signature=mine), tmp_path / "out")):
-        with pytest.raises(UserError, match="the file exists"):
+        with pytest.raises(UserError, match="the output file already exists"):
             diagnose(scene, None, {"threads": 1}, options, out)
         assert mine.read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
@@ -189,7 +189,7 @@ def test_no_file_of_the_user_is_overwritten(scene, tmp_path, name):
 def test_options_without_an_effect_are_refused(arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert ended("diagnose", *arguments) == 2
-    assert f"{arguments[-2 if len(arguments) > 1 else 0]} does nothing" in capsys.readouterr().err
+    assert f"{arguments[-2 if len(arguments) > 1 else 0]} has no effect" in capsys.readouterr().err
 
 
 def failing_from(monkeypatch, first):
@@ -221,7 +221,7 @@ def test_a_training_that_fails_reports_its_probes_and_the_reason(
     printed = capfd.readouterr()
     assert "training failed: the gradient of block means" in printed.err
     assert "Traceback" not in printed.err
-    assert "which failed; probed before that" in printed.out
+    assert "which failed; the probes before the failure are shown" in printed.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert {row["step"] for row in table(tmp_path / "out")} == {"10", "20"}
 

@@ -85,7 +85,7 @@ def test_exposure_auto_is_gain_if_photos_differ_and_none_suggests_gain(varied, t
     assert run(varied, tmp_path / "none", exposure={"name": "none"}) == 0
     assert same(tmp_path / "auto", tmp_path / "gain")
     assert read_run(tmp_path / "auto").config["exposure"]["name"] == "gain"
-    assert "stops standard deviation" in notes(tmp_path / "auto")
+    assert "gains with a standard deviation of" in notes(tmp_path / "auto")
     assert "--exposure gain" in notes(tmp_path / "none")
 
 
@@ -123,7 +123,7 @@ def test_exposure_rates_fall_to_a_hundredth_and_rate_zero_keeps_initial_values(v
     assert run(varied, tmp_path / "one", steps=1, exposure=kept) == 0
     assert run(varied, tmp_path / "more", exposure=kept) == 0
     assert photos(tmp_path / "one") == photos(tmp_path / "more")
-    with pytest.raises(UserError, match="do nothing") as caught:
+    with pytest.raises(UserError, match="have no effect") as caught:
         run(varied, tmp_path / "idle", exposure={**kept, "decay": 0.5})
     assert "exposure.decay" in caught.value.where
 
@@ -176,23 +176,23 @@ WRONG = {
     "another file": (b'{"status": "finished"}', "does not contain parameters"),
     "other photos": (
         b'{"format": 1, "exposure": "gain", "photos": {"x.png": {"stops": 0}}}',
-        "of no training photo",
+        "no values for the training photos",
     ),
     "another exposure": (
         b'{"format": 1, "exposure": "channel", "photos": {"0001.png": {"stops": [0, 0, 0]}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "other parameters": (
         b'{"format": 1, "exposure": "x", "photos": {"0001.png": {"matrix": 0}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "no numbers": (
         b'{"format": 1, "exposure": "gain", "photos": {"0001.png": {"stops": "bright"}}}',
-        "do not fit",
+        "another exposure model",
     ),
     "not finite": (
         b'{"format": 1, "exposure": "gain", "photos": {"0001.png": {"stops": NaN}}}',
-        "do not fit",
+        "another exposure model",
     ),
 }
 
@@ -209,9 +209,9 @@ def test_an_invalid_exposure_file_is_refused_before_anything_is_written(varied, 
 
 def test_an_exposure_file_for_an_exposure_without_values_is_refused(scene, tmp_path):
     (tmp_path / "values.json").write_text("{}")
-    with pytest.raises(UserError, match="do nothing") as caught:
+    with pytest.raises(UserError, match="have no effect") as caught:
         run(scene, tmp_path / "run", exposure_from=str(tmp_path / "values.json"))
-    assert "no values of photos" in caught.value.found
+    assert "no per-photo values" in caught.value.found
 
 
 def finite(out):
@@ -234,7 +234,7 @@ def check_extremes(scene, tmp_path, case, model, views):
     settings = {"exposure": {"name": model}, "views_per_step": views}
     assert run(folder, tmp_path / "run", steps=6, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "for want of usable tracks and EXIF" in notes(tmp_path / "run")
+    assert "because there are no usable tracks and no EXIF data" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -271,7 +271,7 @@ def test_gains_of_ten_stops_from_a_file_give_finite_results_and_are_named(varied
     settings = {"exposure": {"name": model}, "exposure_from": str(file)}
     assert run(varied, tmp_path / "run", steps=6, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "photos are more than 4 stops from the mean" in notes(tmp_path / "run")
+    assert "photos differ by more than 4 stops from the mean" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize("model", [*with_long("gain"), "auto"])
@@ -282,7 +282,7 @@ def test_photos_without_tracks_start_at_the_exposure_of_their_regime(varied, tmp
     settings = {"exposure": {"name": model}, "data": {"init": "random"}}
     assert run(folder, tmp_path / "run", steps=2, **settings) == 0
     assert finite(tmp_path / "run")
-    assert "no SfM tracks tell" in notes(tmp_path / "run")
+    assert "no SfM tracks connect the photos" in notes(tmp_path / "run")
 
 
 @pytest.mark.parametrize("model", [*with_long("channel"), "auto"])
@@ -298,7 +298,7 @@ def test_a_single_photo_gets_no_exposure_correction(scene, tmp_path, model):
     if model == "auto":
         assert "exposure auto: none" in notes(tmp_path / "run")
     else:
-        assert "no other to differ from" in notes(tmp_path / "run")
+        assert "only one training photo" in notes(tmp_path / "run")
 
 
 def with_exif(path, stops):

@@ -167,11 +167,11 @@ def test_numbers_of_views_may_be_numpy_integers(scene, tmp_path, monkeypatch):
 def test_a_run_that_loses_all_primitives_reports_so(scene, tmp_path, monkeypatch, capsys):
     installed(monkeypatch, tmp_path / "site", PLUGINS)
     assert run(scene, tmp_path / "run", "--densifier", "emptying") == 0
-    words = "no primitive is left: look at densifier emptying"
+    words = "no Gaussian is left: check densifier emptying"
     assert words in capsys.readouterr().err
     assert words in (tmp_path / "run" / "log.txt").read_text()
     assert run(scene, tmp_path / "usual") == 0
-    assert "no primitive" not in capsys.readouterr().err
+    assert "no Gaussian" not in capsys.readouterr().err
 
 
 @pytest.mark.sampled(4)
@@ -188,12 +188,12 @@ def test_a_run_that_loses_all_primitives_reports_so(scene, tmp_path, monkeypatch
             ("--observe", "objecting"),
             "in hook crossgrad_validate_selection of observer objecting, from faulty-package 1.0",
         ),
-        (("--resolution", "unfit"), "a plugin of faulty-package 1.0 failed"),
+        (("--resolution", "unfit"), "a plugin of package faulty-package 1.0 raised an error"),
         (("--resolution", "unfit"), "made_up_faulty.py:68"),
         (("--loss", "infinite"), "the photometric loss is not finite"),
         (("--loss", "infinite", "--seconds", "1"), "the photometric loss is not finite"),
-        (("--loss", "vector"), "a step that was tried out before the training failed"),
-        (("--densifier", "typo"), "there is no tensor 'mean' with a row for each primitive"),
+        (("--loss", "vector"), "a trial step failed before the training started"),
+        (("--densifier", "typo"), "there is no tensor 'mean' with one row per Gaussian"),
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )

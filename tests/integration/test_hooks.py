@@ -172,7 +172,7 @@ def test_a_requested_render_equals_the_image_of_training(scene, tmp_path):
 @pytest.mark.parametrize(("view", "scale"), [(-1, 1.0), (99, 1.0), (0, 0.0), (0, 1.5)])
 def test_an_impossible_render_request_is_refused(view, scale):
     setup = SimpleNamespace(train_views=(None,) * 3)
-    with pytest.raises(UserError, match="asked for a render"):
+    with pytest.raises(UserError, match="requested a render"):
         RenderCallback(setup, None, counted=False)(view, scale)
 
 
@@ -288,5 +288,5 @@ def test_scales_out_of_bounds_end_the_run_and_name_the_plugin(scene, tmp_path, m
     from support.hook_plugins import NearAtHalf
 
     monkeypatch.setattr(NearAtHalf, "scales", lambda self, context, state: ((2.0, 1.0), state))
-    with pytest.raises(UserError, match="does not give each view a scale"):
+    with pytest.raises(UserError, match="returned a wrong scale"):
         run(scene, tmp_path / "run", resolution={"name": "near-at-half"})

@@ -88,5 +88,5 @@ def test_every_initializer_trains_a_scene_with_few_or_no_points(
 
 def test_an_initializer_together_with_init_random_is_refused(scene, tmp_path, capsys):
     assert run(scene, tmp_path / "run", "--init", "random", "--initializer", "fill-gaps") == 2
-    assert "initializer: --init random has points of its own" in capsys.readouterr().err
+    assert "initializer: --init random has its own points" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

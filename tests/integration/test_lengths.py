@@ -76,7 +76,7 @@ def test_a_run_that_ends_worse_than_an_earlier_step_reports_so(
     monkeypatch.setattr("crossgrad_core.run.finish.WORSE", margin)
     settings = {"scene": str(scene), "out": str(tmp_path / "run"), "steps": 4, "eval_every": 2}
     assert app.run(settings, verbosity=0) == 0
-    line = "dB below that of step"
+    line = "dB lower than at step"
     assert (line in capsys.readouterr().err) == told
     assert (line in (tmp_path / "run/log.txt").read_text()) == told
 
@@ -94,7 +94,7 @@ def test_a_length_in_views_is_converted_to_steps(views, length, steps, drawn):
 
 
 def test_a_run_shorter_than_a_step_is_refused():
-    with pytest.raises(UserError, match="at least 4, the views of a step"):
+    with pytest.raises(UserError, match="at least 4, the number of views of the first step"):
         assembled(views=4, max_views=3)
 
 
@@ -106,7 +106,7 @@ def test_max_views_ends_a_run_before_its_seconds_are_used(scene, tmp_path):
     assert (stored["steps"], stored["seconds"], stored["max_views"]) == (4, None, None)
     assert (stored["planned_seconds"], stored["planned_views"]) == (60.0, 9)
     assert stored["revisions"] == []
-    assert "the bound on views allows 4" in (tmp_path / "run/log.txt").read_text()
+    assert "the limit on views allows 4" in (tmp_path / "run/log.txt").read_text()
     assert app.run({**stored, "out": str(tmp_path / "again")}, verbosity=-1) == 0
     again = (tmp_path / "again/point_cloud.ply").read_bytes()
     assert again == (tmp_path / "run/point_cloud.ply").read_bytes()
@@ -115,7 +115,7 @@ def test_max_views_ends_a_run_before_its_seconds_are_used(scene, tmp_path):
 def test_a_run_in_seconds_notes_reset_options_without_an_effect(scene, tmp_path):
     out, densifier = tmp_path / "run", {"name": "adc", "prune_scale": 0.3}
     run(scene, out, seconds=60.0, max_views=9, densifier=densifier)
-    line = "densifier.prune_scale does nothing: the run has no opacity resets"
+    line = "densifier.prune_scale has no effect: the run has no opacity resets"
     assert line in (out / "log.txt").read_text()
     given = {"seconds": 60.0, "max_views": 9, "reset_every": 4, "densifier": densifier}
     run(scene, tmp_path / "resets", **given)
@@ -127,7 +127,7 @@ def test_a_run_in_seconds_notes_reset_options_without_an_effect(scene, tmp_path)
 def test_seconds_end_a_run_before_max_views_is_reached(scene, tmp_path):
     rows = run(scene, tmp_path / "run", seconds=0.5, max_views=10**7)
     assert float(rows[-1]["train_seconds"]) < 5.0
-    assert "the bound on views" not in (tmp_path / "run/log.txt").read_text()
+    assert "the limit on views" not in (tmp_path / "run/log.txt").read_text()
 
 
 @pytest.mark.slow
@@ -157,18 +157,18 @@ def test_a_dry_run_with_seconds_and_max_views_prints_its_configuration(scene, tm
 def test_a_dry_run_refuses_more_different_views_than_training_views(scene, views):
     given = {"scene": str(scene), "steps": 8, "views_per_step": views, "threads": 1}
     given["sampler"] = {"name": "epoch"}
-    with pytest.raises(UserError, match="9 different views of 7 training views"):
+    with pytest.raises(UserError, match="9 different views, but only 7 training views"):
         app.run(given, dry_run=True, verbosity=-1)
 
 
 def test_max_views_with_seconds_must_cover_at_least_one_step():
-    with pytest.raises(UserError, match="at least 4, the views of a step"):
+    with pytest.raises(UserError, match="at least 4, the number of views of the first step"):
         assembled(views=4, max_views=3, seconds=1.0)
 
 
 @pytest.mark.parametrize("lengths", [{"steps": 3, "max_views": 4}, {"seconds": 1, "steps": 4}])
 def test_more_than_one_length_is_refused(lengths):
-    with pytest.raises(UserError, match="one length"):
+    with pytest.raises(UserError, match="more than one length"):
         app.with_defaults(RunConfig(**lengths))
 
 

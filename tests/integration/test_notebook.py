@@ -47,7 +47,7 @@ def test_an_interrupted_cell_stops_its_run_and_resuming_gives_the_same_bits(fold
     stopped = executed([RUN], folder, lambda: log.is_file() and "step 24/" in log.read_text())
     (error,) = errors(stopped)
     assert error.startswith("KeyboardInterrupt: the run is stopped")
-    assert "stopping: what there is gets saved" in shown(stopped.cells[0], "stderr")
+    assert "stopping: the current state is saved" in shown(stopped.cells[0], "stderr")
     resume = 'import crossgrad_core as cg\nprint(cg.open("run").summary["step"])\n'
     resume += 'print(cg.resume("run").summary["status"])'
     notebook = executed([resume, SAME], folder)

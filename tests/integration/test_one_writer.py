@@ -57,7 +57,7 @@ def test_a_folder_that_was_filled_during_compilation_is_refused(scene, tmp_path,
         return 0.0
 
     monkeypatch.setattr(app, "warm_up", another_run_comes_and_goes)
-    with pytest.raises(UserError, match="results are never overwritten"):
+    with pytest.raises(UserError, match="never overwrites results"):
         app.run({"scene": str(scene), "out": str(out), "steps": 2}, verbosity=-1)
     assert (out / "metrics.csv").read_text() == "precious"
 
@@ -76,4 +76,4 @@ def test_a_run_warns_if_the_file_system_has_no_locks(stopped, monkeypatch, caplo
 
     monkeypatch.setattr(fcntl, "flock", unsupported)
     assert app.run({}, resume=stopped, verbosity=-1) == 0
-    assert "has no locks" in caplog.text
+    assert "does not support locks" in caplog.text

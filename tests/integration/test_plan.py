@@ -167,7 +167,7 @@ def test_plan_overwrites_no_file_and_bad_input_writes_nothing(scene, tmp_path, c
     file.write_text("mine")
     assert ended("plan", scene, "--write", file) == 2
     assert file.read_text() == "mine"
-    assert "there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 _LOADED = """

@@ -129,7 +129,10 @@ def test_another_version_of_crossgrad_must_be_accepted_like_that_of_a_plugin_pac
 def test_eval_reports_a_changed_package_version(stopped, install, capsys):
     install("1.1")
     assert ended("eval", stopped) == 0
-    words = "the run was trained with versioned-package 1.0; installed is versioned-package 1.1"
+    words = (
+        "the run was trained with versioned-package 1.0; "
+        "the installed version is versioned-package 1.1"
+    )
     assert words in capsys.readouterr().err
 
 
@@ -140,7 +143,9 @@ def test_a_run_without_a_readable_package_file_is_resumed_with_a_note(stopped, c
             (stopped / FILE).write_text(content)
         step = str(packages_before(stopped))
         assert ended("run", "--resume", stopped, "--stop-after", step, "-q") == 0
-        assert capsys.readouterr().err.count("whether its plugins are still the same") == 1
+        assert (
+            capsys.readouterr().err.count("whether the plugins of the run are still the same") == 1
+        )
         assert packages(stopped)["versioned-package"]["versions"] == ["1.0"]
 
 

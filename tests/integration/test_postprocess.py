@@ -70,7 +70,7 @@ def test_baking_for_a_view_does_not_replace_the_file_of_the_summary(finished, ca
     files = (finished / name for name in ("point_cloud.ply", "point_cloud_street__0002.ply"))
     own, baked = (read_ply(file).logit_opacities for file in files)
     assert own.shape != baked.shape or (own != baked).any()
-    with pytest.raises(UserError, match="the file exists"):
+    with pytest.raises(UserError, match="the output file already exists"):
         export_file(finished, camera="street/0002.png")
     with pytest.raises(UserError, match="no view 'nobody'"):
         export_file(finished, camera="nobody")
@@ -93,7 +93,7 @@ def test_the_same_export_writes_the_same_file(finished):
 
 def test_a_backbone_without_baking_cannot_export_for_a_view(scene, tmp_path):
     run(scene, tmp_path / "run", stop_after=1)
-    with pytest.raises(UserError, match="vanilla has nothing to bake"):
+    with pytest.raises(UserError, match="vanilla exports the same file for every view"):
         export_file(tmp_path / "run", camera="street/0002.png")
 
 
@@ -114,13 +114,17 @@ def test_a_run_in_training_is_only_read(finished, tmp_path, caplog, capsys):
         before = content(finished)
         evaluate.evaluate(finished)
         assert "overall" in capsys.readouterr().out
-        assert "another process writes" in caplog.text and "none is written there" in caplog.text
+        assert (
+            "another process is writing" in caplog.text and "none is written there" in caplog.text
+        )
         for write in (
             lambda: export_file(finished),
             lambda: export_file(finished, camera="street/0002.png"),
             lambda: render.render(finished, split="test", out=None),
         ):
-            with pytest.raises(UserError, match=r"training since(.|\n)*another place with --out"):
+            with pytest.raises(
+                UserError, match=r"training since(.|\n)*another output path with --out"
+            ):
                 write()
         export_file(finished, out=tmp_path / "mine.ply")
         render.render(finished, split="test", out=tmp_path / "renders")
@@ -137,7 +141,7 @@ def test_render_overwrites_no_image_in_a_folder_named_by_the_user(finished, tmp_
         folder = tmp_path / name
         folder.mkdir()
         (folder / f"{name}.png").write_bytes(b"a photo of mine")
-        with pytest.raises(UserError, match="the file exists"):
+        with pytest.raises(UserError, match="the output file already exists"):
             draw(folder)
         assert content(folder) == {f"{name}.png": b"a photo of mine"}
     for _ in range(2):  # The run's own are drawn anew.
@@ -186,7 +190,7 @@ def test_a_run_trained_with_cuda_can_be_used_on_a_machine_without_cuda(finished,
         look(How(device="cpu", threads=1))
     assert (tmp_path / "a.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert app.run({"device": "cpu"}, resume=finished, verbosity=-1) == 0
-    assert "rasterizer gsplat does not run on cpu: another one draws" in caplog.text
+    assert "rasterizer gsplat does not run on cpu: another rasterizer is used" in caplog.text
 
 
 def test_eval_render_and_export_have_the_options_device_and_threads():
@@ -225,7 +229,7 @@ def test_a_ply_is_evaluated_on_black_and_nothing_is_written(scene, tmp_path, cap
     assert drawn == pytest.approx(ply["psnr"], abs=6e-3)
     assert abs(own - drawn) > 0.05
     assert f"{told['primitives']} Gaussians of" in printed
-    assert "drawn on black" in printed
+    assert "rendered on black" in printed
 
 
 def test_a_message_reports_the_quality_that_the_ply_loses_by_its_background(
@@ -236,7 +240,7 @@ def test_a_message_reports_the_quality_that_the_ply_loses_by_its_background(
         out = tmp_path / name
         assert app.run({**settings, "out": str(out), "background": name}, verbosity=0) == 0
         told = capsys.readouterr().err
-        assert ("point_cloud.ply: drawn on black, as viewers draw it, it has" in told) == (
+        assert ("point_cloud.ply: rendered on black, as viewers do, it has" in told) == (
             name == "white"
         )
         assert ("over its background white" in told) == (name == "white")

@@ -113,7 +113,7 @@ def test_a_stopped_run_resumed_from_python_has_the_bits_of_the_command(scene, re
     assert bits(finished.folder, EVALUATED) == bits(reference)
     with pytest.raises(cg.UserError, match="the run is finished"):
         cg.resume(stopped.folder, quiet=True)
-    with pytest.raises(cg.UserError, match="a resumed run keeps its settings"):
+    with pytest.raises(cg.UserError, match="settings cannot be changed"):
         cg.resume(stopped.folder, quiet=True, seed=4)
 
 
@@ -163,7 +163,7 @@ def test_a_failed_run_raises_an_error_with_its_folder_and_cause(scene, tmp_path,
         ({"operator": {"name": "cagrad", "d": 1}}, "cagrad has no option"),
         (
             {"steps": 3, "seconds": 3},
-            "a run has one length: in steps, in views or in seconds, or views",
+            "a run has a length in steps, in views or in seconds, or in views",
         ),
     ],
 )
@@ -224,7 +224,7 @@ def test_two_threads_cannot_write_into_one_run_folder(scene, tmp_path):
     stopped = run(scene, tmp_path / "run", stop_after=5)
     with (
         locked(stopped.folder, "training"),
-        pytest.raises(cg.UserError, match="writes into this folder"),
+        pytest.raises(cg.UserError, match="is writing to this folder"),
     ):
         cg.resume(stopped.folder, quiet=True)
 

@@ -61,7 +61,7 @@ def test_a_run_writes_all_documented_files(scene, tmp_path, capsys, drawn):
     assert summary["overall"]["psnr"] > 5
     assert summary["overall"]["lpips"] is None and summary["null"]["lpips"]
     assert summary["seconds"]["train"] > 0
-    assert any("no separate gradients" in note for note in summary["notes"])
+    assert any("gradients of single views are not stored" in note for note in summary["notes"])
     assert str(out) in capsys.readouterr().out
     rows = quality(out)
     assert [row["step"] for row in rows] == ["6", "12"]
@@ -168,10 +168,12 @@ def test_notes_that_a_changed_length_makes_wrong_are_withdrawn(
     logged = (tmp_path / "timed" / "log.txt").read_text()
     assert summary["step"] == 60
     assert not any("no density control" in note for note in summary["notes"])
-    assert f"followed the clock: {summary['step']} steps instead of 28" in summary["notes"][-1]
+    assert (
+        f"adapted to the time budget: {summary['step']} steps instead of 28" in summary["notes"][-1]
+    )
     assert "no density control" in logged
     (line,) = told
-    assert line.startswith("density control after all") and line in logged
+    assert line.startswith("density control is used after all") and line in logged
 
 
 def test_a_stopped_run_resumes_with_the_length_revised_at_its_step(scene, tmp_path):
@@ -271,11 +273,11 @@ def test_growth_stops_at_max_gaussians_with_a_message(scene, tmp_path):
     settings["rate_factor"] = 1.0  # With larger rates some become transparent and are pruned.
     run(scene, tmp_path / "run", max_gaussians=230, **settings)
     assert int(quality(tmp_path / "run")[-1]["primitives"]) <= 230
-    assert "growth held back" in (tmp_path / "run" / "log.txt").read_text()
+    assert "were not added" in (tmp_path / "run" / "log.txt").read_text()
     # On a curve growth is held back at every edit, as it should be.
     run(scene, tmp_path / "curve", max_gaussians=230, growth="budget", **settings)
     assert quality(tmp_path / "curve")[-1]["primitives"] == "230"
-    assert "growth held back" not in (tmp_path / "curve" / "log.txt").read_text()
+    assert "were not added" not in (tmp_path / "curve" / "log.txt").read_text()
     summary = json.loads((tmp_path / "curve/summary.json").read_text())
     assert summary["peak_primitives"] == 230
 
@@ -291,7 +293,7 @@ def test_max_gaussians_below_the_number_of_points_is_applied_and_reported(scene,
     )
     counts = [int(row["primitives"]) for row in quality(tmp_path / "run")]
     assert max(counts) <= 90
-    told = "start: 60 primitives instead of 200"
+    told = "start: 60 Gaussians instead of 200"
     assert told in (tmp_path / "run/log.txt").read_text()
     notes = json.loads((tmp_path / "run/summary.json").read_text())["notes"]
     assert any(told in note for note in notes)
@@ -323,7 +325,7 @@ def poisoned(monkeypatch, poison):
 def test_one_non_finite_step_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100) == 0
-    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 0" in (tmp_path / "run" / "log.txt").read_text()
     # The evaluation of step 6 was before the rewind and is there once, from after it.
     assert [row["step"] for row in quality(tmp_path / "run")] == ["6", "12"]
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
@@ -334,7 +336,7 @@ def test_the_rewind_step_does_not_depend_on_the_clock(scene, tmp_path, monkeypat
     each_step_takes(monkeypatch, seconds)  # Of a second: the run thinks about its length at once.
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100) == 0
-    assert "rewound to step 0" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 0" in (tmp_path / "run" / "log.txt").read_text()
 
 
 def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, monkeypatch):
@@ -351,7 +353,7 @@ def test_a_run_with_a_time_budget_and_a_rewind_can_be_repeated(scene, tmp_path, 
 def test_a_bad_value_right_before_a_length_revision_is_rewound(scene, tmp_path, monkeypatch):
     poisoned(monkeypatch, Poison([7]))
     assert run(scene, tmp_path / "run", save_every=100, revisions=[[4, 12], [7, 12]]) == 0
-    assert "rewound to step 4" in (tmp_path / "run" / "log.txt").read_text()
+    assert "training returned to step 4" in (tmp_path / "run" / "log.txt").read_text()
     assert all(torch.isfinite(t).all() for t in parameters(tmp_path / "run").values())
 
 

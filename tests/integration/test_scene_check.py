@@ -34,7 +34,7 @@ def settings(scenes, name, out):
 
 
 def test_a_contradictory_scene_is_refused_with_the_cause_before_writing(scenes, tmp_path):
-    with pytest.raises(UserError, match="the scene contradicts itself") as error:
+    with pytest.raises(UserError, match="do not match its poses and points") as error:
         app.run(settings(scenes, "wrong", tmp_path / "run"), verbosity=-1)
     assert "principal point" in error.value.found
     assert not (tmp_path / "run").exists()
@@ -45,7 +45,7 @@ def test_an_accepted_scene_is_trained_and_its_configuration_repeats_the_run(scen
     asked = settings(scenes, "wrong", run)
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["scene_check"]["verdict"] == "the scene disagrees"
+    assert summary["scene_check"]["verdict"] == "points, poses and photos do not match"
     assert any("principal point" in note for note in summary["notes"])
     repeated = {**read_config(run), "out": str(tmp_path / "again")}
     assert app.run(repeated, verbosity=-1) == 0
@@ -57,7 +57,7 @@ def test_a_stopped_run_of_an_accepted_scene_can_be_resumed(scenes, tmp_path):
     assert app.run(asked, verbosity=-1, accept_scene=True) == 0
     assert app.run({}, resume=run, verbosity=-1) == 0
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["scene_check"]["verdict"] == "the scene disagrees"
+    assert summary["scene_check"]["verdict"] == "points, poses and photos do not match"
 
 
 def test_summary_json_has_the_numbers_of_a_consistent_scene(scenes, tmp_path):
@@ -86,6 +86,6 @@ def test_check_ends_with_code_2_and_the_cause_if_the_scene_is_refused(scenes):
     command = [sys.executable, "-m", "crossgrad_core", "check", str(scenes / "wrong")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "the scene contradicts itself" in done.stderr
+    assert "do not match its poses and points" in done.stderr
     assert "principal point" in done.stderr
     assert "Traceback" not in done.stderr

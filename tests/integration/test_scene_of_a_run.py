@@ -75,7 +75,9 @@ def spoilt(scene: Path, how: str) -> str:
         return rf"training photos missing: 2 \({NAMES[2]}, {NAMES[3]}\)"
     if how == "split":
         (scene / "test_list.txt").write_text(NAMES[2])
-        return r"photos held out that were trained on: 1(.|\n)*test_list.txt changed"
+        return (
+            r"photos that were training photos and are now held out: 1(.|\n)*test_list.txt changed"
+        )
     shutil.rmtree(scene)
     write_tiny_scene(scene, views=6, scale=3.0, seed=5)
     (scene / "test_list.txt").write_text("\n".join(NAMES[:2]))
@@ -89,7 +91,7 @@ def test_another_scene_is_refused_with_the_difference(root, change):
     for look in (lambda _: resume(root), *looks(root).values()):
         with pytest.raises(UserError, match=words) as told:
             look(How())
-        assert "put it back as it was" in str(told.value)
+        assert "restore the scene" in str(told.value)
     now = {path: path.read_bytes() for path in (root / "run").rglob("*.*") if path.is_file()}
     assert now == before
 
@@ -134,14 +136,16 @@ def test_a_run_resumes_with_changed_photos_only_with_accept_scene(root):
 
 def test_a_run_with_changed_held_out_views_cannot_be_resumed(root):
     words = spoilt(root / "scene", "held out")
-    with pytest.raises(UserError, match=rf"{words}(.|\n)*eval, render and export take it"):
+    with pytest.raises(
+        UserError, match=rf"{words}(.|\n)*eval, render and export accept the change"
+    ):
         resume(root, accept_scene=True)
 
 
 def test_resuming_a_run_of_an_older_version_records_its_scene(root, caplog):
     (root / "run" / FILE).unlink()
     evaluate.evaluate(root / "run")
-    assert caplog.text.count("the run is of an older version") == 1
+    assert caplog.text.count("an older version wrote the run") == 1
     assert not (root / "run" / FILE).exists()
     assert resume(root) == 0
     spoilt(root / "scene", "trained")

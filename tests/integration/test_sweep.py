@@ -31,5 +31,5 @@ def test_a_folder_with_other_content_is_not_changed(tmp_path, capsys):
     out.mkdir()
     (out / "config.yaml").write_text("steps: 3")
     assert ended("sweep", grid, "--out", out) == 2
-    assert "something else than a sweep" in capsys.readouterr().err
+    assert "do not belong to a sweep" in capsys.readouterr().err
     assert [each.name for each in out.iterdir()] == ["config.yaml"]

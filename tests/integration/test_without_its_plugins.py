@@ -62,7 +62,10 @@ def test_a_run_can_be_evaluated_without_the_plugins_that_trained_it(run, capsys)
     before = (run / "per_view.csv").read_text()
     assert ended("eval", run) == 0
     told = capsys.readouterr().err
-    assert "not installed here, and left out: sampler own-samplers, operator own-operators" in told
+    assert (
+        "not installed here, so they are not used: sampler own-samplers, operator own-operators"
+        in told
+    )
     assert "metrics gains, observers listens" in told
     assert (run / "per_view.csv").read_text() == before
     assert ended("export", run, "--out", run.parent / "again.ply") == 0
@@ -79,7 +82,9 @@ def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("own-losses", "other-losses"))
     assert ended("eval", run) == 2
-    assert "config.yaml was changed since this run began" in capsys.readouterr().err
+    assert (
+        "settings in config.yaml have changed since the run was started" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.sampled(2)
@@ -90,7 +95,7 @@ def test_changed_settings_are_refused_even_without_the_plugins(run, capsys):
         ("max_alpha: 0.99", "max_alpha: 0.5", "rasterizer.max_alpha"),
         ("near: ", "near: 1", "rasterizer.near"),
         ("revisions: []", "revisions: [[1, 2]]", "revisions"),
-        ("planned_seconds: null", "planned_seconds: 5.0", "follows the clock"),
+        ("planned_seconds: null", "planned_seconds: 5.0", "follows a time budget"),
     ],
 )
 def test_changed_render_and_length_settings_are_refused_without_the_plugins(
@@ -102,7 +107,7 @@ def test_changed_render_and_length_settings_are_refused_without_the_plugins(
     before = (run / "per_view.csv").read_text()
     assert ended("eval", run) == 2
     told = capsys.readouterr().err
-    assert "config.yaml was changed since this run began" in told
+    assert "settings in config.yaml have changed since the run was started" in told
     assert f"settings {named}; step" in told
     assert (run / "per_view.csv").read_text() == before
 
@@ -117,7 +122,10 @@ def test_a_metric_that_cannot_be_measured_keeps_its_value_in_the_file(run, capsy
     (run / "per_view.csv").write_text(text)
     assert ended("eval", run) == 0
     assert (run / "per_view.csv").read_text() == text
-    assert "per_view.csv stays as it is: gains, lpips not measured here" in capsys.readouterr().err
+    assert (
+        "per_view.csv was not changed: "
+        "it contains metrics that were not computed here (gains, lpips)" in capsys.readouterr().err
+    )
 
 
 def test_a_default_replaces_an_operator_that_names_a_missing_operator():

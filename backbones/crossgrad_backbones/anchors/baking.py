@@ -16,7 +16,7 @@ from crossgrad_core.plugin import Camera, Gaussians
 #: Band 1 of the real spherical harmonics: sqrt(3 / (4 pi)).
 _SH_C1 = sqrt(3.0 / (4.0 * pi))
 #: Regularisation of the coefficients of band 1, as a share of the weight that directions from all
-#: sides would give them. If all directions are equal, band 1 then stays 0.
+#: sides would give them. It keeps band 1 at 0 if all directions are equal.
 RIDGE = 0.01
 _BASIS = 4
 

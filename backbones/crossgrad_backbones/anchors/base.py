@@ -32,7 +32,7 @@ from crossgrad_core.plugin import (
 
 #: Near plane and dilation (px^2) of the filter: the defaults of the rasterizers.
 NEAR, DILATION = 1e-3, 0.3
-#: Standard deviations at which an opaque Gaussian falls below the alpha threshold.
+#: Number of standard deviations at which an opaque Gaussian falls below the alpha threshold.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_THRESHOLD))
 #: Distance of the first pixel's centre from the image border.
 _HALF_PIXEL = 0.5
@@ -186,7 +186,7 @@ class AnchorBackbone(AnchorOptions):
         drawn = gaussians.opacities >= ALPHA_THRESHOLD
         if not bool(drawn.any()):
             raise UserError(
-                "anchors have no point to start from",
+                "no Gaussian is opaque enough to become an anchor",
                 where="--init",
                 expected=f"Gaussians with opacities of at least {ALPHA_THRESHOLD:.4f}",
                 found=f"{len(drawn)} Gaussians, all of them fainter",

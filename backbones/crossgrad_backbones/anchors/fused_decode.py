@@ -18,7 +18,8 @@ from crossgrad_backbones.anchors.numba_kernels import networks as layers
 from crossgrad_core.numerics.elementwise import sigmoid_
 from crossgrad_core.numerics.jobs import parallel
 
-#: Anchors per stretch, a multiple of PANEL; fixed, so that sums do not depend on the machine.
+#: Number of anchors per stretch, a multiple of PANEL. It is fixed, so that sums do not depend on
+#: the machine.
 STRETCH = 2048
 #: Weight and bias of a linear layer.
 Layer = tuple[Tensor, Tensor]
@@ -118,7 +119,7 @@ def forward(inputs: Inputs) -> tuple[tuple[Tensor, ...], Kept]:
     read = (opacities, inputs.view.positions, inputs.offsets, spreads, inputs.view.rows)
     written = (origin, slot, means, quats, shares, scales, kept, colors)
     _fill(inputs, hidden, (*map(array, read), starts, *map(array, written)))
-    # The kernel wrote raw values and the anchor's size: torch's sigmoid is vectorised.
+    # The kernel wrote raw values and the anchor's size, because torch's sigmoid is vectorised.
     scales.mul_(sigmoid_(shares))
     sigmoid_(colors)
     remembered = (array(spreads), starts, array(slot), array(shares), array(colors))

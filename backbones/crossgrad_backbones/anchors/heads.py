@@ -26,7 +26,7 @@ BANK_STRIDES = (4, 2, 1)
 #: Number of covariance values per Gaussian: 3 scales and a quaternion wxyz.
 COVARIANCE = 7
 _CHANNELS = 3
-#: Rows that are summed at once.
+#: Number of rows that are summed at once.
 PANEL = 256
 
 

@@ -31,34 +31,66 @@ class AnchorOptions(Backbone):
     default_densifier: ClassVar[str] = "anchor"
 
     offsets: int = Field(10, ge=1, description="Gaussians per anchor")
-    feature: int = Field(32, ge=1, description="width of the feature and of the hidden layers")
-    opacity_distance: bool = Field(default=False, description="opacity depends on the distance")
-    cov_distance: bool = Field(default=False, description="covariance depends on the distance")
-    color_distance: bool = Field(default=False, description="colour depends on the distance")
-    feature_bank: bool = Field(default=False, description="mix the feature at three strides")
-    appearance: int = Field(0, ge=0, description="width of a code per training view; 0: none")
-    volume_weight: float = Field(0.01, ge=0, description="weight of the mean volume, extents cubed")
-    lr_offsets: float = Field(0.01, gt=0, description="initial, per scene extent")
-    lr_offsets_final: float = Field(1e-4, gt=0, description="final, per scene extent")
+    feature: int = Field(32, ge=1, description="width of the features and of the hidden layers")
+    opacity_distance: bool = Field(
+        default=False, description="whether the opacity depends on the distance"
+    )
+    cov_distance: bool = Field(
+        default=False, description="whether the covariance depends on the distance"
+    )
+    color_distance: bool = Field(
+        default=False, description="whether the colour depends on the distance"
+    )
+    feature_bank: bool = Field(
+        default=False, description="whether to mix the feature at three strides"
+    )
+    appearance: int = Field(
+        0, ge=0, description="width of the appearance code of each training view; 0: none"
+    )
+    volume_weight: float = Field(
+        0.01, ge=0, description="weight of the mean volume in the loss, extents cubed"
+    )
+    lr_offsets: float = Field(
+        0.01, gt=0, description="initial learning rate of the offsets, per scene extent"
+    )
+    lr_offsets_final: float = Field(
+        1e-4, gt=0, description="final learning rate of the offsets, per scene extent"
+    )
     lr_features: float = Field(0.0075, ge=0, description="learning rate of the features")
-    lr_features_final: float | None = Field(None, gt=0, description="None: constant, as published")
+    lr_features_final: float | None = Field(
+        None, gt=0, description="final learning rate; null: constant, as published"
+    )
     lr_scales: float = Field(0.007, ge=0, description="learning rate of the log scales")
-    lr_scales_final: float | None = Field(None, gt=0, description="None: constant, as published")
-    lr_opacity: float = Field(0.002, gt=0, description="initial, network of the opacity")
-    lr_opacity_final: float = Field(2e-5, gt=0, description="final, network of the opacity")
-    lr_cov: float = Field(0.004, ge=0, description="network of the covariance")
-    lr_cov_final: float | None = Field(None, gt=0, description="None: constant, as published")
-    lr_color: float = Field(0.008, gt=0, description="initial, network of the colour")
-    lr_color_final: float = Field(5e-5, gt=0, description="final, network of the colour")
-    lr_bank: float = Field(0.01, gt=0, description="initial, feature bank")
-    lr_bank_final: float = Field(1e-5, gt=0, description="final, feature bank")
-    lr_appearance: float = Field(0.05, gt=0, description="initial, appearance codes")
-    lr_appearance_final: float = Field(5e-4, gt=0, description="final, appearance codes")
+    lr_scales_final: float | None = Field(
+        None, gt=0, description="final learning rate; null: constant, as published"
+    )
+    lr_opacity: float = Field(
+        0.002, gt=0, description="initial learning rate of the opacity network"
+    )
+    lr_opacity_final: float = Field(
+        2e-5, gt=0, description="final learning rate of the opacity network"
+    )
+    lr_cov: float = Field(0.004, ge=0, description="learning rate of the covariance network")
+    lr_cov_final: float | None = Field(
+        None, gt=0, description="final learning rate; null: constant, as published"
+    )
+    lr_color: float = Field(0.008, gt=0, description="initial learning rate of the colour network")
+    lr_color_final: float = Field(
+        5e-5, gt=0, description="final learning rate of the colour network"
+    )
+    lr_bank: float = Field(0.01, gt=0, description="initial learning rate of the feature bank")
+    lr_bank_final: float = Field(1e-5, gt=0, description="final learning rate of the feature bank")
+    lr_appearance: float = Field(
+        0.05, gt=0, description="initial learning rate of the appearance codes"
+    )
+    lr_appearance_final: float = Field(
+        5e-4, gt=0, description="final learning rate of the appearance codes"
+    )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Return the options without an effect; see `HasUnusedOptions`."""
-        bank = "there is no feature bank (feature_bank = false); leave it out"
-        codes = "photos have no codes (appearance = 0); leave it out"
+        bank = "there is no feature bank (feature_bank = false); leave the option out"
+        codes = "photos have no codes (appearance = 0); leave the option out"
         return {
             **({} if self.feature_bank else {"lr_bank": bank, "lr_bank_final": bank}),
             **({} if self.appearance else {"lr_appearance": codes, "lr_appearance_final": codes}),

@@ -5,12 +5,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-#: Smallest automatic voxel size, local units: used for a cloud of identical points.
+#: Smallest automatic voxel size, in local units, for a cloud of identical points.
 SMALLEST_VOXEL = 1e-5
-#: The automatic voxel size of a cloud without neighbours, local units.
+#: Automatic voxel size of a cloud without neighbours, in local units.
 LONE_VOXEL = 0.01
-#: The automatic voxel size, in median distances between neighbours. With 1, nearly every point gets
-#: its own anchor, that is ten Gaussians for one Gaussian of vanilla.
+#: Automatic voxel size, in median distances between neighbours. With 1, nearly every point gets its
+#: own anchor, that is ten Gaussians where vanilla has one.
 SPACING = 2.0
 #: Cells farther from the origin are left out: their integer coordinates would not be exact.
 FARTHEST = 2**40

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from crossgrad_backbones.anchors.voxels import automatic_voxel_size
 
-#: Upper limit of the number of levels: more than any scene needs.
+#: Maximum number of levels, which is more than any scene needs.
 MOST_LEVELS = 16
 #: Least edge of a cell, as a share of the largest coordinate: float32 rounds positions to 2^-24.
 RESOLUTION = 2.0**-20
@@ -121,7 +121,7 @@ class Lattice:
 
     def _forks(self, exponents: Tensor) -> Tensor:
         """Return fork^exponents in the exponents' type, because a step computes it per anchor."""
-        # exp2 is not used: its rounding depends on the number of threads.
+        # Do not use exp2: its rounding depends on the number of threads.
         return torch.exp(torch.log(self.fork) * exponents)
 
     def faded(self, distances: Tensor, levels: Tensor, extra: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def distance_range(
     quantiles = (1.0 - ratio, ratio)
     pooled = [np.quantile(np.linalg.norm(points - c, axis=1), quantiles) for c in centers]
     smallest, largest = (float(value) for value in np.quantile(pooled, quantiles))
-    # All points and all cameras are in one place: any distance is valid.
+    # All points and all cameras have the same position, so any distance is valid.
     largest = largest if largest > 0.0 else 1.0
     return largest, max(smallest, largest * 2.0**-MOST_LEVELS)
 

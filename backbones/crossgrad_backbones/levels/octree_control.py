@@ -172,12 +172,14 @@ class OctreeControl(AnchorDensifier):
     }
 
     update_ratio: float = Field(
-        0.2, ge=0, description="thresholds grow by fork^update_ratio per level"
+        0.2, ge=0, description="gradient thresholds grow by fork^update_ratio per level"
     )
     extra_ratio: float = Field(
-        0.25, ge=0, description="an anchor's mean gradient for an extra level, thresholds"
+        0.25,
+        ge=0,
+        description="mean gradient above which an anchor gets an extra level, in thresholds",
     )
-    extra_level: float = Field(0.01, ge=0, description="what is added to an extra level, levels")
+    extra_level: float = Field(0.01, ge=0, description="amount added to an extra level, levels")
 
     @override
     def window(self, schedule: Schedule) -> Schedule:

@@ -92,7 +92,8 @@ class Exporter(Component):
 
 def _not_read(path: Path) -> UserError:
     return UserError(
-        "files of this format are written, not read",
+        "a run cannot start from a file of this format: crossgrad writes the format "
+        "but does not read it",
         where=path,
-        todo="name a file of a format that a run can start from, such as a PLY of Gaussians",
+        todo="use a file of a format that a run can start from, such as a PLY of Gaussians",
     )

@@ -39,7 +39,7 @@ class Rasterizer(Component):
     deterministic: ClassVar[bool] = True
     sparse_rows: ClassVar[bool] = False
 
-    max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="cap of a Gaussian's alpha")
+    max_alpha: float = Field(0.99, gt=0.0, lt=1.0, description="upper limit of a Gaussian's alpha")
     near: float = Field(1e-3, gt=0.0, description="near plane, local units")
     dilation: float = Field(0.3, ge=0.0, description="dilation of the 2-D covariance, px^2")
 

@@ -43,7 +43,7 @@ def evaluate(
     """
     if ply is not None:
         result, gaussians, place = evaluated_file(folder, ply, how, on)
-        told = f"{gaussians:,} Gaussians of {ply}, drawn on black as viewers draw them"
+        told = f"{gaussians:,} Gaussians of {ply}, rendered on black as viewers do"
         print("\n".join([*metric_lines(result), told, *(place.messages() if place else ())]))  # noqa: T201
     elif on is not None:
         result, there = evaluated_on(folder, on, how)
@@ -127,7 +127,8 @@ def evaluated(folder: Path, how: Opens = AS_IT_IS) -> tuple[EvaluationResult, To
     Raises:
         UserError: The folder is not a run, or the run has no checkpoint.
     """
-    require_checkpoint(folder)  # Before the lock, which must not be written into any other folder.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    require_checkpoint(folder)
     with writing_if_possible(folder, "evaluating") as writes:
         setup, state = how.open(folder)
         draw, points = renderer(setup, state), setup.scene.points
@@ -150,7 +151,11 @@ def _loses_figures(folder: Path, result: EvaluationResult) -> bool:
         return False
     lost = _known(before) - _known(result.views)
     if lost:
-        _LOG.warning("%s stays as it is: %s not measured here", PER_VIEW, listed(sorted(lost)))
+        _LOG.warning(
+            "%s was not changed: it contains metrics that were not computed here (%s)",
+            PER_VIEW,
+            listed(sorted(lost)),
+        )
     return bool(lost)
 
 

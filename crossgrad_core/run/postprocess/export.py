@@ -37,7 +37,7 @@ def export(
     )
     for line in described(content, path):
         print(line)  # noqa: T201
-    print(f"{content.gaussians:,} Gaussians in {one_line(path)}")  # noqa: T201
+    print(f"{content.gaussians:,} Gaussians written to {one_line(path)}")  # noqa: T201
 
 
 def exported(
@@ -77,21 +77,23 @@ def exported(
             check_new(out, georef_of(out))
             clear_leftovers(out.parent, shared=True)
         setup, state = how.open(folder)
-        exporter = setup.selection.exporter  # With the run's own options, if it is the run's.
+        # If the exporter is the run's exporter, use the options of the run.
+        exporter = setup.selection.exporter
         if file_format not in {None, setup.selection.names["exporter"]}:
             exporter = build(Exporter, str(file_format), {})
         if out is not None and out.suffix.lower() in _OF_FORMATS - {f".{exporter.suffix}"}:
             raise UserError(
-                "the file is named as one of another format",
+                "the name of the output file ends like a file of another format",
                 where=f"--out {out}",
                 expected=f"a name that ends in .{exporter.suffix}",
                 todo="rename it, or choose another --format (`crossgrad plugins list` shows them)",
             )
         if camera is not None and setup.backbone.plain:
             raise UserError(
-                f"backbone {setup.selection.names['backbone']} has nothing to bake for a view",
+                f"--camera has no effect: backbone {setup.selection.names['backbone']} "
+                "exports the same file for every view",
                 where="--camera",
-                todo="leave it out: the file is the same for every view",
+                todo="leave --camera out",
             )
         words = [CLOUD] if camera is None else [CLOUD, _flat(setup, camera)]
         words += [] if coordinates == INPUT else [coordinates.replace(":", "-")]

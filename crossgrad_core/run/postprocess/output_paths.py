@@ -24,7 +24,9 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
             stack.enter_context(locked(folder, doing))
         except UserError as error:
             found = f" ({error.found})" if error.found else ""
-            _LOG.warning("%s%s: results are shown, and none is written there", error.what, found)
+            _LOG.warning(
+                "%s%s: results are only shown, and none is written there", error.what, found
+            )
             yield False
         else:
             clear_half_written(folder)
@@ -34,7 +36,8 @@ def writing_if_possible(folder: Path, doing: str) -> Iterator[bool]:
 @contextmanager
 def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
     """Lock the run's folder, unless the results go to `out`."""
-    require_checkpoint(folder)  # Before the lock, which must not be written into any other folder.
+    # Check before taking the lock, because a folder of another kind must not be changed.
+    require_checkpoint(folder)
     if out is not None:
         yield
         return
@@ -44,7 +47,10 @@ def writing(folder: Path, out: Path | None, doing: str) -> Iterator[None]:
             yield
     except RunInUseError as error:
         raise UserError(
-            error.what, where=error.where, found=error.found, todo="name another place with --out"
+            error.what,
+            where=error.where,
+            found=error.found,
+            todo="choose another output path with --out",
         ) from error
 
 

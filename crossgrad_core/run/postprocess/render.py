@@ -101,9 +101,10 @@ def render_path(
     """
     if frames is not None and path != ZOOM:
         raise UserError(
-            "--frames is the number of frames of a zoom path; a camera path has its own",
+            "--frames applies only to a zoom path; a camera path from a file defines its "
+            "own frames",
             where=f"--path {path}",
-            todo=f"leave out --frames, or draw --path {ZOOM}",
+            todo=f"leave out --frames, or use --path {ZOOM}",
         )
     with writing(folder, out, "rendering"):
         check_folder(out or folder)
@@ -125,9 +126,16 @@ def render_path(
                 drop_frames(out, len(files))
             made = write_video(files, along.fps)
             for video in video_files(out) if own else ():
-                if video != made:  # A video of other frames.
+                if video != made:  # Frames of another video exist.
                     video.unlink(missing_ok=True)
-        told = f"video {made}" if made else f"no video: too many or too large without {ENCODER}"
+        told = (
+            f"video {made}"
+            if made
+            else (
+                "no video was written: there are too many frames, or they are too large "
+                f"without {ENCODER}"
+            )
+        )
         print(f"{count(len(files), 'frame')} in {one_line(out)}, {one_line(told)}")  # noqa: T201
 
 

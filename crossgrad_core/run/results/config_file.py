@@ -26,7 +26,8 @@ def write_config(folder: Path, config: RunConfig, notes: Sequence[str] = ()) -> 
 
     A run that follows the clock rewrites the file.
     """
-    config = config.model_copy(update={"stop_after": None})  # It concerns only one start.
+    # This setting applies to one start only.
+    config = config.model_copy(update={"stop_after": None})
     noted = write_yaml({NOTES: list(notes)}) if notes else ""
     write_atomically(folder / FILE, text_bytes(f"{as_yaml(config)}{noted}"))
 
@@ -41,19 +42,19 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / FILE
     if not path.is_file():
         raise UserError(
-            "this is not the folder of a run",
+            "the folder is not the folder of a run",
             where=folder,
-            expected=f"a folder with {FILE}",
+            expected=f"a folder that contains {FILE}",
             todo="name the folder that `crossgrad run` printed",
         )
     content = _content(folder)
     if gone := [name for name in _ALWAYS if name not in content]:
         raise UserError(
-            f"{FILE} is not whole",
+            f"{FILE} is incomplete",
             where=path,
             expected="all settings of the run",
             found=f"no {listed(gone)}",
-            todo="restore the file from a copy; the results beside it are as they were",
+            todo="restore the file from a copy; the results in the folder are unchanged",
         )
     return unmarked(content, path)
 
@@ -91,10 +92,10 @@ def unmarked(settings: Mapping[str, Any], path: Path) -> dict[str, Any]:
     version = str(settings.get(KEY, CURRENT))
     if version != CURRENT:
         raise UserError(
-            "the configuration is of another version of crossgrad",
+            "the configuration was written by another version of crossgrad",
             where=f"{path}, {KEY}",
             expected=CURRENT,
             found=version,
-            todo=f"install crossgrad {version}, or remove the line if the file is of this version",
+            todo=f"install crossgrad {version}; or remove the line if the file is of this version",
         )
     return {name: value for name, value in settings.items() if name not in {KEY, NOTES}}

@@ -66,12 +66,12 @@ def draw_curve(
     figure = Figure(figsize=(7.5, 2.2 + 2.6 * len(charts)), dpi=150, layout=layout)
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(charts), 1, sharex=True, squeeze=False)[:, 0]
-    lines = _lines(rows, views or {}) if scored else [_Line("mean of the step's views", "")]
+    lines = _lines(rows, views or {}) if scored else [_Line("mean over the views of the step", "")]
     for ax, (metric, label) in zip(axes, charts, strict=True):
         _draw(ax, rows, metric, lines)
         ax.set_ylabel(label)
     axes[0].set_xlim(left=0.0)
-    axes[-1].set_xlabel("training seconds (compiling, loading and evaluating excluded)")
+    axes[-1].set_xlabel("training seconds (without compiling, loading and evaluating)")
     _add_view_axis(axes[0], rows)
     _add_legend(figure, axes[0])
     figure.suptitle(_literal(title), fontsize=11)
@@ -82,7 +82,7 @@ def _lines(rows: Sequence[Row], views: Mapping[str, int]) -> list[_Line]:
     lines = [_Line(_labelled(_OVERALL, "", rows[-1], views), "")]
     regimes = [name for name in sorted(views) if name != _OVERALL and f"psnr_{name}" in rows[0]]
     looks = zip(cycle(_COLORS), cycle(_MARKERS), cycle(_STYLES), strict=False)
-    if len(regimes) > 1:  # a single one would repeat `overall`
+    if len(regimes) > 1:  # A single regime would repeat `overall`.
         for name, look in zip(regimes, looks, strict=False):
             lines.append(_Line(_labelled(name, f"_{name}", rows[-1], views), f"_{name}", *look))
     return lines
@@ -105,7 +105,7 @@ def _literal(text: str) -> str:
 
 
 def _draw(ax: "Axes", rows: Sequence[Row], metric: str, lines: Sequence[_Line]) -> None:
-    for line in reversed(lines):  # `overall` on top
+    for line in reversed(lines):  # Draw `overall` on top.
         points = [(row["train_seconds"], row.get(f"{metric}{line.column}")) for row in rows]
         known = [(x, y) for x, y in points if x is not None and y is not None and np.isfinite(y)]
         ax.plot(

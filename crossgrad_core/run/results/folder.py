@@ -21,7 +21,7 @@ from crossgrad_core.system.files import (
 
 #: Space that a run with a small scene and few renders may take, in bytes.
 SMALLEST_NEED = 64 * 2**20
-#: Folder of all runs, relative to the working folder.
+#: Folder that contains all runs, relative to the working folder.
 RUNS = Path("runs")
 _UNSAFE = re.compile(r"[^\w.+-]+")
 
@@ -94,18 +94,20 @@ def check_out(out: Path | None) -> None:
             return
     if not out.is_dir():
         raise UserError(
-            "the output folder is a file", where=out, todo="choose another --out, or remove it"
+            "the output path is a file, not a folder",
+            where=out,
+            todo="choose another --out, or remove the file",
         )
     there = sorted(p.name for p in out.iterdir() if p.name != LOCK and not is_leftover(p))
     if there:
         writer = writer_of(out)
         raise UserError(
-            "the output folder is not empty, and results are never overwritten",
+            "the output folder is not empty; crossgrad never overwrites results",
             where=out,
             expected="a new or empty folder",
             found=", ".join(there[:4]) + (f" of {writer}" if writer else ""),
             todo="choose another --out"
-            + (", or continue that run with --resume" if CONFIG in there else ""),
+            + (", or resume that run with --resume" if CONFIG in there else ""),
         )
 
 
@@ -118,7 +120,8 @@ def clear_half_written(folder: Path) -> None:
 
 def expected_bytes(primitives: int, checkpoints: int) -> int:
     """Estimate the bytes that a run writes: SH degree 3, two Adam moments, one PLY file."""
-    floats = 59 * 3 * (checkpoints + 1) + 62  # one more checkpoint exists while it is written
+    # Count one more checkpoint, because the old ones exist while a new one is written.
+    floats = 59 * 3 * (checkpoints + 1) + 62
     return max(SMALLEST_NEED, 4 * floats * primitives)
 
 

@@ -14,9 +14,9 @@ from crossgrad_core.system.input_files import read_file
 from crossgrad_core.system.yaml_values import read_mapping, read_yaml
 from crossgrad_core.wording import listed
 
-#: The scalar of a checkpoint that holds the texts: name of a file -> its content.
+#: Scalar of a checkpoint that contains the texts: name of a file -> its content.
 KEY: Final = "files"
-#: Settings that a run which follows the clock rewrites.
+#: Settings that a run with a time budget rewrites.
 _REVISED: Final = frozenset({"steps", "revisions"})
 
 
@@ -40,12 +40,12 @@ def restored(folder: Path, scalars: Mapping[str, Any], step: int) -> tuple[str, 
     text = (scalars.get(KEY) or {}).get(METRICS)
     found = _content(folder / METRICS)
     if text is None or found == text.encode():
-        return ()  # There was no file when the checkpoint was written, or it is whole.
+        return ()  # The file did not exist when the checkpoint was written, or it is complete.
     write_atomically(folder / METRICS, text.encode())
     if found is not None and found.startswith(text.encode()):
         return ()
     was = "was gone" if found is None else "was damaged"
-    return (f"{METRICS} {was}: it is restored as it was at step {step}",)
+    return (f"{METRICS} {was}: it is restored to its state at step {step}",)
 
 
 def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def edited(folder: Path, scalars: Mapping[str, Any]) -> tuple[str, ...]:
     if not changed:
         return ()
     parts = (name if name == NOTES else _difference(name, was, now) for name in changed)
-    return (f"{CONFIG} was edited since its run wrote it: {listed(parts)}",)
+    return (f"{CONFIG} was edited after its run wrote it: {listed(parts)}",)
 
 
 def _difference(name: str, was: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -18,11 +18,13 @@ from crossgrad_core.errors import UserError
 from crossgrad_core.system.check_writable import check_own
 from crossgrad_core.system.files import disk_errors
 
-#: The locked file. It stays when its process has ended; then no process holds the lock.
+#: Name of the locked file. The file remains when its process has ended; then no process holds the
+#: lock.
 FILE = "run.lock"
 
 _TAKEN = frozenset({errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK})
-# Windows locks ranges of bytes that other processes cannot read, so lock one far after the content.
+# Windows locks ranges of bytes, which other processes then cannot read. Lock a byte far after the
+# content.
 _FAR = 2**30
 _MOST = 4096  # most bytes of a holder's description
 
@@ -81,7 +83,7 @@ def locked(folder: Path, doing: str) -> Iterator[bool]:
     path = folder / FILE
     check_own(path)
     with disk_errors(path):
-        # Unbuffered: a buffer would write again on close what a full disk had refused.
+        # Do not buffer: on close, a buffer would write again the data that a full disk had refused.
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)
     with file:
         taken = _take(file)
@@ -107,15 +109,15 @@ def writer_of(folder: Path) -> str | None:
 
 def _in_use(folder: Path, holder: Holder | None) -> RunInUseError:
     return RunInUseError(
-        "another process writes into this folder",
+        "another process is writing to this folder",
         where=folder,
         found=_named(holder),
-        todo="wait until it ends, or stop it",
+        todo="wait until the process ends, or stop it",
     )
 
 
 def _named(holder: Holder | None) -> str:
-    return "a process that holds the folder's lock" if holder is None else str(holder)
+    return "a process that holds the lock of the folder" if holder is None else str(holder)
 
 
 def _take(file: BinaryIO) -> Literal["by us", "by another", "not at all"]:

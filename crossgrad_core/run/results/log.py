@@ -13,7 +13,7 @@ from crossgrad_core.wording import showable
 
 #: Weight of a new value in the smoothed loss and step rate.
 SMOOTHING = 0.05
-#: A change of the length by a smaller share is not reported.
+#: A change of the length is reported only if it is larger than this share.
 NEWS_SHARE = 0.1
 
 
@@ -92,7 +92,12 @@ def length_lines(pace: Pace) -> list[str]:
     planned = pace.planned
     if planned is None or abs(pace.total - planned) < NEWS_SHARE * planned:
         return []
-    return [f"the length followed the clock: {pace.total} steps instead of {planned}"]
+    return [
+        (
+            f"the number of steps was adapted to the time budget: {pace.total} steps "
+            f"instead of {planned}"
+        )
+    ]
 
 
 def figures(pace: Pace) -> list[str]:

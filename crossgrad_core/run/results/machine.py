@@ -17,9 +17,10 @@ from crossgrad_core.system.version import VERSION
 
 #: Seconds between two readings of the load.
 LOOK_SECONDS = 1.0
-#: Seconds that a calibration takes.
+#: Duration of a calibration in seconds.
 CALIBRATION_SECONDS = 2.0
-#: Runs that trained for fewer seconds are not calibrated, because calibration takes too long then.
+#: Runs that trained for fewer seconds are not calibrated, because calibration would take too long
+#: for them.
 WORTH_A_CALIBRATION = 20.0
 #: Numbers in the fixed workload, and passes over them between two readings of the clock.
 _NUMBERS, _PASSES = 1 << 16, 8

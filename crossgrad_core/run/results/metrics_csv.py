@@ -100,11 +100,11 @@ class MetricsCsv:
         lines = _lines(path)
         if not lines or tuple(lines[0]) != table.columns:
             raise UserError(
-                "cannot continue the table of another run",
+                "metrics.csv cannot be continued: its columns belong to another run",
                 where=path,
                 expected=",".join(table.columns),
                 found=",".join(lines[0]) if lines else "an empty file",
-                todo="resume with the scene and split of that run",
+                todo="resume with the scene and the split that the run was started with",
             )
         # A row that a crash cut short has fewer cells; the resumed run writes it again.
         whole = [line for line in lines[1:] if len(line) == len(table.columns)]
@@ -122,7 +122,7 @@ class MetricsCsv:
         """
         unknown = set(row) - set(self.columns)
         if unknown:
-            message = f"{FILE} has no columns {sorted(unknown)}"
+            message = f"{FILE} does not contain the columns {sorted(unknown)}"
             raise ValueError(message)
         line = csv_bytes([[as_cell(row.get(name)) for name in self.columns]])
         with disk_errors(self.path, len(line)):
@@ -142,7 +142,7 @@ def read_metrics(folder: Path) -> tuple[Row, ...]:
     path = folder / FILE
     if not path.is_file():
         raise UserError(
-            f"no {FILE}",
+            f"the folder does not contain {FILE}",
             where=folder,
             expected="the folder of a crossgrad run",
             todo="name the folder that `crossgrad run` printed",
@@ -172,7 +172,7 @@ def _is_step(number: float | None) -> bool:
 
 
 def _unreadable(path: Path, found: str) -> UserError:
-    return UserError(f"unreadable {FILE}", where=path, found=found, todo=_TODO)
+    return UserError(f"{FILE} cannot be read", where=path, found=found, todo=_TODO)
 
 
 def _append(path: Path, content: bytes) -> None:
@@ -180,7 +180,7 @@ def _append(path: Path, content: bytes) -> None:
         size = file.tell()
         try:
             left = memoryview(content)
-            while left:  # The system may write only a part of it.
+            while left:  # The system may write only a part of the data.
                 left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError:
@@ -249,5 +249,9 @@ def _view(path: Path, header: list[str], line: list[str]) -> ViewMetrics:
 
 def _unreadable_view(path: Path, found: str, expected: str = "") -> UserError:
     return UserError(
-        f"unreadable {PER_VIEW}", where=path, expected=expected, found=found, todo=_RESTORE_VIEWS
+        f"{PER_VIEW} cannot be read",
+        where=path,
+        expected=expected,
+        found=found,
+        todo=_RESTORE_VIEWS,
     )

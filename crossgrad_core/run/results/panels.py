@@ -79,7 +79,7 @@ FOLDER = "renders"
 _NARROWEST = 360
 _SMALLEST_FONT, _LARGEST_FONT, _FONTS_PER_WIDTH = 12, 26, 38
 _COLUMNS = ("photo", "render", "error")
-_TODO = "draw the panels again: crossgrad render RUN, or remove the file"
+_TODO = "render the panels again: crossgrad render RUN, or remove the file"
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def read_panel(path: Path) -> "dict[str, Image]":
         raise _unreadable(path, str(error)) from error
     layout = Layout.in_canvas(panel.size)
     if layout is None:
-        raise _unreadable(path, f"a picture of {panel.width} x {panel.height} px")
+        raise _unreadable(path, f"an image of {panel.width} x {panel.height} px")
     lower = layout.top + layout.height
     left = [layout.left(column) for column in range(len(_COLUMNS))]
     boxes = [(x, layout.top, x + layout.width, lower) for x in left]
@@ -190,14 +190,15 @@ def read_panel(path: Path) -> "dict[str, Image]":
 
 def _unreadable(path: Path, found: str) -> UserError:
     return UserError(
-        "unreadable panel",
+        "a panel image cannot be read",
         where=path,
         found=found,
         todo=_TODO,
     )
 
 
-#: Errors of this size and above get the last colour; fixed, so that panels are comparable.
+#: Errors of at least this size get the last colour; the limit is fixed, so that panels are
+#: comparable.
 LARGEST_ERROR = 0.25
 _COLORMAP = "inferno"
 _TICKS = (0.0, 0.05, 0.10, 0.15, 0.20, 0.25)

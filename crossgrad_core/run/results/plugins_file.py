@@ -71,11 +71,11 @@ def read_plugins(folder: Path, *, quiet: bool = False) -> Packages | None:
     try:
         return _PACKAGES.validate_json(read_file(path))
     except OSError:
-        why = f"{folder} has no {FILE}: the run is of an older version"
+        why = f"{folder} has no {FILE}: an older version wrote the run"
     except ValidationError:
-        why = f"{path} is damaged, or of another version"
+        why = f"{path} is damaged, or another version wrote it"
     if not quiet:
-        _LOG.warning("%s; whether its plugins are still the same cannot be told", why)
+        _LOG.warning("%s; it is not known whether the plugins of the run are still the same", why)
     return None
 
 
@@ -93,8 +93,11 @@ def with_present(known: Packages | None, present: Packages) -> Packages:
 def history(packages: Packages) -> tuple[str, ...]:
     """Return a note on each package of which several versions trained the run."""
     return tuple(
-        f"trained with {name} {', then '.join(package.versions)} (--accept-plugins)"
-        f"{': ' if package.components else ''}{', '.join(package.components)}"
+        (
+            f"trained with {name} {', then '.join(package.versions)} "
+            f"(--accept-plugins){': ' if package.components else ''}"
+            f"{', '.join(package.components)}"
+        )
         for name, package in packages.items()
         if len(package.versions) > 1
     )
@@ -167,14 +170,15 @@ def refuse_changed(folder: Path, packages: Packages | None) -> None:
             where=folder / FILE,
             expected=listed(changed),
             found=listed(changed.values()),
-            todo="install those versions again, or add --accept-plugins to go on with these",
+            todo="install the same versions again, or add --accept-plugins to resume with the "
+            "installed versions",
         )
 
 
 def report_changed(packages: Packages | None) -> None:
     """Warn that other versions of packages trained the run."""
     for was, now in changes(packages).items():
-        _LOG.warning("the run was trained with %s; installed is %s", was, now)
+        _LOG.warning("the run was trained with %s; the installed version is %s", was, now)
 
 
 def _parts(value: object) -> Iterator[Component]:
@@ -211,6 +215,6 @@ def _found(package: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return f"{package} {version(package)}, which does not offer them"
+        return f"{package} {version(package)}, which does not contain them"
     except (PackageNotFoundError, ValueError):
-        return f"no package {package}"
+        return f"package {package} is not installed"

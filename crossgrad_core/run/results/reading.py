@@ -20,7 +20,7 @@ from crossgrad_core.run.results.summary import read_summary
 from crossgrad_core.system.checksums import check_unchanged
 from crossgrad_core.system.text_files import read_json
 
-#: The file with the fingerprint of a run's scene; results/scene_file.py writes it.
+#: File with the fingerprint of a run's scene; results/scene_file.py writes it.
 SCENE = "scene.json"
 #: The files of a run that are read.
 _READ: Final = (CONFIG, METRICS, PER_VIEW, SUMMARY, SCENE)
@@ -65,9 +65,9 @@ class RunResults:
         if isinstance(marks, dict) and isinstance(marks.get("views"), dict):
             return marks
         raise UserError(
-            "unreadable scene.json",
+            "scene.json cannot be read",
             where=self.folder / SCENE,
-            expected="the views of the scene, with what their photos are known by",
+            expected="the views of the scene, with the fingerprints of their photos",
             todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
         )
 
@@ -93,7 +93,7 @@ def read_run(folder: Path) -> RunResults:
     Raises:
         UserError: The folder is not a run, or one of its files is damaged.
     """
-    check_unchanged(folder, _READ, f"restore it, or let crossgrad run --resume {folder} repair it")
+    check_unchanged(folder, _READ, f"restore it, or repair it with crossgrad run --resume {folder}")
     summary = read_summary(folder) if (folder / SUMMARY).is_file() else None
     views = () if summary is None else read_per_view(folder)
     return RunResults(folder, read_config(folder), read_metrics(folder), summary, views)

@@ -16,14 +16,19 @@ from crossgrad_core.system.input_files import read_file
 
 #: Advice for the most serious difference; None is the key for a difference that can be accepted.
 _WAYS_OUT = {
-    None: "put it back as it was, or add --accept-scene to go on with it as it is",
-    Weight.HELD_OUT: "put it back as it was; eval, render and export take it with --accept-scene, "
-    "but a run goes on only with the views that it began with",
-    Weight.PLACE: "put it back as it was, or start a new run: the parameters of this one would be "
-    "in the wrong place, or views that it was trained on would be measured",
+    None: "restore the scene, or add --accept-scene to continue with the changed scene",
+    Weight.HELD_OUT: (
+        "restore the scene; eval, render and export accept the change with "
+        "--accept-scene, but a run can continue only with the views that it was "
+        "started with"
+    ),
+    Weight.PLACE: (
+        "restore the scene, or start a new run: otherwise the trained parameters "
+        "would be at wrong positions, or training views would be used for evaluation"
+    ),
 }
 #: The beginning of the note on an accepted scene.
-ACCEPTED: Final = "the scene is not the one that the run was trained on, accepted: "
+ACCEPTED: Final = "the scene has changed since the run was trained, accepted: "
 _LOG = logging.getLogger(__name__)
 
 
@@ -43,16 +48,16 @@ def write_scene(folder: Path, fingerprint: Fingerprint) -> None:
 def read_scene_file(folder: Path) -> Fingerprint | None:
     """Return the scene that a run was trained on; None, with a note, if it is unknown."""
     path = folder / FILE
-    why = f"{path} is damaged, or of another version"
+    why = f"{path} is damaged, or another version wrote it"
     try:
         fingerprint = Fingerprint.model_validate_json(read_file(path))
         if not changed_files(folder, [FILE]):
             return fingerprint
     except OSError:
-        why = f"{folder} has no {FILE}: the run is of an older version, or somebody removed it"
+        why = f"{folder} has no {FILE}: an older version wrote the run, or the file was removed"
     except ValidationError:
         pass
-    _LOG.warning("%s; whether its scene is still the same cannot be told", why)
+    _LOG.warning("%s; it is not known whether the scene is still the same", why)
     return None
 
 
@@ -82,7 +87,7 @@ def check_scene(
     if heaviest <= tolerated and accept:
         return (f"{ACCEPTED}{text}",)
     raise UserError(
-        "the scene is not the one that the run was trained on",
+        "the scene has changed since the run was trained",
         where=folder / FILE,
         found=text,
         todo=_WAYS_OUT[heaviest if heaviest > tolerated else None],

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FILE = "summary.json"
 Status = Literal["finished", "stopped", "failed"]
-#: Note for every metric; values are comparable only under the same definition.
+#: Note that is added to every metric; values are comparable only under the same definition.
 RENDERS = "rounded to 8 bits per channel before comparison; masked pixels do not count"
 
 
@@ -80,19 +80,19 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / FILE
     if not path.is_file():
         raise UserError(
-            f"no {FILE}",
+            f"the folder does not contain {FILE}",
             where=folder,
             expected="the folder of a crossgrad run",
-            todo="name the folder of a run that has ended",
+            todo="name the folder of a finished run",
         )
     try:
-        content, found = read_json(path), "something else than an object"
+        content, found = read_json(path), "a value that is not an object"
     except ValueError as error:
         content, found = None, str(error)
     if isinstance(content, dict):
         return content
     raise UserError(
-        f"unreadable {FILE}",
+        f"{FILE} cannot be read",
         where=path,
         found=found,
         todo="restore the file, or repeat the run: crossgrad run --config config.yaml",
@@ -133,7 +133,7 @@ def _as_data(summary: Summary) -> dict[str, Any]:
 
 def _metrics(result: EvaluationResult | None) -> dict[str, Any]:
     if result is None:
-        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation took place"}}
+        return {"overall": None, "regimes": {}, "null": {"overall": "no evaluation was made"}}
     return {
         "overall": result.overall.as_data(),
         "regimes": {name: means.as_data() for name, means in result.regimes.items()},

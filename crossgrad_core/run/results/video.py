@@ -17,9 +17,9 @@ from crossgrad_core.system.interrupts import HELPERS
 #: The program that writes videos; without it, Pillow writes an animated image.
 ENCODER: Final = "ffmpeg"
 _QUALITY: Final = 85
-#: Most bytes of all frames of an animated image, which are in memory at once.
+#: Maximum number of bytes of all frames of an animated image, which are in memory at the same time.
 _LARGEST: Final = 1 << 29
-#: Most pixels of a side of an animated image.
+#: Maximum side of an animated image in pixels.
 _LONGEST: Final = 16_383
 
 
@@ -99,7 +99,7 @@ def _encode(encoder: str, frames: list[Path], target: Path, fps: float) -> None:
             "the video could not be written",
             where=frames[0].parent,
             found=said.strip()[-300:],
-            todo="the frames are there",
+            todo="the frames are in the folder",
         )
 
 

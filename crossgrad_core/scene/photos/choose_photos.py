@@ -63,13 +63,20 @@ def white_of(deep: Sequence[Path]) -> tuple[int, list[str]]:
     if top > _DARK:
         return FULL_16_BIT, []
     white = next(white for white in WHITES if white >= top)
-    photos = f"photos: {count(len(deep), 'photo')} of 16 bits"
+    photos = f"photos: {count(len(deep), 'photo')} with 16 bits"
     bits = white.bit_length()
     if white > WHITES[0] and top >= _REACHED * white:
-        return white, [f"{photos} hold {bits}-bit values (up to {top}): scaled, {white} is white"]
+        return white, [
+            (
+                f"{photos} contain {bits}-bit values (up to {top}), which are scaled: {white} "
+                "is white"
+            )
+        ]
     return FULL_16_BIT, [
-        f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) and are dark; "
-        f"if they hold {bits}-bit values, save them scaled to 16 bits"
+        (
+            f"{photos} use {100 * top / FULL_16_BIT:.2g} % of their range (up to {top}) "
+            f"and are dark; if they contain {bits}-bit values, save them scaled to 16 bits"
+        )
     ]
 
 
@@ -173,11 +180,11 @@ def _read_full(folder: PhotoFolder, names: Sequence[str]) -> _Found:
     paths = _pair(folder, names)
     if not paths:
         raise UserError(
-            "no posed image has a photo",
+            "no photo was found for any image of the model",
             where=folder.path,
-            expected=f"photos named as in the model, such as {names[0]}",
+            expected=f"photos with the names of the model, such as {names[0]}",
             found=name_some(folder.names) or "no photo",
-            todo="put the photos below the image folder under the names that the model gives them",
+            todo="put the photos below the image folder, with the names that the model uses",
         )
     return _read_found(folder, paths)
 
@@ -205,8 +212,8 @@ def _prefer_reduced(
         if len(paths) < len(full.paths):
             absent = [name for name in full.paths if name not in paths]
             notes.append(
-                f"photos: {folder.path.name}/ is not used, {count(len(absent), 'photo')} of it "
-                f"missing: {name_some(absent)}"
+                f"photos: {folder.path.name}/ is not used, because it lacks "
+                f"{count(len(absent), 'photo')}: {name_some(absent)}"
             )
             continue
         found = _read_found(folder, paths)
@@ -229,9 +236,9 @@ def _fit(calibration: Calibration, header: PhotoHeader, path: Path) -> tuple[int
     if orientation is not None and is_scaled((height, width), posed):
         return height, width, orientation
     raise UserError(
-        "a photo does not have the shape of its camera",
+        "the aspect ratio of a photo differs from the aspect ratio of its camera",
         where=path,
-        expected=f"{calibration.width} x {calibration.height} pixels, or in that proportion",
+        expected=f"{calibration.width} x {calibration.height} pixels, or the same aspect ratio",
         found=f"{width} x {height} pixels",
         todo="use the photos that the poses were estimated from",
     )

@@ -27,7 +27,7 @@ WHITES = (1, _FULL_8_BIT, 1023, 4095, 16383, FULL_16_BIT)
 _MOST_GREY = 0.05
 #: Bytes of a photo that are copied at once, so that they stay in the processor's cache.
 _BAND = 1 << 19
-#: Standard deviations at which SciPy cuts its Gaussians off.
+#: SciPy cuts its Gaussian filter off at this many standard deviations.
 _WIDTHS = 4.0
 
 
@@ -135,11 +135,11 @@ def _decode(path: Path, read: "Callable[[Image], T]", reduction: int = 1) -> T:
             image.draft(None, (image.width // reduction, image.height // reduction))
         if image.width * image.height > pillow.MOST_PIXELS:
             raise UserError(
-                "the photo is too large to be decoded at once",
+                "the photo is too large to be decoded",
                 where=path,
                 expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
                 found=f"{image.width} x {image.height} pixels",
-                todo="it has changed since the scene was read: put the old one back",
+                todo="the photo has changed since the scene was read: restore the old photo",
             )
         return read(image)
 
@@ -163,7 +163,7 @@ def _read_photo(image: "Image") -> tuple[Pixels, Pixels | None]:
         grey = np.rint(_read_grey(image) * (_FULL_8_BIT / FULL_16_BIT)).clip(0, _FULL_8_BIT)
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2), None
     if image.mode == "F":
-        raise ValueError("pixels are floating-point numbers; save it as 8 or 16-bit")
+        raise ValueError("the pixels are floating-point numbers; save the photo with 8 or 16 bits")
     if pillow.has_alpha(image):
         rgba = np.array(image.convert("RGBA"))
         return rgba[..., :3].copy(), rgba[..., 3].copy()

@@ -108,7 +108,7 @@ class FileNames:
         for likeness, files in best.values():
             for file in files:
                 claims[file].append(likeness)
-        # If another name is more similar to a file's path, this name loses the file.
+        # A file is not paired with this name if another name is more similar to its path.
         held = {
             name: (likeness, [file for file in files if likeness == max(claims[file])])
             for name, (likeness, files) in best.items()

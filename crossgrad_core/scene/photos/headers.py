@@ -58,11 +58,11 @@ def read_header(path: Path) -> PhotoHeader:
         whole = _is_whole(file) and _has_all_tiff_data(image, size)
         if not whole or image.width * image.height > _most_pixels(image, file, size):
             raise UserError(
-                "the photo is cut short: the end of the file is missing",
+                "the photo is incomplete: the end of the file is missing",
                 where=path,
                 expected=f"{image.width} x {image.height} pixels",
                 found=f"{size:,} bytes",
-                todo="copy or download it again, or remove it",
+                todo="copy or download the photo again, or remove it",
             )
         return _describe(image)
 

@@ -73,7 +73,8 @@ def find_photo_folders(images: Path) -> list[PhotoFolder]:
             "the scene has no folder of photos",
             where=images,
             found="a file" if images.exists() else f"folders {', '.join(beside) or '(none)'}",
-            todo=f"put the photos into {images.name}/, or name their folder",
+            todo=f"put the photos into {images.name}/, or name their folder "
+            "(COLMAP: --set reader.images=FOLDER)",
         )
     return folders
 
@@ -164,9 +165,10 @@ def find_mask_folder(option: Path | None, root: Path) -> Path | None:
         if folder.is_dir():
             return folder
     raise UserError(
-        "the mask folder is not there",
+        "the mask folder does not exist",
         where=option,
-        todo="name a folder, as it is or within the scene: --set data.masks=FOLDER",
+        todo="give the folder as a path, or as a path below the scene folder: --set "
+        "data.masks=FOLDER",
     )
 
 
@@ -180,7 +182,7 @@ def check_masks(folder: Path, option: Path | None, found: int, names: Sequence[s
     if found or (option is None and not there):
         return
     raise UserError(
-        "no photo has a mask in the mask folder",
+        "the mask folder contains no mask for any photo",
         where=folder,
         expected=f"{' or '.join(dict.fromkeys(mask_names(names[0])))} for the photo {names[0]}",
         found=name_some(there) or "no mask",
@@ -222,7 +224,7 @@ def with_photo_names(raw: RawScene) -> RawScene:
     moved = {name: file for name, file in pairs.files.items() if not same_spelling(name, file)}
     told = (
         (moved, "found by the end of their path", "{0} is {1}"),
-        (pairs.ambiguous, "without a photo of their own, several could be meant", "{0} ({1})"),
+        (pairs.ambiguous, "without a photo: their name matches several photos", "{0} ({1})"),
     )
     notes = [
         f"photos: {count(len(which), 'posed image')} {what}: "
@@ -245,9 +247,9 @@ def _check_absolute(raw: RawScene, ambiguous: Mapping[str, Sequence[str]]) -> No
     names = [name for name in ambiguous if is_absolute(name)]
     if names:
         raise UserError(
-            "an image name fits several photos",
+            "an image name of the model matches several photos",
             where=raw.images,
-            expected="a path below the image folder, or one whose end only one photo has",
+            expected="a path below the image folder, or the end of a path that only one photo has",
             found=f"{names[0]}, which can be {name_some(ambiguous[names[0]])}",
-            todo="rename the image in the model, so that its folders are those of the photo",
+            todo="rename the image in the model, so that its path equals the path of the photo",
         )

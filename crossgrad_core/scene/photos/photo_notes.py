@@ -39,9 +39,9 @@ def note_pairing(
     spare = [name for name in others if kind_of(name) is PHOTO]
     renamed = [name for name, path in paths.items() if path != folder.path / name]
     told = (
-        (absent, "posed image", "left out, the photo is missing"),
-        (spare, "photo", "without a pose left out"),
-        (renamed, "photo", "paired by a name that differs in suffix or case"),
+        (absent, "posed image", "left out, because the photo is missing"),
+        (spare, "photo", "left out (no pose)"),
+        (renamed, "photo", "matched with a photo whose suffix or case differs"),
     )
     return [
         f"photos: {count(len(which), noun)} {what}: {name_some(which)}"
@@ -59,8 +59,10 @@ def note_links(root: Path, sources: Sources) -> list[str]:
         return []
     first = min(outside)
     return [
-        f"photos: {count(len(outside), 'file')} outside the scene's folder, such as {first}, "
-        f"which is {os.path.realpath(first)}"
+        (
+            f"photos: {count(len(outside), 'file')} outside the scene folder, such as "
+            f"{first}, which is {os.path.realpath(first)}"
+        )
     ]
 
 
@@ -84,15 +86,16 @@ def _costs(sources: Sources) -> list[str]:
     if folded:
         models = listed(sorted({model for model, _ in folded}))
         notes.append(
-            f"photos: camera model {models} folds over inside the frame of "
-            f"{count(len(folded), 'photo')}; {_percent([share for _, share in folded])} of the "
-            "undistorted pixels lie beyond the fold and do not count"
+            f"photos: the distortion of camera model {models} is not invertible inside "
+            f"the frame of {count(len(folded), 'photo')}; "
+            f"{_percent([share for _, share in folded])} of the undistorted pixels are "
+            "outside the valid range and are ignored"
         )
     if wide:
         notes.append(
-            f"photos: the lens of {count(len(wide), 'photo')} sees "
-            f"{_degrees([cost.seen for cost in wide])} degrees across; undistortion keeps "
-            f"{_degrees([cost.kept for cost in wide])} of these and loses "
+            f"photos: the lens of {count(len(wide), 'photo')} has a field of view of "
+            f"{_degrees([cost.seen for cost in wide])} degrees; undistortion keeps "
+            f"{_degrees([cost.kept for cost in wide])} degrees and loses "
             f"{_percent([cost.lost for cost in wide])} of the pixels"
         )
     return notes
@@ -122,7 +125,7 @@ def note_sizes(
     notes = [f"photos: {text} from {folder}/, {how}"]
     scaled = sum(calibrated[n] != (s.width, s.height) for n, s in sources.items())
     if scaled:
-        notes.append(f"photos: {scaled} of another size than their camera, which was scaled")
+        notes.append(f"photos: {scaled} with another size than their camera, which was scaled")
     return notes
 
 
@@ -143,15 +146,27 @@ def note_kinds(
 ) -> list[str]:
     """Note the numbers of turned, transparent, grey and masked photos."""
     total = len(sources)
-    over = f"blended over RGB {background}" if background else "alpha < 0.5 does not count"
+    over = f"blended over RGB {background}" if background else "pixels with alpha < 0.5 are ignored"
     told = (
-        (sum(s.orientation != 1 for s in sources.values()), "photos", "turned by EXIF orientation"),
+        (
+            sum(s.orientation != 1 for s in sources.values()),
+            "photos",
+            "rotated as their EXIF orientation says",
+        ),
         (sum(header.alpha for header in headers.values()), "photos", f"with transparency: {over}"),
-        (sum(header.grey for header in headers.values()), "photos", "grey: three equal channels"),
-        (sum(s.mask is not None for s in sources.values()), "masks", "have one: white counts"),
+        (
+            sum(header.grey for header in headers.values()),
+            "photos",
+            "grey: copied into three equal channels",
+        ),
+        (
+            sum(s.mask is not None for s in sources.values()),
+            "masks",
+            "have one: white pixels are used",
+        ),
     )
     bare = [name for name, source in sorted(sources.items()) if source.mask is None]
-    missing = f"{len(bare)} of {total} have none, all of their pixels count: {name_some(bare)}"
+    missing = f"{len(bare)} of {total} have none, and all their pixels are used: {name_some(bare)}"
     return [
         *(f"{topic}: {number} of {total} {what}" for number, topic, what in told if number),
         *([f"masks: {missing}"] if bare and len(bare) < total else []),
@@ -164,9 +179,11 @@ def note_memory(sources: Sources, options: SceneOptions) -> list[str]:
     if need <= options.cache_mib:
         return []
     return [
-        f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are kept; the "
-        "others are decoded again whenever they are drawn (more memory: --set data.cache_mib=N; "
-        "smaller photos: --max-size N)"
+        (
+            f"photos: {need:.0f} MiB when decoded, of which {options.cache_mib} MiB are "
+            "kept in memory; the other photos are decoded again for every use (more "
+            "memory: --set data.cache_mib=N; smaller photos: --max-size N)"
+        )
     ]
 
 
@@ -230,18 +247,22 @@ def _reason(name: str, raw: RawScene, masks: Path | None) -> str | None:
     if kind is None or (kind is PHOTO and path.is_relative_to(raw.images)):
         return None
     if masks is not None and kind in {PHOTO, MASK} and path.is_relative_to(masks):
-        return "masks of no photo that is used"
+        return "masks without a used photo"
     if kind is MASK:
-        return "named like masks; use them with --set data.masks=FOLDER"
+        return "files whose names look like masks; use them with --set data.masks=FOLDER"
     if kind is POINTS:
-        own = "the scene has its own points" if len(raw.points) else "not a name that is looked for"
+        own = (
+            "the scene has its own points"
+            if len(raw.points)
+            else "the reader does not look for this name"
+        )
         return f"{own}; start from such a file with --points FILE"
     return {
-        RAW: "a camera's own format; save the photos as JPEG or PNG to use them",
+        RAW: "raw files of a camera; save the photos as JPEG or PNG to use them",
         DEPTH: "depth and normal maps are not used",
-        COPY: "smaller copies of the photos are read with --max-size only",
+        COPY: "smaller copies of the photos are read only with --max-size",
         PHOTO: f"outside the photo folder {_shown(raw, os.path.relpath(raw.images, raw.root))}",
-    }.get(kind, "not a table that the reader takes")
+    }.get(kind, "the reader does not read this table")
 
 
 def _shown(raw: RawScene, folder: str) -> str:

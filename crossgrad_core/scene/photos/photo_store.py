@@ -30,11 +30,11 @@ _LOG = logging.getLogger(__name__)
 FOLDER: Final = "CROSSGRAD_CACHE"
 #: Raised whenever decoding, undistorting or resizing gives other bits than before.
 PIXELS_VERSION: Final = 2
-#: Bytes of a disk that stay free.
+#: Bytes of a disk that are kept free.
 RESERVE: Final = 2 * 2**30
 _MAGIC, _SUM = b"CGphoto1", 4
 _KEPT, _TEMPORARY = ".photo", ".tmp"
-#: Seconds after which an unfinished file belongs to a killed process.
+#: An unfinished file that is older than this many seconds belongs to a killed process.
 _STALE = 3600.0
 #: Uncertainty of file times in seconds.
 _GRAIN = 2.0
@@ -126,7 +126,7 @@ class PhotoStore:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             size = sum(len(part) for part in content)
             if not self._has_room(size):
-                self._close("its limit is reached or the disk is full")
+                self._close("its limit is reached, or the disk is full")
                 return
             with temporary.open("wb") as file:
                 file.writelines(content)
@@ -146,7 +146,7 @@ class PhotoStore:
     def _close(self, why: str) -> None:
         """Write no more photos in this run: photos are decoded again instead."""
         self._open = False
-        _LOG.info("no more photos are kept in %s: %s", self._folder, why)
+        _LOG.info("further photos are not stored in %s: %s", self._folder, why)
 
     def _has_room(self, size: int) -> bool:
         with self._lock:
@@ -163,7 +163,8 @@ class PhotoStore:
         for last_used, length, path in entries:
             if used + size <= self._limit or last_used >= self._begun:
                 break
-            with suppress(OSError):  # Another process may be faster, or hold it open.
+            # Another process may have replaced the file first, or may hold it open.
+            with suppress(OSError):
                 path.unlink()
                 used -= length
         return used

@@ -28,12 +28,12 @@ from crossgrad_core.scene.photos.decode import (
 from crossgrad_core.scene.photos.photo_store import Decoded, PhotoStore, Storable, made_by
 from crossgrad_core.scene.photos.shapes import is_turned
 
-#: Decode JPEG files at an eighth of their sides to test them: this reads all of their data.
+#: JPEG files are decoded at an eighth of their sides for the test, which reads all of their data.
 SMALLEST = 8
 _OPAQUE, _HALF = 255, 128
 #: Seconds to wait for a photo that another thread is decoding.
 _PATIENCE = 0.5
-# More than the views of one step, so that no photo is decoded twice in one step.
+# Size of the cache: more than the views of one step, so that no photo is decoded twice in one step.
 _LATEST = 16
 #: Photos with fewer pixels are decoded about as quickly as they are read from the disk cache.
 _LARGE = 2_000_000
@@ -92,7 +92,7 @@ class PhotoSource:
         files = [self.path] if self.mask is None else [self.path, self.mask]
         try:
             facts = [os.stat(path) for path in files]
-        except OSError:  # Decoding reports the error later.
+        except OSError:  # The decoder reports the error later.
             return None
         marks = [(f.st_size, f.st_mtime_ns, f.st_ctime_ns, f.st_ino) for f in facts]
         return f"{made_by()} {[str(path.absolute()) for path in files]} {marks} {self}"
@@ -144,7 +144,7 @@ class PhotoSource:
                 where=self.path,
                 expected=f"{self.width} x {self.height} pixels",
                 found=f"{width} x {height} pixels",
-                todo="put the former photo back, or start a new run",
+                todo="restore the old photo, or start a new run",
             )
 
     def _decode_mask(self) -> Pixels | None:

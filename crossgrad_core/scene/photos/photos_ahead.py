@@ -78,7 +78,7 @@ class PhotosAhead:
         cache, size, fitting = photos[0].cache, 0, list[FilePhoto]()
         for photo in photos:
             size += photo.source.decoded_bytes
-            if size <= cache.limit // 2:  # More photos would push these out of the cache.
+            if size <= cache.limit // 2:  # More photos would push them out of the cache.
                 fitting.append(photo)
         cache.expect(photo.source for photo in fitting)
         with self._changed:
@@ -111,7 +111,7 @@ class PhotosAhead:
                 if view is not None:
                     return partial(self._see, view)
                 if self._keep:
-                    self._at_work = False  # All are in memory.
+                    self._at_work = False  # All photos are in memory.
                     self._changed.notify_all()
                 else:
                     self._changed.wait()
@@ -121,7 +121,7 @@ class PhotosAhead:
         try:
             decode(view, keep=self._keep)
         except MemoryError:
-            self._unseen = iter(())  # Training needs the memory more.
+            self._unseen = iter(())  # Training needs the memory more than prefetching.
         except Exception as error:  # Third-party photos may raise anything.
             self._unseen = iter(())
             report, self._report = self._report, _ignore

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-#: More pixels are not decoded at once. This is Pillow's default limit, 0.5 GB of RGB.
+#: Maximum number of pixels that are decoded at once: Pillow's default limit, 0.5 GB of RGB.
 MOST_PIXELS: Final = 178_956_970
 # Formats of cameras and mask tools. Pillow knows more formats, some of which run programs.
 _FORMATS = ("AVIF", "BMP", "GIF", "JPEG", "JPEG2000", "MPO", "PNG", "PPM", "TIFF", "WEBP")
@@ -58,17 +58,18 @@ def opened(path: Path, what: str) -> Iterator["Image"]:
     except (UserError, MemoryError):
         raise
     except UnidentifiedImageError as error:
-        found = "an empty file" if path.stat().st_size == 0 else "no format that Pillow knows"
+        found = "an empty file" if path.stat().st_size == 0 else "an unknown image format"
         raise UserError(
-            "the file is not a photo", where=path, found=found, todo="replace or remove it"
+            "the file is not a photo", where=path, found=found, todo="replace or remove the file"
         ) from error
     except Exception as error:
-        # For damaged files, decoders raise any exception: KeyError, struct.error ...
+        # Catch every exception, because decoders raise any type for damaged files: KeyError,
+        # struct.error ...
         raise UserError(
             what,
             where=path,
             found=str(error) or type(error).__name__,
-            todo="copy or download it again, or remove it",
+            todo="copy or download the file again, or remove it",
         ) from error
 
 
@@ -133,7 +134,7 @@ def rows_of(image: "Image", top: int, end: int) -> bytes:
 
 def _check_pixels(image: "Image", path: Path) -> None:
     if 0 in image.size:
-        raise UserError("the photo has no pixels", where=path, todo="replace or remove it")
+        raise UserError("the photo has no pixels", where=path, todo="replace or remove the photo")
 
 
 def _identified(file: BinaryIO, path: Path) -> "Image":
@@ -166,7 +167,7 @@ def admit(head: bytes, path: Path) -> bool:
         return False
     if not _registered():
         raise UserError(
-            "photos in HEIC need a package that is not installed",
+            "photos in HEIC format need a package that is not installed",
             where=path,
             expected="the package pillow-heif",
             todo="pip install 'crossgrad[heic]', or convert the photos to JPEG",

@@ -41,20 +41,20 @@ def check_mask(path: Path, photo: Size, *, may_turn: bool) -> None:
     header = read_header(path)
     if header.width * header.height > pillow.MOST_PIXELS:
         raise UserError(
-            "the mask is too large to be decoded at once",
+            "the mask is too large to be decoded",
             where=path,
             expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
             found=f"{header.width} x {header.height} pixels",
-            todo="save it smaller: a mask of any size in the proportion of its photo will do",
+            todo="save the mask at a smaller size, with the same aspect ratio as its photo",
         )
     turned = is_turned((header.width, header.height), photo)
     if turned is None or (turned and not may_turn):
         raise UserError(
-            "a mask does not have the shape of its photo",
+            "the aspect ratio of a mask differs from the aspect ratio of its photo",
             where=path,
-            expected=f"{photo[0]} x {photo[1]} pixels, or in that proportion",
+            expected=f"{photo[0]} x {photo[1]} pixels, or the same aspect ratio",
             found=f"{header.width} x {header.height} pixels",
-            todo="make the mask from the photo as it is stored, in its own size",
+            todo="make the mask from the stored photo, at its full size",
         )
 
 
@@ -82,11 +82,14 @@ def too_large(path: Path, header: PhotoHeader) -> UserError:
     way = (
         "--max-size N, such as --max-size 4000, decodes it at a reduced size"
         if header.reducible
-        else "put smaller copies of all photos into <images>_2, _4 or _8 beside the image folder "
-        "and name their size with --max-size N; or save it as a JPEG file that is not progressive"
+        else (
+            "put smaller copies of all photos into <images>_2, _4 or _8 next to the "
+            "image folder and select their size with --max-size N; or save it as a JPEG "
+            "file that is not progressive"
+        )
     )
     return UserError(
-        "the photo is too large to be decoded at once",
+        "the photo is too large to be decoded",
         where=path,
         expected=f"at most {megapixels(pillow.MOST_PIXELS)}",
         found=f"{header.width} x {header.height} pixels, "

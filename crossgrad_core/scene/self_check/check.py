@@ -21,21 +21,22 @@ from crossgrad_core.scene.self_check.evidence import Floats, Integers, Pixels, p
 from crossgrad_core.scene.self_check.verdict import Cause, Verdict, verdict_of
 from crossgrad_core.scene.wording import count, name_some
 
-#: Poses are equal below this difference of their numbers, local units.
+#: Poses are equal if their numbers differ by less than this, in local units.
 _SAME_POSE: Final = 1e-9
 #: Points beyond this many times the median distance from the cameras count as infinitely far.
 _INFINITE: Final = 1e4
-#: Pixels of the small copy for the comparison of photos, in either direction.
+#: Photos are compared as small copies with this many pixels in either direction.
 _SMALL: Final = 16
-#: Mean difference in levels of 255 below which two photos are almost equal.
+#: Two photos are almost equal if their mean difference is below this, in levels of 255.
 _ALMOST: Final = 0.5
 #: A photo is blurred below this share of the median sharpness. It is dark or bright if it differs
 #: from the median brightness by more than this many stops.
 _BLURRED: Final = 0.15
 _STOPS: Final = 4.0
-#: With fewer photos, no median is computed.
+#: No median is computed for fewer photos.
 _FEWEST_PHOTOS: Final = 5
-#: Sharpness is the difference of neighbouring pixels over that of pixels this far apart.
+#: Sharpness is the difference of neighbouring pixels divided by the difference of pixels at this
+#: distance.
 _APART: Final = 6
 
 
@@ -98,7 +99,7 @@ def _equal_poses(poses: Floats, names: Sequence[str]) -> Iterator[str]:
     equal = _repeated(rounded, names)
     if equal:
         photos = count(len(equal), "photo")
-        yield f"check: {photos} with the pose of another one: {name_some(equal)}"
+        yield f"check: {photos} with the same pose as another photo: {name_some(equal)}"
 
 
 def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
@@ -107,7 +108,7 @@ def _far_points(points: Floats, centers: Floats) -> Iterator[str]:
     away = np.linalg.norm(points - np.median(centers, axis=0), axis=1)
     far = int((away > _INFINITE * np.median(away)).sum())
     if far:
-        yield f"check: {count(far, 'point')} practically at infinity"
+        yield f"check: {count(far, 'point')} extremely far away"
 
 
 def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
@@ -117,10 +118,10 @@ def _unusual(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
     if known.any():
         low = known & (sharpness < _BLURRED * np.median(sharpness[known]))
         if low.any():
-            yield f"check: {_listed(low, names)} much less sharp than the others"
+            yield f"check: {_listed(low, names)} much less sharp than the other photos"
     off = np.abs(light - np.median(light)) > _STOPS
     if off.any() and off.mean() < 1.0 / _FEWEST_PHOTOS:
-        yield f"check: {_listed(off, names)} much darker or brighter than the others"
+        yield f"check: {_listed(off, names)} much darker or brighter than the other photos"
 
 
 def _almost_equal(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
@@ -132,7 +133,7 @@ def _almost_equal(sketches: Sketches, names: Sequence[str]) -> Iterator[str]:
     pairs = [(names[order[i]], names[order[i + 1]]) for i in np.flatnonzero(close)]
     if pairs:
         shown = name_some([f"{min(pair)} and {max(pair)}" for pair in sorted(pairs)])
-        yield f"check: photos that are almost equal: {shown}"
+        yield f"check: some photos are almost equal: {shown}"
 
 
 def _listed(which: NDArray[np.bool_], names: Sequence[str]) -> str:
@@ -166,7 +167,7 @@ def checked(scene: Scene, path: Path, *, cache_mib: int, accept: bool = False) -
     """
     begun = perf_counter()
     pixels = pixels_of(scene)
-    _LOG.info("checking points, poses and photos against each other")
+    _LOG.info("checking whether points, poses and photos match")
     looked_at = _looked_at(scene, cache_mib)
     views = [view for view in looked_at if _is_decoded(pixels, view)]
     undecoded = [scene.views[view].name for view in looked_at if view not in {*views}]
@@ -222,26 +223,28 @@ def _figures(verdict: Verdict) -> dict[str, Json]:
 
 def _word(verdict: Verdict) -> str:
     if verdict.all_wrong is not None:
-        return "the scene disagrees"
+        return "points, poses and photos do not match"
     if verdict.some_wrong:
-        return "some photos disagree"
-    return "agrees" if isfinite(verdict.correlation) else "cannot be told"
+        return "some photos do not match"
+    return "agrees" if isfinite(verdict.correlation) else "not enough evidence"
 
 
 def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[str]:
     told = []
     if undecoded:
         told.append(
-            f"check: {count(len(undecoded), 'photo')} left out, because the files cannot be "
+            f"check: {count(len(undecoded), 'photo')} left out, because they cannot be "
             f"decoded: {name_some(undecoded)}"
         )
     if verdict.all_wrong is not None:
-        told.append(f"check: the scene contradicts itself, accepted: {verdict.all_wrong.what}")
+        told.append(
+            f"check: points, poses and photos do not match, accepted: {verdict.all_wrong.what}"
+        )
     for cause in verdict.some_wrong:
         names = [scene.views[view].name for view in cause.views]
         told.append(
-            f"check: {count(len(names), 'photo')} at odds with the points: {name_some(names)}; "
-            f"{cause.what}: {cause.todo}"
+            f"check: {count(len(names), 'photo')} not matching the points: "
+            f"{name_some(names)}; {cause.what}: {cause.todo}"
         )
     return told
 
@@ -249,14 +252,16 @@ def _warnings(scene: Scene, verdict: Verdict, undecoded: Sequence[str]) -> list[
 def _refusal(verdict: Verdict, cause: Cause, path: Path) -> UserError:
     found = []
     if isfinite(verdict.in_frame):
-        found.append(f"{verdict.in_frame:.0%} of the observed points are in frame")
+        found.append(f"{verdict.in_frame:.0%} of the observed points are inside the photos")
     if isfinite(verdict.correlation):
-        found.append(f"colours of points and photos correlate by {verdict.correlation:.2f}")
+        found.append(
+            f"the colours of points and photos have a correlation of {verdict.correlation:.2f}"
+        )
     return UserError(
-        "the scene contradicts itself",
+        "the photos of the scene do not match its poses and points",
         where=path,
-        expected="photos that show the points where their poses put them",
+        expected="photos that show the SfM points at the positions that the poses predict",
         found=f"{cause.what} ({', '.join(found)})" if found else cause.what,
-        todo=f"{cause.todo}; or go on with the scene as it is: --accept-scene, or "
-        "data.accept_scene: true in a file of settings",
+        todo=f"{cause.todo}; or train on the scene unchanged with --accept-scene, or with "
+        "data.accept_scene: true in a settings file",
     )

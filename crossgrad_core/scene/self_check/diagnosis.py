@@ -18,20 +18,20 @@ from crossgrad_core.scene.self_check.evidence import (
 
 #: Cameras that are used in trials.
 MOST_CAMERAS: Final = 12
-#: With fewer points in frame, a camera without tracks counts as seeing nothing.
+#: A camera without tracks counts as seeing nothing if fewer points are in its frame.
 _FEWEST_UNTRACKED: Final = 3 * FEWEST
-#: A later trial must score this much more than an earlier, simpler trial.
+#: A later trial must score higher by this much than an earlier, simpler trial.
 _CLEARLY: Final = 0.03
-#: A probe must score this much more than the unchanged scene.
+#: A probe must score higher by this much than the unchanged scene.
 _PROBED: Final = 0.01
 #: Number of times that the step of a search is halved.
 _ROUNDS: Final = 4
-#: The least score of a consistent scene, and the least gain of a change that repairs a scene.
+#: Minimum score of a consistent scene, and minimum gain of a change that repairs a scene.
 LEAST: Final = 0.35
 GAINED: Final = 0.25
 Change: TypeAlias = Callable[[Rig], Rig]
 _POSES: Final = "convert the poses of the model to OpenCV axes (x right, y down, z forward)"
-_PHOTOS: Final = "put the photos back as they were when the poses were estimated"
+_PHOTOS: Final = "restore the photos that the poses were estimated from"
 _FLIP: Final = np.diag([1.0, -1.0, -1.0])
 _AXES: Final = "xyz"
 #: Step of a factor's logarithm; step and reach of the principal point, in shares of the photo.
@@ -187,18 +187,18 @@ def likely() -> Iterator[Trial]:
     yield from _inverted()
     yield from turns()
     yield Trial(
-        "the principal point is not where the model puts it; the middle of the photos fits",
+        "the principal point in the model is wrong; the centre of the photos fits better",
         "set the principal point (cx, cy) of the cameras to half of their width and height",
         lambda rig: replace(rig, principal=rig.sizes / 2.0),
     )
     yield Trial(
-        "the coordinates of the principal point are exchanged",
-        "exchange cx and cy of the cameras",
+        "the coordinates of the principal point are swapped",
+        "swap cx and cy of the cameras",
         lambda rig: replace(rig, principal=rig.principal[:, ::-1]),
     )
     yield Trial(
-        "the focal lengths fx and fy are exchanged",
-        "exchange fx and fy of the cameras",
+        "the focal lengths fx and fy are swapped",
+        "swap fx and fy of the cameras",
         lambda rig: replace(rig, focal=rig.focal[:, ::-1]),
     )
     yield from _shifted()
@@ -209,7 +209,7 @@ def other_axes() -> Iterator[Trial]:
     for matrix, text in _signed_axes():
         yield Trial(
             f"the points have other axes than the poses: ({text}) of the points fit",
-            "write points and poses in the same axes: export both from one program again",
+            "export points and poses again from the same program, with the same axes",
             _with_points(matrix),
         )
     for matrix, text in _signed_axes():
@@ -268,35 +268,35 @@ def _signed_axes() -> Iterator[tuple[Floats, str]]:
 
 def _inverted() -> Iterator[Trial]:
     """Yield trials for poses that are inverse, completely or in part."""
-    cause = "the poses are camera-to-world where world-to-camera is expected"
+    cause = "the poses are camera-to-world, but world-to-camera is expected"
     todo = "invert the 4 x 4 matrix of each pose in the model"
     for own, text in ((np.eye(3), ""), (_FLIP, ", in OpenGL axes")):
         for world in (np.eye(3), _FLIP):
             yield Trial(f"{cause}{text}", todo, _inverse(own, world))
     yield Trial(
-        "the rotations of the poses are camera-to-world where world-to-camera is expected",
+        "the rotations of the poses are camera-to-world, but world-to-camera is expected",
         "transpose the rotation of each pose in the model",
         lambda rig: replace(rig, rotations=rig.rotations.transpose(0, 2, 1)),
     )
     yield Trial(
-        "the rotations of the poses are inverse, their camera centres are right",
+        "the rotations of the poses are inverted, but their camera centres are correct",
         "transpose the rotation of each pose in the model and keep the camera centre",
         lambda rig: _placed(rig, rig.rotations.transpose(0, 2, 1), rig.centers),
     )
     yield Trial(
-        "the positions of the poses are camera centres where translations are expected",
+        "the positions of the poses are camera centres, but translations are expected",
         "write the translation -R C of each pose instead of its centre C",
         lambda rig: _placed(rig, rig.rotations, rig.translations),
     )
     yield Trial(
-        "the positions of the poses are translations where camera centres are expected",
+        "the positions of the poses are translations, but camera centres are expected",
         "write the centre C = -R^T t of each pose instead of its translation t",
         lambda rig: replace(rig, translations=rig.centers),
     )
     for order, text in (((3, 0, 1, 2), "(x, y, z, w)"), ((1, 2, 3, 0), "(w, x, y, z)")):
         yield Trial(
-            f"the quaternions of the poses are in another order: {text} fits",
-            "write the quaternions of the poses in the order that the format asks for",
+            f"the quaternions of the poses have another component order: {text} fits",
+            "write the quaternions in the component order of the format",
             _reordered(order),
         )
 
@@ -333,11 +333,11 @@ def _reordered(order: tuple[int, ...]) -> Change:
 def _shifted() -> Iterator[Trial]:
     for shift in (1, -1, 2, -2):
         yield Trial(
-            f"the photos are shifted by {abs(shift)} against the poses: each photo fits the pose "
-            f"of the photo {abs(shift)} place{'s' * (abs(shift) > 1)} "
-            f"{'before' if shift > 0 else 'after'} it",
-            "name the photos as the model does: one may be missing, or counting starts at 1 "
-            "instead of 0",
+            f"the photos are shifted by {abs(shift)} relative to the poses: each photo "
+            f"fits the pose of the photo {abs(shift)} place{'s' * (abs(shift) > 1)} "
+            f"{('before' if shift > 0 else 'after')} it",
+            "rename the photos as in the model: one photo may be missing, or the numbers "
+            "may start at 1 instead of 0",
             _next(shift),
         )
 
@@ -348,35 +348,37 @@ def _next(shift: int) -> Change:
 
 def _focal(factor: float) -> Trial:
     return Trial(
-        f"the focal length is wrong: {factor:.3g} times the given one fits",
-        "correct the focal length of the cameras; it is in pixels of the photos that the model "
-        "was made from",
+        f"the focal length is wrong: {factor:.3g} times its value fits",
+        "correct the focal length of the cameras; its unit is pixels of the photos "
+        "from which the model was made",
         lambda rig: replace(rig, focal=rig.focal * factor),
     )
 
 
 def _scaled(factor: float) -> Trial:
     return Trial(
-        f"points and poses have different units: {factor:.3g} times the points fit",
+        f"points and camera positions have different units: {factor:.3g} times the points fit",
         "write points and camera positions in the same units",
-        # This gives the same image as scaled points, and each camera may have its own factor.
+        # Scaling the depth gives the same image as scaling the points, and each camera may have its
+        # own factor.
         lambda rig: replace(rig, translations=rig.translations / factor),
     )
 
 
 def _resized(factor: float) -> Trial:
     return Trial(
-        f"the calibration is of photos of another size: {factor:.3g} times its focal length and "
-        "principal point fit",
-        "correct width, height, focal length and principal point of the cameras together",
+        f"the calibration belongs to photos of another size: {factor:.3g} times its "
+        "focal length and principal point fit",
+        "correct width, height, focal length and principal point of the cameras",
         lambda rig: replace(rig, focal=rig.focal * factor, principal=rig.principal * factor),
     )
 
 
 def _offset(across: float, down: float) -> Trial:
     return Trial(
-        f"the principal point is wrong: {across:+.1%} of the photos' width and {down:+.1%} of "
-        "their height away fits",
-        "correct the principal point of the cameras; if the photos were cropped, move it with them",
+        f"the principal point is wrong: a point moved by {across:+.1%} of the photos' "
+        f"width and {down:+.1%} of their height fits",
+        "correct the principal point of the cameras; if the photos were cropped, "
+        "shift it by the crop",
         lambda rig: replace(rig, principal=rig.principal + rig.sizes * [across, down]),
     )

@@ -17,25 +17,26 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 #: Photos as they are, neither turned nor mirrored.
 UPRIGHT: Final = np.eye(2)
-#: With fewer observations, a correlation is not computed.
+#: A correlation is not computed for fewer observations.
 FEWEST: Final = 8
-#: The same limit if the colours of points come from other photos.
+#: Minimum number of observations if the colours of points come from other photos.
 FEWEST_OF_PHOTOS: Final = 24
-#: The most observed points of a photo that are used.
+#: Maximum number of observed points per photo.
 MOST_OBSERVED: Final = 64
-#: The most points of a camera that trials use.
+#: Maximum number of points per camera in trials.
 MOST_TRIED: Final = 2_000
-#: The least number of points that are tested for each photo without tracks.
+#: Minimum number of tested points for each photo without tracks.
 _TESTED: Final = 1_500
 #: A point is hidden if another point in its cell is nearer by this factor.
 _HIDES: Final = 1.15
-#: Points per cell of the depth test, and the most cells in either direction.
+#: Number of points per cell of the depth test, and maximum number of cells in either direction.
 _IN_A_CELL, _CELLS = 6, 64
-#: Levels of 255: colours with a smaller spread cannot be compared.
+#: Colours with a smaller spread, in levels of 255, cannot be compared.
 FLAT: Final = 4.0
 Booleans: TypeAlias = NDArray[np.bool_]
 Photo: TypeAlias = tuple[NDArray[np.uint8], Booleans | None]
-#: Decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool if only some pixels count.
+#: Function that decodes the photo of a view: [H, W, 3] uint8, and [H, W] bool if some pixels are
+#: masked.
 Pixels: TypeAlias = Callable[[int], Photo]
 
 

@@ -32,12 +32,12 @@ from crossgrad_core.scene.self_check.evidence import (
 
 #: If more than this share of the photos disagrees, the scene as a whole disagrees.
 _MOST_BAD: Final = 0.6
-#: A photo disagrees below this share of the correlation of the better photos.
+#: A photo disagrees if its correlation is below this share of the correlation of the better photos.
 _BAD: Final = 0.33
 #: A pose is wrong if less than this share of its observed points is in frame.
 _IN_FRAME: Final = 0.5
-#: Below this share of the correlation of the better photos, a photo is tested as a suspect.
-#: A change or another photo fits a pose if its score is higher by this difference.
+#: A photo is tested as a suspect if its correlation is below this share of that of the better
+#: photos. A change or another photo fits a pose if its score is higher by this difference.
 _SUSPECT: Final = 0.65
 _FITS_BETTER: Final = 0.25
 #: Photos used for comparison if most photos disagree, and suspects that are tested.
@@ -45,19 +45,20 @@ _MOST_COMPARED: Final = 64
 _MOST_SUSPECTS: Final = 32
 #: A photo fits if it reaches this share of the correlation of the better photos.
 _FITS: Final = 0.7
-#: Up to this many photos are only tested mirrored and rotated: some other change fits by chance.
+#: Up to this number of photos, only mirrored and rotated copies are tested, because some other
+#: change would fit by chance.
 _FEW: Final = 2
-#: Points in frame that a photo needs if it is compared with others or has no tracks.
+#: Minimum number of points in frame of a photo that is compared with others or has no tracks.
 _FEWEST_TESTED: Final = 3 * FEWEST
 #: A photo without tracks disagrees if its correlation is this many standard errors below the bound.
 _ERRORS: Final = 3.0
-#: Points that are tested in all photos of a scene without tracks.
+#: Number of points that are tested in all photos of a scene without tracks.
 _MOST_TESTED: Final = 300_000
 #: The better photos are the upper quartile.
 _BETTER: Final = 0.75
 #: Photos with a lower score are also tested with the likely changes of all cameras.
 _SURE: Final = 0.75
-#: The least gain of a small change of all cameras that counts as the cause.
+#: Minimum gain of a small change of all cameras that counts as the cause.
 _GAIN_OF_ALL: Final = 0.08
 
 
@@ -102,12 +103,12 @@ _EXCHANGED: Final = (
     "give each photo the name that its pose has in the model",
 )
 _STRANGE: Final = (
-    "their poses are wrong, or they show something else than the points",
+    "their poses are wrong, or they do not show the points",
     "remove them from the model, or estimate their poses again",
 )
 _UNRELATED: Final = (
-    "poses, points and photos do not belong together, and no change that was tried repairs it",
-    "check that the model and the photos are of one reconstruction",
+    ("poses, points and photos do not match, and none of the tested corrections repairs them"),
+    "check that the model and the photos belong to the same reconstruction",
 )
 _UNKNOWN: Final = Verdict(0, np.nan, np.nan)
 
@@ -124,9 +125,13 @@ def verdict_of(scene: Scene, views: Sequence[int], pixels: Pixels) -> Verdict:
         UserError: A photo cannot be decoded.
     """
     if len(scene.points) < FEWEST:
-        return replace(_UNKNOWN, notes=("there are no points to compare the photos with",))
+        return replace(
+            _UNKNOWN, notes=("the scene has no points that could be compared with the photos",)
+        )
     if not views:
-        return replace(_UNKNOWN, notes=("there are no photos to compare the points with",))
+        return replace(
+            _UNKNOWN, notes=("the scene has no photos that could be compared with the points",)
+        )
     has_tracks = np.array([len(scene.views[view].seen) >= FEWEST for view in views])
     rows = np.asarray(views, dtype=np.int64)
     # If some photos have tracks, photos without tracks are skipped: hidden points would mislead.
@@ -208,14 +213,19 @@ class _Group:
             int(self.told.sum()),
             float(np.median(correlation[known])) if known.any() else np.nan,
             float(np.nanmedian(self.agreement.share)) if self.evidence.tracked else np.nan,
-            notes=("the colours of the points say nothing; photos are compared with each other",)
+            notes=(
+                (
+                    "the colours of the points contain no information; photos are compared with "
+                    "each other"
+                ),
+            )
             if self.recolored
             else (),
         )
         if not self.told.any():
             if self.evidence.colored and not self.recolored:
                 return self._as_a_whole(verdict)
-            return replace(verdict, notes=("colours of points and photos cannot be compared",))
+            return replace(verdict, notes=("the colours of points and photos cannot be compared",))
         bad = self.bad
         if self.better < LEAST or bad[self.told].mean() > _MOST_BAD or self._mean < LEAST:
             return self._as_a_whole(verdict)
@@ -270,7 +280,7 @@ class _Group:
             if other.better >= LEAST or not np.isfinite(other.agreement.correlation).any():
                 return other.verdict()
             return replace(verdict, all_wrong=unrelated)
-        note = "colours of points and photos are unlike, so that nothing can be said"
+        note = "the colours of points and photos differ too much for a decision"
         return replace(verdict, notes=(*verdict.notes, note))
 
     def suspects(self) -> tuple[Cause, ...]:
@@ -286,7 +296,7 @@ class _Group:
         if not len(rows):
             return ()
         causes = []
-        # If a photo belongs to another pose, its own pose has a wrong photo.
+        # If a photo belongs to another pose, its own pose has the wrong photo.
         exchanged = self._fitting_others(rows, rows)
         if len(exchanged):
             causes.append(Cause(self._named(exchanged), *_EXCHANGED))
@@ -345,7 +355,7 @@ class _Group:
             evidence = self.evidence.chosen(np.full(len(others), row))
             agreement = evidence.agreement(replace(evidence.rig, photos=others))
             fit = scores(agreement, tracked=self.evidence.tracked)
-            # One of many photos may fit a few points by chance.
+            # With many candidate photos, one may fit a few points by chance.
             fit[(others == self.views[row]) | (agreement.inside < _FEWEST_TESTED)] = 0.0
             if self._fits(fit.max(keepdims=True), np.array([row]))[0]:
                 fitting.append(row)

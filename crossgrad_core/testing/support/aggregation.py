@@ -94,7 +94,7 @@ def aggregated(
 def _answer(operator: Operator, context: AggregateContext) -> AggregateResult:
     answer: object = operator.crossgrad_aggregate_gradients(context)
     if not isinstance(answer, AggregateResult):
-        require(False, f"the operator answers {answer!r} at the hook, not Aggregated")
+        require(False, f"the operator returns {answer!r} in the hook, not an AggregateResult")
         raise TypeError
     return answer
 
@@ -108,7 +108,7 @@ def every_tensor_is_answered(make: Make[Operator]) -> None:
     for views in admitted(operator.views):
         answer = aggregated(operator, sample_gradients(views))
         names = set(answer.gradients)
-        require(names == set(_SHAPES), f"K = {views}: gradients of {sorted(names)} were answered")
+        require(names == set(_SHAPES), f"K = {views}: gradients of {sorted(names)} were returned")
         for name, shape in _SHAPES.items():
             _require_gradient(f"K = {views}: the gradient of {name}", answer.gradients[name], shape)
         good = all(type(count) is int and count >= 0 for count in answer.counts.values())
@@ -141,15 +141,15 @@ def absent_views_have_no_weight(make: Make[Operator]) -> None:
         what = f"K = {views}: the gradient of means"
         if views > 1:
             _require_gradient(f"{what}, one view not finite,", broken, _SHAPES["means"])
-            _require_same(f"{what} where one view is zero, or does not see it,", zero, unseen)
-            _require_same(f"{what} where one view is zero, or not finite,", zero, broken)
+            _require_same(f"{what} if one view is zero, or does not see it,", zero, unseen)
+            _require_same(f"{what} if one view is zero, or not finite,", zero, broken)
         else:
-            require(broken is None, f"{what} is not None where no view has a finite one")
+            require(broken is None, f"{what} is not None, although no view has a finite gradient")
 
 
 def _require_same(what: str, one: Tensor | None, other: Tensor | None) -> None:
     same = one is not None and other is not None and torch.equal(one, other)
-    require(same, f"{what} is not the same")
+    require(same, f"{what} differs")
 
 
 def gradients_stay_untouched(make: Make[Operator]) -> None:
@@ -174,9 +174,11 @@ def same_seed_same_aggregation(make: Make[Operator]) -> None:
         for name, gradient in one.gradients.items():
             again = other.gradients[name]
             same = gradient is not None and again is not None and torch.equal(gradient, again)
-            require(same, f"K = {views}: two calls with one seed differ in {name}")
+            require(same, f"K = {views}: two calls with the same seed differ in {name}")
         for name, state in one.states.items():
-            require(same_state(revived(state), other.states[name]), f"K = {views}: states differ")
+            require(
+                same_state(revived(state), other.states[name]), f"K = {views}: the states differ"
+            )
 
 
 def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
@@ -187,7 +189,9 @@ def equal_gradients_have_a_scale(make: Make[Operator]) -> None:
     for views in admitted(make().views):
         context = aggregate_context(sample_gradients(views))
         one, other = (OperatorScale(make()).of(context).per_step for _ in range(2))
-        require(one == other, f"K = {views}: equal gradients get other weights each time")
+        require(
+            one == other, f"K = {views}: equal gradients receive different weights in two calls"
+        )
 
 
 def states_stay_bounded(make: Make[Operator]) -> None:

@@ -17,7 +17,7 @@ def options_are_frozen(make: Make[Component]) -> None:
         hash(component)
     except TypeError as error:
         raise ContractError(
-            f"the component has no hash ({error}): use tuples and frozen values as options"
+            f"the component cannot be hashed ({error}): use tuples and frozen values as options"
         ) from error
 
 
@@ -29,7 +29,7 @@ def unknown_options_are_refused(make: Make[Component]) -> None:
         type(component).model_validate(surprise)
     except ValidationError:
         return
-    raise ContractError("an unknown option is accepted: keep `extra='forbid'`")
+    raise ContractError("the component accepts an unknown option: keep `extra='forbid'`")
 
 
 def options_survive_the_configuration_file(make: Make[Component]) -> None:
@@ -38,7 +38,9 @@ def options_survive_the_configuration_file(make: Make[Component]) -> None:
     try:
         again = type(component).model_validate(component.model_dump(mode="json"))
     except ValidationError as error:
-        raise ContractError(f"options are refused when read back: {in_one_line(error)}") from error
+        raise ContractError(
+            f"options that were written cannot be read back: {in_one_line(error)}"
+        ) from error
     require(again == component, f"the options {component!r} are read back as {again!r}")
 
 
@@ -54,7 +56,9 @@ def options_are_described(make: Make[Component]) -> None:
 def options_can_be_set(make: Make[Component]) -> None:
     """No option is called `name`, because this key chooses the component."""
     clear = "name" not in type(make()).model_fields
-    require(clear, "the option `name` cannot be set, as that key chooses the component: rename it")
+    require(
+        clear, "the option `name` cannot be set, because this key chooses the component: rename it"
+    )
 
 
 def hooks_exist(make: Make[Component]) -> None:

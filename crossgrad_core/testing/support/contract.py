@@ -26,12 +26,13 @@ from crossgrad_core.training.state import unsavable
 
 C = TypeVar("C", bound=Component)
 
-#: Returns a fresh component with default options.
+#: Function that returns a fresh component with default options.
 Make = Callable[[], C]
-#: Raises `ContractError` if a component breaks the contract, `SkipTest` if it cannot be decided.
+#: Function that raises `ContractError` if a component breaks the contract, or `SkipTest` if this
+#: cannot be decided.
 Check = Callable[[Make[C]], None]
 
-#: Numbers of views per step that checks try if the component admits them.
+#: Numbers of views per step that the checks try if the component supports them.
 VIEW_COUNTS = range(1, 7)
 
 
@@ -57,7 +58,9 @@ def admitted(views: ViewCounts) -> tuple[int, ...]:
         ContractError: No number from `VIEW_COUNTS` is admitted.
     """
     found = tuple(count for count in VIEW_COUNTS if views.admits(count))
-    require(found, f"no number of views from 1 to {max(VIEW_COUNTS)} is admitted: {views}")
+    require(
+        found, f"the component supports no number of views from 1 to {max(VIEW_COUNTS)}: {views}"
+    )
     return found
 
 
@@ -71,8 +74,9 @@ def revived(state: PluginState) -> PluginState:
         values = json.loads(json.dumps(dict(state.values), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ContractError(
-            f"the state's values do not survive JSON ({error}): keep plain numbers, strings, "
-            "lists and dictionaries with string keys there, and tensors in `tensors`"
+            f"the state cannot be stored as JSON ({error}): keep plain numbers, strings, "
+            "lists and dictionaries with string keys in `values`, and tensors in "
+            "`tensors`"
         ) from error
     wrong = unsavable(state, "cpu")
     require(not wrong, f"a checkpoint cannot hold the state: {wrong}")

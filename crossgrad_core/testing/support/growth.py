@@ -17,9 +17,10 @@ from torch import Tensor
 from crossgrad_core.contract.blocks import PluginState
 from crossgrad_core.testing.support.contract import require
 
-#: Steps of the first measurement, which is enough for a state that does not grow.
+#: Number of steps before the first measurement; a state that does not grow is complete by then.
 _FEW = 16
-#: Length of each of the three further windows: states with a shorter history stop growing there.
+#: Length of each of the three further windows; states with a shorter history have stopped growing
+#: by then.
 _WINDOW = 1000
 
 
@@ -53,9 +54,10 @@ def require_bounded(sizes: Iterable[int], method: str) -> None:
     later = [_largest(steps, _WINDOW) for _ in range(3)]
     require(
         not later[0] < later[1] < later[2],
-        f"the state that {method} returns grows for ever: it holds {later[0]:,} numbers after "
-        f"{_FEW + _WINDOW:,} steps and {later[2]:,} after {_FEW + 3 * _WINDOW:,}; expected a size "
-        "that does not depend on the number of steps: keep sums, or a window of the last steps",
+        f"the state that {method} returns grows without limit: it contains "
+        f"{later[0]:,} numbers after {_FEW + _WINDOW:,} steps and {later[2]:,} after "
+        f"{_FEW + 3 * _WINDOW:,}; expected a size that does not depend on the number "
+        "of steps: keep sums, or a window of the last steps",
     )
 
 

@@ -25,7 +25,7 @@ from crossgrad_core.testing.support.contract import Check, ContractError, Make, 
 _PIXEL = 0.02
 #: Largest mean difference of pixels, and relative difference of gradients, from the reference.
 _MEAN, _GRADIENT = 2e-4, 2e-2
-#: Largest ratio of a rasterizer's rounding error to the reference's rounding error in float32.
+#: Maximum ratio of a rasterizer's rounding error to the reference's rounding error in float32.
 _ROUNDINGS = 8.0
 #: Colour of the background, with three different channels.
 _BACKGROUND = (0.1, 0.5, 0.9)
@@ -130,7 +130,7 @@ def _options() -> Iterator[_Case]:
     yield _Case("option max_alpha = 0.5", opaque, options={"max_alpha": 0.5})
     yield _Case("option dilation = 2", some, options={"dilation": 2.0})
     depths = _depths(some, camera).sort().values
-    # The value is in the widest gap, so that rounding moves no centre to the other side.
+    # Put the value into the widest gap, so that rounding moves no centre to the other side.
     inner = slice(len(depths) // 4, 3 * len(depths) // 4)
     gaps = depths.diff()[inner]
     widest = int(gaps.argmax()) + len(depths) // 4
@@ -209,7 +209,7 @@ def _require_pixels(
 ) -> None:
     require(name in drawn, f"{case}: render gives no {name}")
     error, lost = (drawn[name] - expected).abs(), (rounded - expected).abs()
-    # The depth error of a Gaussian at the edge is proportional to its distance.
+    # The depth error of a Gaussian at its edge is proportional to its distance.
     size = max(1.0, float(expected.abs().max()))
     most = _PIXEL * size + _ROUNDINGS * float(lost.max())
     mean = _MEAN * size + _ROUNDINGS * float(lost.mean())
@@ -265,11 +265,11 @@ def its_options_are_heeded(make: Make[Rasterizer]) -> None:
         try:
             changed = type(rasterizer).model_validate({**rasterizer.model_dump(), **case.options})
         except ValidationError:
-            continue  # It supports one value only and reports this.
+            continue  # The rasterizer supports one value only and reports this.
         tried += 1
         _require_same(changed, case)
     if not tried:
-        raise cannot_tell("it has one value of max_alpha, near and dilation and no other")
+        raise cannot_tell("the rasterizer supports only one value of max_alpha, near and dilation")
 
 
 def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
@@ -287,7 +287,7 @@ def views_drawn_together_are_the_same(make: Make[Rasterizer]) -> None:
             for view, behind in zip(views, backgrounds, strict=True)
         ]
     if len(together) != len(alone):
-        raise ContractError(f"render_views gives {len(together)} renders of {len(alone)} views")
+        raise ContractError(f"render_views returned {len(together)} renders for {len(alone)} views")
     for number, (one, other) in enumerate(zip(together, alone, strict=True), 1):
         error = float((one.image - other.image).abs().max())
         require(

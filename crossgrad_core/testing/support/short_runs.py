@@ -55,7 +55,8 @@ def reasons_to_refuse(config: RunConfig) -> tuple[str, ...]:
     """
     config, *_ = with_decisions(config, sample_scene())
     selection, _ = select(config, sample_scene(), "none")
-    # The manager would collect the same answers; registration with it would take most of the time.
+    # Do not register the observer with the manager, because registration would take most of the
+    # time.
     observers = [build(Observer, choice.name, choice.options) for choice in config.observers]
     plugins = (*selection.plugins.values(), *observers)
     asked = (getattr(each, "crossgrad_validate_selection", None) for each in plugins)
@@ -106,11 +107,16 @@ def require_repeated(run: ShortRun, again: ShortRun) -> None:
             same = found[0] == found[1]
             require(
                 same,
-                f"step {step}: two runs with one seed have the {what} {listed(map(str, found))}",
+                f"step {step}: two runs with the same seed have the {what} "
+                f"{listed(map(str, found))}",
             )
-    require(run.after.keys() == again.after.keys(), "two runs with one seed have other tensors")
+    require(
+        run.after.keys() == again.after.keys(), "two runs with the same seed have other tensors"
+    )
     for name, tensor in run.after.items():
-        require(torch.equal(tensor, again.after[name]), f"two runs with one seed differ in {name}")
+        require(
+            torch.equal(tensor, again.after[name]), f"two runs with the same seed differ in {name}"
+        )
 
 
 def try_out(config: RunConfig, steps: int) -> None:

@@ -17,7 +17,7 @@ from crossgrad_core.training.adam.coefficients import (
     Coefficients,
 )
 
-#: A tensor, its gradient, its moments and its step.
+#: A tensor with its gradient, its moments and its step.
 Update: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor, Coefficients]
 
 
@@ -56,7 +56,7 @@ def adam_step(  # noqa: PLR0913 - the step of an optimizer without an object tha
     """
     _check(params, grads, rule.betas)
     given = {name: grad for name in params if (grad := grads.get(name)) is not None}
-    # Looked up before the first step is counted.
+    # Look it up before the first step is counted.
     numbers = {name: (lrs[name], 1.0 if scales is None else scales[name]) for name in given}
     updates = []
     for name, grad in given.items():
@@ -111,14 +111,15 @@ def update_tensors(updates: Iterable[Update]) -> None:
 def _update_fused(updates: Sequence[Update]) -> None:
     from crossgrad_core.training.adam.numba_kernels.fused import update_at
 
-    # Keep references until the step is done, because copies would be freed before.
+    # Keep references until the step is done; otherwise the copies would be freed too early.
     laid_out = [(p, g.contiguous(), m, v) for p, g, m, v, _ in updates]
     addresses = [[tensor.data_ptr() for tensor in four] for four in laid_out]
     sizes = [param.numel() for param, *_ in laid_out]
     update_at(addresses, sizes, [step for *_, step in updates])
-    # NumPy wrote without autograd, so graphs that hold the old values must be invalidated.
+    # NumPy wrote without autograd, so invalidate graphs that use the old values.
     for param, _, exp_avg, exp_avg_sq, _ in updates:
-        for tensor in (param, exp_avg, exp_avg_sq):  # Older versions of torch take one at a time.
+        # Older versions of torch accept only one tensor at a time.
+        for tensor in (param, exp_avg, exp_avg_sq):
             torch.autograd.graph.increment_version(tensor)
 
 
@@ -194,5 +195,5 @@ def _check(
         if grad is not None and (grad.shape != param.shape or grad.dtype != param.dtype):
             found = f"{list(grad.shape)} {grad.dtype} for {list(param.shape)} {param.dtype}"
             raise ValueError(
-                f"gradient of `{name}` must have the shape and type of the tensor; {found}"
+                f"the gradient of `{name}` must have the shape and type of the tensor; {found}"
             )

@@ -45,7 +45,7 @@ def step_along_axes(positions: Tensor, steps: Tensor, scales: Tensor, quats: Ten
         from crossgrad_core.training.adam.numba_kernels.axes import move_rows
 
         move_rows(*(each.detach().numpy() for each in arrays))
-        # NumPy wrote without autograd, so graphs that hold the old values must be invalidated.
+        # NumPy wrote without autograd, so invalidate graphs that use the old values.
         torch.autograd.graph.increment_version(positions)
     else:
         positions.add_(stretched(steps, factors, quats))

@@ -93,7 +93,7 @@ class Late:
         """
         for each in [name] if name is not None else list(self._under_way):
             if (begun := self._under_way.get(each)) is not None:
-                # A failed step is kept, so that it raises its error again.
+                # Keep the failed step, so that it raises its error again.
                 begun.end()
                 del self._under_way[each]
 
@@ -164,7 +164,7 @@ class Late:
             from crossgrad_core.numerics.jobs import Begun
             from crossgrad_core.training.adam.numba_kernels.late import catch_up
 
-            # Always the same type, because another type would compile the kernel again.
+            # Always use the same type, because another type would compile the kernel again.
             which = np.empty(0, np.int32) if rows is None else rows.numpy()
             flat, width = _flat(name, param, adam), _width(param)
             steps, before = behind.table, behind.before

@@ -24,7 +24,7 @@ class Borrowed(Rasterizer):
     )
     responses: ClassVar[frozenset[Response]] = frozenset({"plain", "antialiased", "analytic"})
 
-    by: str = Field("torch", description="name of the rasterizer that draws")
+    by: str = Field("torch", description="name of the rasterizer that renders the image")
 
     @override
     def render(

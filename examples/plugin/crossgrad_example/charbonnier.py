@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Field, Loss, unit_range
 class Charbonnier(Loss):
     """Mean of sqrt(d^2 + e^2) - e over the pixels that count, with the difference d."""
 
-    epsilon: float = Field(0.01, gt=0, description="e: below it the loss is quadratic")
+    epsilon: float = Field(0.01, gt=0, description="error below which the loss is quadratic")
 
     @override
     def loss(

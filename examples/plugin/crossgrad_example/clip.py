@@ -15,14 +15,14 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Name of the state, which is kept from step to step and in checkpoints.
+#: Name of the state, which is kept between steps and in checkpoints.
 STATE = "clip"
 
 
 class Clip(Observer):
     """A wrapper that shortens a block's aggregated gradient to `max_norm` if it is longer."""
 
-    max_norm: float = Field(1.0, gt=0.0, description="largest length of a block's gradient")
+    max_norm: float = Field(1.0, gt=0.0, description="maximum length of a block's gradient")
 
     @hookimpl(wrapper=True)
     def crossgrad_aggregate_gradients(

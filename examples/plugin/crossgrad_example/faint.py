@@ -14,7 +14,9 @@ class Faint(Densifier):
     tensors: ClassVar[frozenset[str]] = frozenset({"opacities"})
     resets: ClassVar[bool] = False
 
-    threshold: float = Field(0.005, gt=0.0, lt=1.0, description="opacities below it are removed")
+    threshold: float = Field(
+        0.005, gt=0.0, lt=1.0, description="Gaussians with lower opacities are removed"
+    )
 
     @override
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:

@@ -9,7 +9,7 @@ from crossgrad_core.plugin import Field, Initializer, MorePoints, Scene
 class Sky(Initializer):
     """Blue points on the upper half of a sphere around the cameras; z is up."""
 
-    radius: float = Field(10.0, gt=0.0, description="of the dome, scene extents")
+    radius: float = Field(10.0, gt=0.0, description="radius of the dome, scene extents")
     count: int = Field(200, ge=1, description="points")
 
     @override

@@ -22,4 +22,4 @@ class Xyz(Exporter):
         part = path.with_name(f".{path.name}.part")
         part.write_text("".join(f"{x} {y} {z}\n" for x, y, z in centres), encoding="utf-8")
         part.replace(path)
-        return (f"{path.name}: the centres of the Gaussians alone",)
+        return (f"{path.name}: contains only the centres of the Gaussians",)

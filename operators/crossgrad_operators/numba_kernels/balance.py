@@ -41,15 +41,16 @@ from crossgrad_operators.numba_kernels.normal import (
     Indices,
 )
 
-#: Greatest number of Newton steps of Nash-MTL. About ten are usual.
+#: Maximum number of Newton steps of Nash-MTL. About ten are usual.
 STEPS = 200
-#: Newton decrement at which the steps end.
+#: The iteration ends at this Newton decrement.
 DECREMENT = 1e-13
-#: Newton decrement below which whole steps converge quadratically.
+#: Below this Newton decrement, whole steps converge quadratically.
 CLOSE = 0.25
-#: A beta above this means that the bargain diverges: 7e5 sqrt(K) is already zero by `CANCELLED`.
+#: If beta is above this, the bargaining problem diverges: 7e5 sqrt(K) is already zero by
+#: `CANCELLED`.
 ENDLESS = 3e7
-#: Greatest number of final Newton steps with 32 digits. Two are enough up to a kappa of 1e5.
+#: Maximum number of final Newton steps with 32 digits. Two are enough up to a kappa of 1e5.
 POLISHING = 20
 
 
@@ -196,7 +197,7 @@ def _same_shares(
         sizes += abs(v[i, 0])
         largest = max(largest, abs(v[i, 0]))
         put(x, i, product(at(v, i), at(scaled, i), exact))
-    # The sum of the v, or of v times gradients, may be only rounding noise.
+    # The sum of the v, or of v times gradients, may consist only of rounding noise.
     if total[0] * total[0] > CANCELLED * largest * largest and not cancels(x, cosines, exact):
         for i in range(n):
             weights[places[i]] = quotient(at(v, i), total, exact)[0]

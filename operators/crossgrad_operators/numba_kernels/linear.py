@@ -23,7 +23,7 @@ from crossgrad_operators.numba_kernels.normal import Floats, Indices
 #: matrix. The null vector, which callers look for, then dominates the solution.
 PIVOT = 1e-15
 
-#: Greatest number of Jacobi sweeps. Six are enough for 16 rows, and eight with 32 digits.
+#: Maximum number of Jacobi sweeps. Six are enough for 16 rows, and eight with 32 digits.
 SWEEPS = 30
 #: With 32 digits, off-diagonal elements up to this share of the diagonal ones count as zero.
 NEGLIGIBLE = 1e-31

@@ -16,5 +16,5 @@ CANCELLED = 2.0 * OPPOSITE
 #: Two directions with |cos| up to this value are unrelated: cancelling sums have such an error.
 UNRELATED = 1e-14
 EPSILON = 2.220446049250313e-16
-#: Generous error bound of float64 algorithms on K rows, in units of K eps.
+#: Error bound of float64 algorithms on K rows, in units of K eps, with a safety margin.
 CAUTION = 4.0

@@ -37,11 +37,12 @@ from crossgrad_operators.numba_kernels.digits import (
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
-#: Greatest number of proximal steps, each from the last result.
+#: Maximum number of proximal steps, each from the previous result.
 ROUNDS = 3
-#: Pivot (square of a sine) up to which 16 digits may be inaccurate.
+#: If a pivot (square of a sine) is at most this, 16 digits may be inaccurate.
 ILL_CONDITIONED = 1e-6
-#: Greatest number of changes of the active set, per view and round. A sixth of it has been seen.
+#: Maximum number of changes of the active set, per view and round. Observed runs needed at most a
+#: sixth of it.
 CHANGES = 12
 
 

@@ -53,9 +53,9 @@ from crossgrad_operators.numba_kernels.polyhedron import (
     substitute,
 )
 
-#: Greatest number of levels that are tried. About five are usual.
+#: Maximum number of levels that are tried. About five are usual.
 LEVELS = 60
-#: The level is accepted if the active constraints stay the same, and if its change is at most this
+#: The level is accepted if the active constraints do not change, and if its change is at most this
 #: share or reverses. The next rounds correct the remaining error.
 CLOSE = 1e-6
 #: Directions may cancel if the ridge adds more than this share of rho^2 to the distance.
@@ -175,7 +175,7 @@ def _change(problem: Polyhedron, count: int, search: Search, level: Pair, ridge:
     for i in range(count):
         k = problem.chosen[i]
         y, a, r = at(problem.y, k), at(slope, k), at(search.r, k)
-        # On the active face C y + q - level r + ridge (y - centre) = 0, which gives C y and C a.
+        # On the active face, C y + q - level r + ridge (y - centre) = 0, which gives C y and C a.
         pull = minus((ridge * y[0], ridge * y[1]), (ridge * problem.centre[k, 0], 0.0), exact)
         force = minus(product(level, r, exact), plus(at(search.q, k), pull, exact), exact)
         turn = minus(r, (ridge * a[0], ridge * a[1]), exact)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from crossgrad_operators.stress.runner import Cell
     from crossgrad_operators.stress.search.worst_cases import WorstCases
 
-#: Elements of the largest gradients.
+#: Default number of elements of the largest gradients.
 LARGE = 10_000_000
 #: Option -> the kinds of run that use it. "" means the fixed cases.
 _USED: Final[Mapping[str, tuple[str, ...]]] = {
@@ -65,25 +65,25 @@ class Options:
     operators: list[str] | None = argument(
         "OPERATOR...", "Names of operators. Default: all installed.", default=None
     )
-    case: str | None = option(None, "Only cases whose name contains this text.", "TEXT")
+    case: str | None = option(None, "Run only cases whose name contains this text.", "TEXT")
     elements: int | None = option(
-        None, f"Elements of the largest gradients. Default: {LARGE:,}.", "N", min=1000
+        None, f"Number of elements of the largest gradients. Default: {LARGE:,}.", "N", min=1000
     )
-    csv: Path | None = option(None, "Also write the table to a CSV file.", "FILE")
+    csv: Path | None = option(None, "Also write the table to this CSV file.", "FILE")
     search: float | None = option(
         None,
-        "Instead of the fixed cases: look at random for the worst gradients, that long.",
+        "Instead of the fixed cases: search at random for the worst gradients, for this time.",
         "SECONDS",
     )
     matrices: int | None = option(
         None,
-        "Instead of the fixed cases: whether results are finite on N short random ones.",
+        "Instead of the fixed cases: check whether results are finite for N short random matrices.",
         "N",
         min=1,
     )
     rows: str | None = option(
         None,
-        "Instead of the fixed cases: this one, a row per view, as a search prints it.",
+        "Instead of the fixed cases: run this case, one row per view, as a search prints it.",
         "[[...],...]",
     )
     precision: Precision | None = option(
@@ -96,10 +96,10 @@ class Options:
 
 @command_of(Options)
 def stress(given: Options) -> None:
-    """Hold operators against exact arithmetic on extreme gradients.
+    """Test the accuracy of operators on extreme gradients.
 
-    Results are compared with 50-digit arithmetic. The exit status is 1 if an operator breaks its
-    promise.
+    Results are compared with 50-digit arithmetic. The exit status is 1 if an operator is less
+    accurate than docs/operators.md guarantees.
     """
     announce()
     _refuse_idle(given)
@@ -135,14 +135,14 @@ def _refuse_idle(given: Options) -> None:
     chosen = [name for name, value in modes.items() if value is not None]
     if len(chosen) > 1:
         raise UserError(
-            f"{' and '.join(chosen)} do not go together",
-            todo="leave all but one of them out; each is a run of its own",
+            f"{' and '.join(chosen)} cannot be combined",
+            todo="use only one of them; each option starts a different kind of run",
         )
     mode = chosen[0] if chosen else ""
     idle = [name for name, value in others.items() if value is not None and mode not in _USED[name]]
     if idle:
         raise UserError(
-            f"{' and '.join(idle)} does nothing with {mode or 'the fixed cases'}",
+            f"{' and '.join(idle)} has no effect with {mode or 'the fixed cases'}",
             todo="leave it out",
         )
 
@@ -154,10 +154,10 @@ def _cases(names: Sequence[str], case: str | None, elements: int, csv: Path | No
     chosen = [each for each in cases(large=elements) if (case or "") in each.name]
     if not chosen:
         raise UserError(
-            "no case has this in its name",
+            "no case name contains this text",
             where=f"--case {case}",
             expected=f"a part of {', '.join(each.name for each in cases(large=elements))}",
-            todo="leave it out to run all of them",
+            todo="leave --case out to run all cases",
         )
     return _table(list(run_suite(names, chosen, progress=Progress().tell)), csv)
 
@@ -222,4 +222,4 @@ class _Clock:
     def tick(self, turn: int, tallies: "Sequence[WorstCases]") -> None:
         if self._progress.due:
             matrices, broken = (sum(getattr(t, n) for t in tallies) for n in ("matrices", "broken"))
-            self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a promise")
+            self._progress.tell(f"round {turn}: {matrices} matrices, {broken} break a guarantee")

@@ -15,12 +15,13 @@ from crossgrad_operators.stress.cases import Case, Rows
 Number: TypeAlias = Any
 Matrix: TypeAlias = list[list[Number]]
 DIGITS = 50
-#: Range of products of float64 numbers in binary digits. Sums with this precision are exact.
+#: Exponent range of products of float64 numbers in binary digits. Sums with this precision are
+#: exact.
 _RANGE = 4300
 Vector = list[Number]
-#: Relative size of a pivot that counts as zero. Exactly singular matrices have about 1e-50.
+#: Pivots below this relative size count as zero. Exactly singular matrices have about 1e-50.
 SINGULAR = "1e-35"
-#: A multiple of a direction that is large enough for some entry to reach zero first.
+#: Multiple of a direction that is large enough for some entry to reach zero first.
 FAR = 10**30
 
 

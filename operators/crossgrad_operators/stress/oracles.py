@@ -58,7 +58,7 @@ class Question:
         return len(self.places)
 
 
-#: A function that returns [n] weights.
+#: Function that returns the [n] weights.
 Oracle = Callable[[Question], Vector]
 
 

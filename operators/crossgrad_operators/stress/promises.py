@@ -18,22 +18,23 @@ from numpy.typing import NDArray
 from crossgrad_operators.stress.exact import Matrix, form, number, pivots
 from crossgrad_operators.stress.solvers import shortest
 
-#: Relative error that is promised inside the set, in units of u kappa.
+#: Relative error that is guaranteed inside the set, in units of u kappa.
 PROMISED: Final = 8.0
 #: Unit roundoff of float64.
 FLOAT64: Final = 2.0**-53
 #: The gradients determine the result if kappa u is at most this value.
 DETERMINED: Final = 0.1
-#: Directions whose pivots are between these values are nearly dependent.
+#: Directions with a pivot between these values are nearly dependent.
 DEPENDENT: Final = 1e-29
 INDEPENDENT: Final = 1e-13
 #: Upper limit of such pivots for methods that divide by every eigenvalue.
 REGULAR: Final = 1e-8
 #: Amount that rounding may add to a bound of 1.
 SLIGHTLY: Final = 1e-3
-#: Norm ratio up to which CAGrad can distinguish cancelling directions from other directions.
+#: Ratio of norms up to which CAGrad can distinguish cancelling directions from other directions.
 COMPARABLE: Final = 1e8
-#: Solutions are continuous if zero is at least this far from the hull of the directions.
+#: Solutions are continuous if the distance of zero from the hull of the directions is at least
+#: this.
 APART: Final = 1e-7
 
 
@@ -192,7 +193,7 @@ class Promise:
     continuous: Callable[[Facts], bool] = everywhere
 
 
-#: The promise of an operator without a stated promise.
+#: Guarantee for operators without their own guarantee.
 ALL: Final = Promise("all gradients", "infinity", lambda _views: float("inf"), everywhere)
 _DETERMINED: Final = "all Gramians with kappa u <= 0.1, and those whose exact result is zero"
 _CLEAR: Final = (
@@ -217,7 +218,7 @@ def _plain(words: str, factor: Callable[[int], float]) -> Promise:
 
 _SUM: Final = _plain("K", float)
 _PAIRS: Final = Promise(_DETERMINED, "K", float, bound=pairwise_bound)
-#: Operator name -> its promise.
+#: Operator name -> its guarantee.
 PROMISES: Final[Mapping[str, Promise]] = {
     "sum": _SUM,
     "mean": _plain("1", lambda _views: 1.0),

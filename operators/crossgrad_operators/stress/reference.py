@@ -32,7 +32,7 @@ ORACLES: Final[Mapping[str, Oracle]] = {
     "dispatch": oracles.symmetric,
 }
 
-#: Options with which an operator acts from the first step on.
+#: Options that make an operator active from the first step on.
 OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "confgate": {"warmup": 0},
     "soft": {"threshold": 0.25, "strength": 0.5},

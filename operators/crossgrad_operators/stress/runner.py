@@ -26,11 +26,11 @@ from crossgrad_operators.stress.verdict import ElementRule, ExactCase, Finding, 
 
 #: The only block of a case.
 BLOCK = Block("means", ("means",), False, "geometry", LearningRate(1.0))
-#: Greatest number of elements for which a case is repeated to measure its time.
+#: A case is repeated to measure its time if it has at most this number of elements.
 REPEATED = 100_000
 #: Number of steps for operators with memory.
 STEPS = 3
-#: Failure reason if the oracle finds no proven answer.
+#: Failure reason if the reference finds no proven answer.
 UNPROVEN = "the reference is not proven"
 
 

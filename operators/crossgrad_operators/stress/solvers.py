@@ -36,14 +36,14 @@ from crossgrad_operators.stress.oracles import (
 
 #: Digits for matrices whose eigenvalues differ by 60 decades.
 WIDE: Final = 150
-#: Newton decrement and greatest beta for the start in float64.
+#: Newton decrement and maximum beta for the start in float64.
 ROUGH: Final = 1e-3
 LONG: Final = 1e7
 #: Ratio of eigenvalues above which float64 determines the rank without doubt.
 FAR: Final = 1e-10
 #: A sum is zero if |sum x_k e_k|^2 over the largest x_k^2 is at most this, in 50 digits.
 VANISHED = "1e-45"
-#: Greatest number of levels that are tried for CAGrad.
+#: Maximum number of levels that are tried for CAGrad.
 LEVELS = 400
 
 
@@ -63,7 +63,7 @@ def imtl_g(question: Question) -> Vector:
         return zeros(2) if opposite else [n[1] / total, n[0] / total]
     v = _equal_projections(gramian, n, cosine)
     total, largest = sum(v), max(abs(x) for x in v)
-    # The sum of the v is in the denominator. It counts as zero by the rule for cancelling sums.
+    # The sum of the v is in the denominator, so it counts as zero by the rule for cancelling sums.
     if cancels(total**2, largest) or is_noise(cosine, [x * y for x, y in zip(v, n, strict=True)]):
         return zeros(count)
     return [x / total for x in v]

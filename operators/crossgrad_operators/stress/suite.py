@@ -20,7 +20,8 @@ from crossgrad_operators.stress.reference import OPTIONS, ORACLES, Views, chaine
 from crossgrad_operators.stress.runner import BLOCK, Cell, Reference, context_of, run_case, timed
 from crossgrad_operators.stress.verdict import ExactCase, Finding, one_sign
 
-#: A law returns its error in units of u times the largest norm, or None if it does not apply.
+#: Function that returns the error of a law in units of u times the largest norm, or None if the law
+#: does not apply.
 Law = Callable[[Operator], float | None]
 _UNIT = 2.0**-24
 #: Number of operators in one part of the table.
@@ -43,7 +44,7 @@ def _rows(views: int) -> Case:
 def _result(operator: Operator, case: Case, views: Views | None = None) -> Tensor:
     gradient, _, _ = timed(operator, case, views or sample_views(case.views))
     if gradient is None:
-        raise RuntimeError("no gradient where all views have one")
+        raise RuntimeError("a view has no gradient, but all views must have one")
     return gradient.double()
 
 

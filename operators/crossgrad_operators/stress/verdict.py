@@ -20,14 +20,15 @@ from crossgrad_operators.stress.oracles import cosines, lengths
 from crossgrad_operators.stress.promises import ALL, Facts, Promise
 from crossgrad_operators.stress.reference import Answer
 
-#: Above this kappa u only finiteness is promised, as the input does not determine the result.
+#: Above this kappa u only finiteness is guaranteed, because the input does not determine the
+#: result.
 UNDETERMINED: Final = 0.1
 #: Failure reason of a result that contains a NaN or an infinity.
 NOT_FINITE: Final = "not finite"
 
 Verdict = Literal["ok", "undetermined", "outside", "refused", "failed"]
 
-#: Distance of a result from the nearest result that a rule for elements allows.
+#: Maximum distance of a result from the nearest result that a rule for elements allows.
 ElementRule = Callable[[Case, Tensor], float]
 
 
@@ -83,7 +84,9 @@ def judge(
 ) -> Finding:
     """Compare a result with exact weights, with a rule for elements, or only for finiteness."""
     if found is None or not exact.touched:
-        return _either(found is None and not exact.touched, "None is for blocks without any view")
+        return _either(
+            found is None and not exact.touched, "None is expected only for blocks without any view"
+        )
     if not bool(torch.isfinite(found).all()):
         return Finding("failed", inf, NOT_FINITE)
     if expected is None:
@@ -136,7 +139,12 @@ def _outside(case: Case, found: Tensor, facts: Facts, promise: Promise) -> Findi
     ratio = float(found.double().norm()) / facts.longest
     if ratio <= promise.factor(case.views):
         return Finding("outside", ratio=ratio)
-    return Finding("failed", inf, f"{ratio:.3g} times the longest gradient outside the set", ratio)
+    return Finding(
+        "failed",
+        inf,
+        f"{ratio:.3g} times as long as the longest gradient, outside the operator's set",
+        ratio,
+    )
 
 
 def _measured(case: Case, error: float, sizes: tuple[float, float], bound: float) -> Finding:

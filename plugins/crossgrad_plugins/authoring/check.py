@@ -45,9 +45,12 @@ def check_package(package: str) -> tuple[str, bool]:
         lines += [_reason(result) for result in failures]
     total = len(found) + len(lost)
     for stray in lost:
-        lines += [f"  {stray.name}  FAIL", _reason(Result("it is never read", stray.reason))]
+        lines += [
+            f"  {stray.name}  FAIL",
+            _reason(Result("the plugin is never read", stray.reason)),
+        ]
     failed += len(lost)
-    lines.append(f"{total - failed} of {total} plugins keep the contract of their slot")
+    lines.append(f"{total - failed} of {total} plugins fulfil the contract of their slot")
     return "\n".join(lines), failed == 0
 
 
@@ -72,13 +75,14 @@ def entries_of(package: str) -> list[Entry]:
     known = sorted({entry.distribution for entry in offered})
     if _is_installed(package):
         raise UserError(
-            f"package {package!r} offers no plugins",
+            f"package {package!r} contains no plugins",
             expected=f"entry points in a group such as {GROUPS['operators']}",
             found=sentences(*(f"{each.name}: {each.reason}" for each in _strays_of(package))),
-            todo="name them in its pyproject.toml (docs/plugins.md) and install it again",
+            todo="declare the plugins in pyproject.toml (docs/plugins.md) and install the "
+            "package again",
         )
     raise UserError(
-        f"there is no installed package {package!r}",
+        f"no package named {package!r} is installed",
         expected=f"a package such as {', '.join(known)}",
         todo=sentences(did_you_mean(package, known), "install it into this environment with pip"),
     )

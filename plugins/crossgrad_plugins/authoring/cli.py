@@ -1,4 +1,4 @@
-"""List, explain, check and begin plugins."""
+"""List, explain, check and create plugins."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ from crossgrad_core.commands import (
 )
 
 app = typer.Typer(
-    help="List, explain, check and begin plugins.",
+    help="List, explain, check and create plugins.",
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -31,21 +31,23 @@ app = typer.Typer(
 
 SlotOption = Annotated[
     str | None,
-    typer.Option("--slot", metavar="SLOT", help=f"Only this slot: {listed(OFFERED)}."),
+    typer.Option(
+        "--slot", metavar="SLOT", help=f"Restrict the command to this slot: {listed(OFFERED)}."
+    ),
 ]
 
 
 PackageArgument = Annotated[
     str,
     typer.Argument(
-        metavar="PACKAGE", help="An installed package: its name for pip, or its import name."
+        metavar="PACKAGE", help="An installed package: its name in pip, or its import name."
     ),
 ]
 
 
 @app.callback(invoke_without_command=True)
 def plugins(context: typer.Context) -> None:
-    """List, explain, check and begin plugins. Without a command: list."""
+    """List, explain, check and create plugins. Without a command: list."""
     if context.invoked_subcommand is None:
         list_plugins(None)
 
@@ -58,7 +60,7 @@ def list_plugins(slot: SlotOption = None) -> None:
         typer.echo("\n".join(_rows(offers(each))) or "  none installed")
     if lost := [f"  {each.name}  {each.origin}: {each.reason}" for each in strays()]:
         typer.echo("\n".join(["never read", *lost]))
-    typer.echo("\n`crossgrad plugins show NAME` explains one of them.")
+    typer.echo("\n`crossgrad plugins show NAME` explains a plugin.")
 
 
 @app.command("show", cls=GroupedCommand)
@@ -66,7 +68,7 @@ def show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a plugin.")],
     slot: SlotOption = None,
 ) -> None:
-    """Explain a plugin: purpose, options, origin."""
+    """Show the purpose, the options and the origin of a plugin."""
     from crossgrad_plugins.authoring.describe import describe
 
     found = [entry for each in _slots(slot) for entry in offers(each)]
@@ -75,10 +77,10 @@ def show(
         slots = [each for each in _slots(None) if any(e.name == name for e in offers(each))]
         raise UserError(
             f"there is no plugin named {name!r}" + (f" among the {slot}" if slot else ""),
-            found=f"one among the {listed(slots)}" if slots else "",
+            found=f"a plugin with this name among the {listed(slots)}" if slots else "",
             todo=sentences(
                 did_you_mean(name, [entry.name for entry in found]),
-                "`crossgrad plugins list` shows them all",
+                "`crossgrad plugins list` shows all plugins",
             ),
         )
     typer.echo("\n\n".join(describe(entry) for entry in chosen))
@@ -90,8 +92,8 @@ def check(
 ) -> None:
     """Run the contract checks of a package's plugins.
 
-    Every plugin of the package is loaded and checked as its slot demands.
-    Exit status: 0 where all of them pass, 1 where one fails.
+    Every plugin of the package is loaded and tested with the checks of its slot.
+    Exit status: 0 if all plugins pass, 1 if a plugin fails.
     """
     from crossgrad_plugins.authoring.check import check_package
 
@@ -108,20 +110,22 @@ def matrix(
         bool,
         typer.Option(
             "--full/--pairwise",
-            help="All combinations, or as few as bring every component of the package together "
-            "with every other one.",
+            help="Test all combinations; the default is a smaller set that contains every "
+            "pair of a component of the package and any other component.",
         ),
     ] = False,
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="COMBINATION", help="A single one, as the report shows it."),
+        typer.Option(
+            "--only", metavar="COMBINATION", help="Test one combination, in the form of the report."
+        ),
     ] = None,
 ) -> None:
     """Train a package's components with all others for a few steps.
 
-    Each combination of installed components trains a tiny scene twice; losses and parameters must
-    be finite, and both runs the same. A combination that is refused before training, with a
-    reason, is no failure. Exit status: 0 where all others train, 1 where one fails.
+    Each combination of installed components trains a tiny scene twice. Losses and parameters must
+    be finite, and both runs must be equal. A combination that is refused before training, with a
+    reason, does not count as a failure. Exit status: 0 if all other combinations train, else 1.
     """
     announce()
     from crossgrad_plugins.authoring.matrix.report import train_matrix, train_one
@@ -142,15 +146,16 @@ def new(
         str, typer.Argument(metavar="NAME", help="Name of the plugin and of its package.")
     ],
     slot: Annotated[
-        str, typer.Option("--slot", metavar="SLOT", help=f"What it fills: {listed(OFFERED)}.")
+        str, typer.Option("--slot", metavar="SLOT", help=f"Slot of the plugin: {listed(OFFERED)}.")
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Its folder. Default: NAME.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder of the package. Default: NAME."),
     ] = None,
 ) -> None:
-    """Write a small package with one plugin, to begin with.
+    """Create a small package with one plugin as a starting point.
 
-    The package holds a pyproject.toml, one module and one test, and passes `crossgrad plugins
+    The package contains a pyproject.toml, one module and one test, and passes `crossgrad plugins
     check`. Nothing is overwritten.
     """
     from crossgrad_plugins.authoring.new import write_package
@@ -182,10 +187,10 @@ def _rows(found: tuple[Entry, ...]) -> list[str]:
     for entry in found:
         note = ""
         if names.count(entry.name) > 1:
-            note = "  offered twice: it is refused where it is asked for"
+            note = "  two packages offer this name: choosing it is an error"
         if entry.slot == COMMANDS and entry.name in OWN_COMMANDS:
-            note = "  never called: the core has a command of that name"
+            note = "  never called: the core has a command with this name"
         if required := unmet_requirement(entry.distribution):
-            note = f"  refused where it is asked for: it requires {required}"
+            note = f"  cannot be chosen: it requires {required}"
         rows.append(f"  {entry.name:<{width}}  {entry.distribution} {entry.version}{note}")
     return rows

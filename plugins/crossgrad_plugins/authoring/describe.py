@@ -93,7 +93,7 @@ def _traits(component: "type[Component]") -> list[tuple[str, object]]:
         if attribute not in component.model_fields and hasattr(component, attribute):
             value = getattr(component, attribute)
             if isinstance(value, property):
-                continue  # It depends on the options.
+                continue  # The answer depends on the options.
             value = sorted(value) if isinstance(value, frozenset) else value
             if value:
                 found.append((label, listed(value) if isinstance(value, list | tuple) else value))

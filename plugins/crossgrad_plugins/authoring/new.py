@@ -133,7 +133,7 @@ def _contents(name: str, module: str, slot: str) -> dict[str, str]:
 def _check(name: str, module: str, slot: str) -> None:
     if not _NAME.fullmatch(name) or iskeyword(module):
         raise UserError(
-            f"{name!r} cannot be the name of a plugin",
+            f"{name!r} is not a valid name of a plugin",
             where="NAME",
             expected="lower-case words joined by hyphens, such as equal-length",
             todo="choose another name",
@@ -142,14 +142,17 @@ def _check(name: str, module: str, slot: str) -> None:
     if taken is not None or find_spec(module) is not None:
         found = taken.origin if taken else f"an installed package {module}"
         raise UserError(
-            f"the name {name} is taken", where="NAME", found=found, todo="choose another name"
+            f"an installed plugin already uses the name {name}",
+            where="NAME",
+            found=found,
+            todo="choose another name",
         )
 
 
 def _check_empty(folder: Path) -> None:
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(
-            "there is something in the folder already",
+            "the output folder already contains files",
             where=folder,
             found=listed(sorted(each.name for each in folder.iterdir())[:5])
             if folder.is_dir()

@@ -24,7 +24,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--crossgrad-matrix",
         metavar="PACKAGE",
-        help="also train the components of an installed package with all others (pairwise)",
+        help="also train the components of an installed package together with all other "
+        "components (pairwise)",
     )
     group.addoption(
         "--crossgrad-matrix-full",

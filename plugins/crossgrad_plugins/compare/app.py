@@ -47,7 +47,7 @@ from crossgrad_plugins.compare.tables import (
     standing_table,
 )
 
-_MEANING: Final = "that they are equally fast is not given, and bits may differ"
+_MEANING: Final = "their speed may differ, and so may their bits"
 _MOST_SHOWN: Final = 3
 
 
@@ -112,7 +112,7 @@ _OPEN_ROWS: Final = 12
 #: Series colours on a dark page: the same hues, lighter.
 _DARK: Final = ("#4fa8e0", "#f08a3c", "#2fc79b", "#e3a1c5", "#f0b93a", "#86c9f2", "#c2a04a")
 _WORST_NAMED: Final = 8
-#: Field of a run's environment (machine, code) -> the text before its value.
+#: Field of a run's environment (machine, code) -> text that precedes its value.
 _MACHINE: Final = {
     "cpu": "",
     "cpu_cores": "cores: ",
@@ -295,11 +295,11 @@ def _check_numbers(options: Options) -> None:
         value = getattr(options, name)
         if value is not None and not isfinite(value):
             raise UserError(
-                f"the {name} is no number that a figure can have",
+                f"the {name} is not a finite number",
                 where=f"--{name}",
                 expected="a finite number",
                 found=str(value),
-                todo="give one, or leave it out",
+                todo="give a finite number, or leave the option out",
             )
 
 

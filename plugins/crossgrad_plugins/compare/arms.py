@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 from crossgrad_core.commands import UserError
 from crossgrad_plugins.compare.run import ABSENT, Run, Settings, text_of
 
-#: Settings that name an arm if they differ; other settings are used after these.
+#: Settings that name an arm if they differ; other settings follow.
 _FIRST: Final = (
     *("backbone", "views_per_step", "sampler", "operator", "densifier"),
     *("rate_factor", "densify_views", "schedule", "schedule_length", "schedule_unit"),
@@ -18,7 +18,7 @@ _FIRST: Final = (
 #: Settings that have a shorter name in the names of arms.
 _SPOKEN: Final = {"views_per_step": "views"}
 _DIGITS: Final = re.compile(r"(\d+)")
-#: Scene and seed.
+#: Names of the settings for scene and seed.
 Problem: TypeAlias = tuple[str, int]
 Length: TypeAlias = tuple[str, float]
 
@@ -119,7 +119,7 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
         old = max(fitting, key=len, default=None)
         if old is None or text == f"{old}:":
             raise UserError(
-                "no arm has this name",
+                "--name renames an arm that does not exist",
                 where="--name",
                 expected=f"OLD:NEW with one of {'; '.join(new)}",
                 found=text,
@@ -128,10 +128,10 @@ def renamed(arms: Sequence[Arm], names: Sequence[str]) -> tuple[Arm, ...]:
         new[old] = text[len(old) + 1 :]
     if len(set(new.values())) < len(new):
         raise UserError(
-            "two arms would have one name",
+            "two arms would have the same name",
             where="--name",
             found="; ".join(new.values()),
-            todo="give each arm a name of its own",
+            todo="give each arm a different name",
         )
     return tuple(Arm(new[arm.name], arm.runs, arm.failed, arm.settings) for arm in arms)
 
@@ -261,7 +261,9 @@ class Cells:
         """Name of a run -> why it is not used, although no other run of its arm replaces it."""
         chosen = self._chosen()
         return {
-            run.name: f"has {run.length_text}, other runs of {arm} on {scene} {text_of(length)}"
+            run.name: (
+                f"has {run.length_text}, but other runs of {arm} on {scene} have {text_of(length)}"
+            )
             for arm, problems in self.runs.items()
             for (scene, _), by in problems.items()
             if (length := chosen.get((arm, scene))) is not None and length not in by

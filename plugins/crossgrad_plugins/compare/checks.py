@@ -15,7 +15,7 @@ from crossgrad_plugins.compare.quantity import (
 )
 from crossgrad_plugins.compare.run import Run
 
-#: The note on the photos' sizes that every run writes.
+#: Pattern of the note on the photos' sizes that every run writes.
 _SIZES: Final = re.compile(r"^photos: (?P<sizes>\d.*?) from .*?/, (?P<how>.*)$")
 _MOST_SHOWN: Final = 3
 #: The definition that applies to every metric: how renders are compared.
@@ -26,10 +26,10 @@ _SHARE: Final = {"cpu_cores": "number of cores", "torch_threads": "number of thr
 #: Allowed relative difference of the calibration rates: by wall clock, and in CPU time. CPU
 #: time varies more, because other processes share the caches and cores.
 _SAME_SPEED: Final = {"rate": 0.1, "cpu_rate": 0.25}
-#: A machine whose mean load exceeds its number of cores by this amount is busy.
+#: A machine counts as busy if its mean load exceeds its number of cores by this amount.
 _BUSY: Final = 0.5
 #: Wall-clock seconds in notes; CPU seconds may still be compared.
-_CLOCK: Final = "seconds of the clock"
+_CLOCK: Final = "wall-clock seconds"
 _NEVER_RECORDED: Final = "no run recorded them"
 
 
@@ -51,12 +51,12 @@ def check_scenes(runs: Sequence[Run]) -> list[str]:
     notes = []
     if unknown and len(runs) > 1:
         shown = ", ".join(unknown[:_MOST_SHOWN])
-        notes.append(
-            f"{len(unknown)} without scene.json, so that nobody can tell which photos they had: "
-            f"{shown}"
-        )
+        notes.append(f"{len(unknown)} without scene.json, so their photos are not known: {shown}")
     return notes + [
-        f"regimes are not compared on {scene}: its runs label the held-out views differently"
+        (
+            f"regimes of scene {scene} are not compared: its runs label the held-out "
+            "views differently"
+        )
         for scene in differing_regimes(runs)
     ]
 
@@ -75,11 +75,11 @@ def _check_held_out(scene: str, runs: Sequence[Run]) -> None:
     if found is not None:
         first, second = found
         raise UserError(
-            f"runs of {scene} were measured on different held-out views",
+            f"runs of scene {scene} were evaluated on different held-out views",
             where=f"{first.name}, {second.name}",
             expected="the same views in per_view.csv",
             found=_difference(_held_out(first), _held_out(second)),
-            todo="compare runs with the same --split, --test-every and scene folder only",
+            todo="compare only runs with the same --split, --test-every and scene folder",
         )
 
 
@@ -87,12 +87,12 @@ def _check_photos(scene: str, runs: Sequence[Run]) -> None:
     found = _odd_one([run for run in runs if run.results.scene_marks], _photos)
     if found is not None:
         raise UserError(
-            f"runs of {scene} were measured against different photos",
+            f"runs of scene {scene} were evaluated against different photos",
             where=f"{found[0].name}, {found[1].name}",
             expected="the same photo files in scene.json",
-            found="photos of the same name with other bytes, or other masks",
-            todo="compare runs on one state of the scene's folder; another scene of the same name "
-            "needs a comparison of its own",
+            found="photos of the same name with different bytes or masks",
+            todo="compare only runs on the same state of the scene folder; compare another "
+            "scene of the same name separately",
         )
 
 
@@ -100,11 +100,12 @@ def _check_sizes(scene: str, runs: Sequence[Run]) -> None:
     found = _odd_one([run for run in runs if _sizes(run)], _sizes)
     if found is not None:
         raise UserError(
-            f"runs of {scene} have photos of different sizes or resize filters",
+            f"runs of scene {scene} were evaluated at different photo sizes or with "
+            "different resize filters",
             where=f"{found[0].name}, {found[1].name}",
-            expected="one size: PSNR falls with the size of the photos",
+            expected="the same size for all runs: PSNR falls with the size of the photos",
             found=" against ".join(_sizes(run) for run in found),
-            todo="compare runs with the same --max-size and images folder only",
+            todo="compare only runs with the same --max-size and images folder",
         )
 
 
@@ -113,11 +114,11 @@ def _check_trained(scene: str, runs: Sequence[Run]) -> None:
     if found is not None:
         first, second = found
         raise UserError(
-            f"runs of {scene} were trained on different photos",
+            f"runs of scene {scene} were trained on different photos",
             where=f"{first.name}, {second.name}",
             expected="the same split in scene.json",
             found=_difference(_trained(first), _trained(second)),
-            todo="compare runs with the same --split and --test-every only",
+            todo="compare only runs with the same --split and --test-every",
         )
 
 
@@ -158,7 +159,7 @@ def _sizes(run: Run) -> str:
 
 
 def _difference(first: frozenset[str], second: frozenset[str]) -> str:
-    sides = (("only in the first", first - second), ("only in the second", second - first))
+    sides = (("only in the first run", first - second), ("only in the second run", second - first))
     return "; ".join(
         f"{len(names)} {side}: {', '.join(sorted(names)[:_MOST_SHOWN])}"
         for side, names in sides
@@ -184,17 +185,17 @@ def quantities_of(
     measured = [key for key in offered if any(run.final(key) is not None for run in runs)]
     if not measured:
         raise UserError(
-            "no run has a figure: none of them held a photo out",
+            "no run has metrics, because no run held out a photo",
             where=runs[0].name,
-            todo="repeat the runs without --split none, and with more photos where there are few",
+            todo="repeat the runs without --split none; if the scene has few photos, add more",
         )
     if name not in measured:
         raise UserError(
-            "no run has this figure",
+            "no run has this metric",
             where="--metric",
             expected=f"one of {', '.join(measured)}",
             found=name,
-            todo="choose another one, or repeat the runs with it: crossgrad run --metrics NAME",
+            todo="choose another metric, or repeat the runs with it: crossgrad run --metrics NAME",
         )
     for key in (_RENDERS, name):
         _check_definition(runs, key)
@@ -203,9 +204,9 @@ def quantities_of(
         if key == name:
             continue
         if len(_definitions(runs, key)) > 1:
-            notes.append(f"{key} is not compared: runs define it differently")
+            notes.append(f"{key} is not compared: the runs define it differently")
         elif lacking := [run.name for run in runs if key not in _overall(run)]:
-            notes.append(f"{key} is not compared: {lacking[0]} and others did not measure it"
+            notes.append(f"{key} is not compared: {lacking[0]} and other runs did not measure it"
                          if len(lacking) > 1 else
                          f"{key} is not compared: {lacking[0]} did not measure it")  # fmt: skip
         else:
@@ -222,13 +223,14 @@ def _check_definition(runs: Sequence[Run], key: str) -> None:
     if len(found) > 1:
         (first, one), (second, other), *_ = ((text, run) for text, run in found.items())
         raise UserError(
-            f"runs define {key} differently"
+            f"the runs define {key} differently"
             if key != _RENDERS
-            else "runs compare renders by different rules",
+            else "the runs computed their metrics under different rules",
             where=f"{one}, {other}",
-            expected="one definition in summary.json",
-            found=f"{first!r} against {second!r}",
-            todo="compare runs of one version, or repeat those of the other one",
+            expected="the same definition in every summary.json",
+            found=f"{first!r} in one run, {second!r} in the other",
+            todo="compare runs of one version of crossgrad, or repeat the runs of the other "
+            "version",
         )
 
 
@@ -260,10 +262,10 @@ def comparable_costs(runs: Sequence[Run], clock: ClockChoice) -> tuple[tuple[Cos
     wanted = {ClockChoice.WALL: SECONDS, ClockChoice.CPU: CPU_SECONDS}.get(clock)
     if wanted is not None and reasons[wanted]:
         raise UserError(
-            f"{wanted.title} of these runs do not compare",
+            f"{wanted.title} of these runs cannot be compared",
             where=f"--clock {clock}",
             found=reasons[wanted],
-            todo="leave --clock out: quality at equal steps and views is compared then"
+            todo="leave --clock out to compare the quality at equal steps and views"
             + ("" if reasons[CPU_SECONDS] else "; --clock cpu compares CPU seconds"),
         )
     left_out = {cost for cost, reason in reasons.items() if reason}
@@ -332,7 +334,10 @@ def _busy(runs: Sequence[Run]) -> str:
             run.number("environment", "cpu_cores"),
         )
         if load is not None and cores is not None and load > cores + _BUSY:
-            return f"the machine was busy: a load of {load:.1f} on {cores:g} cores at {run.name}"
+            return (
+                f"the machine was busy during {run.name}: its load was {load:.1f} on "
+                f"{cores:g} cores"
+            )
     return ""
 
 
@@ -344,7 +349,7 @@ def _threads(runs: Sequence[Run]) -> str:
     for run in runs:
         threads = run.number("environment", "torch_threads")
         if threads is not None and threads > 1:
-            return f"they only compare with one thread, and {run.name} has {threads:g}"
+            return f"they can be compared only with one thread, and {run.name} used {threads:g}"
     return ""
 
 

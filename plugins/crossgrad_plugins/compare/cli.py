@@ -6,10 +6,10 @@ from crossgrad_plugins.compare.options import Command
 
 @command_of(Command)
 def compare(options: Command) -> None:
-    """Compare runs: what won, by how much, how sure, at what cost.
+    """Compare runs: quality with confidence intervals, and costs.
 
-    Groups runs by what differs in their configurations, pairs them by scene and seed, and writes
-    one page, figures for a paper and CSV tables. What does not compare is refused.
+    Groups runs into arms by the settings that differ, pairs them by scene and seed, and writes one
+    page, figures for a paper and CSV tables. Runs that cannot be compared are refused.
     """
     announce()
     from crossgrad_plugins.compare import app

@@ -22,7 +22,7 @@ from crossgrad_plugins.compare.ranking import Standing
 from crossgrad_plugins.compare.run import Run
 from crossgrad_plugins.compare.targets import is_inside, shared_amount, value_at
 
-#: The place at which the contrasts of the main table are taken.
+#: Position at which the contrasts of the main table are taken: the end of the runs.
 END = "at the end"
 OVERALL = "overall"
 #: With at most this many arms, every table has a row for every pair of arms.
@@ -221,7 +221,7 @@ def compared(found: RunRecord, options: Options) -> Comparison:
             "no run has finished",
             expected="at least one run with summary.json",
             found="; ".join(f"{name} {why}" for name, why in found.left_out.items()),
-            todo="let a run come to its end, or resume it: crossgrad run --resume RUN",
+            todo="wait until a run has finished, or resume it: crossgrad run --resume RUN",
         )
     notes = check_scenes(found.runs)
     quantities, about_figures = quantities_of(found.runs, options.metric, options.margin)
@@ -245,7 +245,7 @@ def _check_baseline(arms: Sequence[Arm], baseline: str | None) -> None:
     names = [arm.name for arm in arms]
     if baseline is not None and baseline not in names:
         raise UserError(
-            "no arm has this name",
+            "--baseline names an arm that does not exist",
             where="--baseline",
             expected=f"one of {'; '.join(names)}",
             found=baseline,
@@ -261,7 +261,8 @@ def _without(main: Mapping[str, Runs], quantity: Quantity) -> list[str]:
             held_out = run.number("overall", "views") != 0.0
             why = "not finite" if held_out else "no view is held out"
             notes.append(
-                f"{run.name} has no {quantity.label} at its end ({why}): its pair is left out, and "
-                "it never reaches a quality that it did not reach before"
+                f"{run.name} has no {quantity.label} at its end ({why}): its pair is left "
+                "out, and it counts as never reaching a quality that it had not reached "
+                "before"
             )
     return notes

@@ -16,7 +16,7 @@ from crossgrad_plugins.compare.statistics import (
     verdicts,
 )
 
-#: Maps a run to its value; None if the run has no value.
+#: Function that maps a run to its value, or to None if the run has no value.
 Reading: TypeAlias = Callable[[Run], float | None]
 #: Scene and seed -> the run of an arm.
 Runs: TypeAlias = Mapping[Problem, Run]

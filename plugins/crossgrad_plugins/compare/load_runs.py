@@ -84,10 +84,10 @@ def read_runs(places: Sequence[Path], *, skip_broken: bool) -> RunRecord:
     for folder in dict.fromkeys(each for place in places for each in _headless(place)):
         if not skip_broken:
             raise UserError(
-                "results of a run without its config.yaml",
+                "the folder contains results of a run, but no config.yaml",
                 where=folder,
-                todo="restore the file, or move the folder away; --skip-broken leaves this run out "
-                "and compares the others",
+                todo="restore the file, or move the folder away; --skip-broken ignores this run "
+                "and compares the other runs",
             )
         found.left_out[str(folder)] = "has no config.yaml"
     for folder in folders:
@@ -121,11 +121,11 @@ def _folders(place: Path) -> Iterator[Path]:
 
 
 def _no_run(place: Path) -> UserError:
-    there = "a file" if place.is_file() else "no such folder"
+    there = "a file" if place.is_file() else "the folder does not exist"
     return UserError(
-        "no run to compare",
+        "there is no run to compare",
         where=place,
-        expected="the folder of a run, or one with runs below it",
+        expected="the folder of a run, or a folder that contains runs",
         found="no config.yaml" if place.is_dir() else there,
         todo="name the folder that `crossgrad run` or `crossgrad sweep` printed",
     )
@@ -145,13 +145,13 @@ def _broken(error: UserError) -> UserError:
         where=error.where,
         expected=error.expected,
         found=error.found,
-        todo=f"{error.todo}; --skip-broken leaves this run out and compares the others",
+        todo=f"{error.todo}; --skip-broken ignores this run and compares the other runs",
     )
 
 
 def _sort_in(found: RunRecord, name: str, results: "RunResults", label: str | None) -> None:
     if results.summary is None:
-        found.left_out[name] = "has not ended: no summary.json"
+        found.left_out[name] = "has not finished: no summary.json"
         return
     _check_summary(results)
     run = Run(name, results, results.summary, _config(results), label)
@@ -174,17 +174,18 @@ def _check_whole(results: "RunResults") -> None:
         UserError: metrics.csv ends before the end of the run or contains a number that is too
             large, held-out views have no metrics, or scene.json cannot be read.
     """
-    views = (results.scene_marks or {}).get("views") or {}  # Raises if scene.json is malformed.
+    # This raises an error if scene.json is malformed.
+    views = (results.scene_marks or {}).get("views") or {}
     if not all(isinstance(view, Mapping) for view in views.values()):
         raise UserError(
-            "unreadable scene.json",
+            "scene.json cannot be read",
             where=results.folder / "scene.json",
-            expected="an object for each view, with what its photo is known by",
+            expected="an object for each view, with the fingerprint of its photo",
             todo=_REPEAT,
         )
     if _oversized(list(results.rows)):
         raise UserError(
-            "unreadable metrics.csv",
+            "metrics.csv cannot be read",
             where=results.folder / "metrics.csv",
             found=_OVERSIZED,
             todo=_REPEAT,
@@ -194,19 +195,19 @@ def _check_whole(results: "RunResults") -> None:
     steps = summary.get("step")
     if last != steps:
         raise UserError(
-            "metrics.csv does not go to the end of the run",
+            "metrics.csv ends before the last step of the run",
             where=results.folder / "metrics.csv",
-            expected=f"a last row of step {steps}, which summary.json is of",
-            found=f"step {last:.0f}" if last is not None else "no row with a step",
+            expected=f"a last row for step {steps}, as in summary.json",
+            found=f"a last row for step {last:.0f}" if last is not None else "no row with a step",
             todo=_REPEAT,
         )
     if (summary.get("overall") or {}).get("views") and not results.views:
         raise UserError(
             "the file with the metrics of the held-out views is missing",
             where=results.folder / "per_view.csv",
-            expected="a row of each",
+            expected="a row for each held-out view",
             found="no such file, or an empty one",
-            todo=f"crossgrad eval {results.folder} writes them again",
+            todo=f"`crossgrad eval {results.folder}` writes the file again",
         )
 
 
@@ -218,7 +219,7 @@ def _check_summary(results: "RunResults") -> None:
         found = _in_words(error)
     if found:
         raise UserError(
-            "unreadable summary.json",
+            "summary.json cannot be read",
             where=results.folder / "summary.json",
             found=found,
             todo=_REPEAT,
@@ -251,10 +252,10 @@ def _config(results: "RunResults") -> dict[str, object]:
         return RunConfig.model_validate(results.config).model_dump(mode="json")
     except ValueError as error:
         raise UserError(
-            "unreadable configuration of a run",
+            "the configuration of a run cannot be read",
             where=results.folder / "config.yaml",
             found=_in_words(error),
-            todo="restore the file, or read the run with the version that wrote it",
+            todo="restore the file, or use the version of crossgrad that wrote it",
         ) from error
 
 

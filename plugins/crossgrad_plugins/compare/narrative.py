@@ -13,8 +13,8 @@ from crossgrad_plugins.compare.statistics import Verdict
 _TITLES = {cost.name: cost.title for cost in COSTS}
 #: Maximum number of arms that one sentence names.
 _MOST_NAMED = 6
-_ONE_PAIR = "one pair says nothing about noise: run more seeds"
-_NONE_BEATEN = "but it is surely better than no other arm"
+_ONE_PAIR = "one pair does not show the noise: run more seeds"
+_NONE_BEATEN = "but it is not significantly better than any other arm"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def claim(contrast: Contrast) -> str:
     """Return the statement about two arms."""
     found = contrast.estimate
     if found is None:
-        return f"{contrast.first} and {contrast.second} share no scene with the same seed"
+        return f"{contrast.first} and {contrast.second} have no scene with the same seed in common"
     better = contrast.favours
     worse = contrast.second if better == contrast.first else contrast.first
     size = _size(contrast)
@@ -55,7 +55,7 @@ def claim(contrast: Contrast) -> str:
         return f"{both} are equivalent within {_margin(contrast)}{_except(contrast)}"
     if found.center == 0.0:
         return f"Inconclusive: no difference between {contrast.first} and {contrast.second}"
-    return f"Inconclusive: {better} is {size} ahead of {worse}, which may be noise"
+    return f"Inconclusive: {better} is {size} better than {worse}, which may be noise"
 
 
 def _except(contrast: Contrast) -> str:
@@ -67,7 +67,7 @@ def opposed_text(contrast: Contrast) -> str:
     shown = [
         f"{each.scene} ({contrast.quantity.difference(each.center)})" for each in contrast.opposed
     ]
-    return f"surely otherwise on {', '.join(shown)}" if shown else ""
+    return f"significantly the opposite on {', '.join(shown)}" if shown else ""
 
 
 def where_text(contrast: Contrast) -> str:
@@ -107,12 +107,15 @@ def needed_text(contrast: Contrast) -> str:
         return _ONE_PAIR
     margin = _margin(contrast)
     if found.needed is None:
-        return f"the noise is far above the margin of {margin}"
+        return f"the noise is much larger than the margin of {margin}"
     if found.needed <= found.pairs:
         if contrast.is_small or contrast.differs:
-            return "sure by itself, but not beside the other comparisons of its table"
+            return (
+                "significant alone, but not after the correction for the other comparisons "
+                "of the table"
+            )
         return f"the difference is too close to the margin of {margin} for {found.pairs} pairs"
-    return f"n \u2265 {found.needed} pairs needed to tell {margin} at this noise"
+    return f"n ≥ {found.needed} pairs are needed to detect {margin} at this noise"
 
 
 def interval_text(contrast: Contrast, interval: tuple[float, float]) -> str:
@@ -134,7 +137,7 @@ def noise_sentence(comparison: Comparison) -> str:
     unit = f" {quantity.unit}" if quantity.unit else ""
     parts = [f"{', '.join(known)}{unit}"] if known else []
     if lacking:
-        parts.append(f"unknown on {', '.join(lacking)}: one seed")
+        parts.append(f"unknown on {', '.join(lacking)}: only one seed")
     return "; ".join(parts)
 
 
@@ -148,7 +151,7 @@ def _alone(comparison: Comparison) -> Sentence:
         + ("" if isnan(each.spread) else f" \u00b1 {each.spread:.{quantity.decimals}f}")
         for scene, each in by.items()
     )
-    return Sentence("One arm: there is nothing to compare it with", finals)
+    return Sentence("There is only one arm, so nothing can be compared", finals)
 
 
 def _unpaired(comparison: Comparison) -> Sentence:
@@ -156,18 +159,17 @@ def _unpaired(comparison: Comparison) -> Sentence:
     failed = [arm.name for arm in comparison.arms if arm.failed and not arm.runs]
     if failed:
         return Sentence(
-            f"Nothing is paired: every run of {', '.join(failed)} failed", "see what is left out"
+            f"No pairs: every run of {', '.join(failed)} failed", "see the list of left-out runs"
         )
     problems = [set(by) for by in comparison.main.values() if by]
     if len(problems) > 1 and set.intersection(*problems):
         return Sentence(
-            f"Nothing is paired: no scene and seed has {comparison.quantity.label} at the ends of "
-            "two arms",
+            f"No pairs: no scene and seed has {comparison.quantity.label} at the ends of two arms",
             "see the notes",
         )
     return Sentence(
-        "The arms share no scene with the same seed: nothing is paired",
-        "run them on the same scenes with the same seeds",
+        "No pairs: the arms have no scene with the same seed in common",
+        "run the arms on the same scenes with the same seeds",
     )
 
 
@@ -182,12 +184,14 @@ def _of_the_best(comparison: Comparison) -> list[Sentence]:
     ahead = [c for c in groups[Verdict.DIFFERENT] if c.favours == leader]
     behind = [c for c in groups[Verdict.DIFFERENT] if c.favours != leader]
     support = f"better than {_against(ahead)}" if ahead else _NONE_BEATEN
-    found = [Sentence(f"{leader} {'has the best mean' if behind else 'ends best'}", support)]
+    found = [
+        Sentence(f"{leader} {'has the best mean' if behind else 'is best at the end'}", support)
+    ]
     if behind:
         found.append(Sentence(f"It is worse than {_against(behind)}", "pair by pair"))
     for verdict, words in (
         (Verdict.EQUIVALENT, "equivalent to"),
-        (Verdict.INCONCLUSIVE, "not told apart from"),
+        (Verdict.INCONCLUSIVE, "not distinguishable from"),
     ):
         if groups[verdict]:
             found.append(
@@ -235,7 +239,7 @@ def _lengths(comparison: Comparison) -> list[Sentence]:
     shown = (
         f"{name} {', '.join(sorted(told[name]))}" for name in comparison.ranking if name in told
     )
-    return [Sentence("The arms were given different lengths", _named(shown, "; "))]
+    return [Sentence("The arms had different lengths", _named(shown, "; "))]
 
 
 def _equal_costs(comparison: Comparison) -> list[Sentence]:

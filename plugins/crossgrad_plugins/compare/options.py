@@ -6,7 +6,7 @@ from pathlib import Path
 from crossgrad_core.commands import argument, option
 from crossgrad_plugins.compare.quantity import ClockChoice
 
-_WHAT = "What is compared"
+_WHAT = "Comparison"
 _ARMS = "Arms"
 
 
@@ -14,36 +14,35 @@ _ARMS = "Arms"
 class Options:
     """How runs are compared."""
 
-    metric: str = option("psnr", "The figure that is compared.", "NAME", heading=_WHAT)
+    metric: str = option("psnr", "Metric to compare.", "NAME", heading=_WHAT)
     margin: float | None = option(
         None,
-        "What counts as no difference; fix it before you look. Default: 0.1 dB, 0.005 of SSIM and "
-        "LPIPS.",
+        "Differences below this margin count as none; choose it before you look at "
+        "results. Default: 0.1 dB, 0.005 of SSIM and LPIPS.",
         "X",
         heading=_WHAT,
         min=1e-9,
     )
     clock: ClockChoice = option(
         ClockChoice.AUTO,
-        "Seconds of the clock, of the processor, or none. auto: of the clock if all runs had one "
-        "quiet machine, else of the processor.",
+        "Wall-clock seconds, CPU seconds, or none. auto: wall-clock seconds if all "
+        "runs had the same quiet machine, else CPU seconds.",
         heading=_WHAT,
     )
     target: float | None = option(
         None,
-        "Quality to reach. Default: on each scene what the weakest arm ends with.",
+        "Target quality for the time to quality. Default: on each scene, the final "
+        "quality of the worst arm.",
         "X",
         heading=_WHAT,
     )
     baseline: str | None = option(
         None,
-        "Compare the other arms with this one only. Default: all with all.",
+        "Compare the other arms only with this arm. Default: all pairs of arms.",
         "ARM",
         heading=_ARMS,
     )
-    name: list[str] | None = option(
-        None, "Another name for an arm, repeatable.", "OLD:NEW", heading=_ARMS
-    )
+    name: list[str] | None = option(None, "Rename an arm. Repeatable.", "OLD:NEW", heading=_ARMS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,14 +50,16 @@ class Command(Options):
     """All options of the command: the comparison, its runs, and the output folder."""
 
     runs: list[Path] = argument(
-        "RUN...|FOLDER", "Folders of runs, or folders with runs below, such as that of a sweep."
+        "RUN...|FOLDER",
+        "Folders of runs, or folders that contain runs, such as the folder of a sweep.",
     )
     out: Path | None = option(
         None,
-        "Folder for the page, the figures and the tables; an earlier comparison in it is "
-        "replaced, nothing else is. Default: compare, beside the runs.",
+        "Folder for the page, the figures and the tables; it may contain only an "
+        "earlier comparison, which is replaced. Default: the folder compare next to "
+        "the runs.",
         "DIR",
     )
     skip_broken: bool = option(
-        False, "Leave out runs with damaged files, and list them.", flag="--skip-broken"
+        False, "Ignore runs with damaged files, and list them.", flag="--skip-broken"
     )

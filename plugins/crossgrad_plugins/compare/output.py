@@ -13,9 +13,9 @@ from crossgrad_core.commands import (
     write_atomically,
 )
 
-#: The page. A folder is a comparison if it contains a page with the mark.
+#: Name of the page. A folder belongs to a comparison if it contains a page with the mark.
 PAGE: Final = "index.html"
-#: Part of the head of each page that compare wrote.
+#: The mark: a part of the head of each page that compare wrote.
 MARK: Final = '<meta name="generator" content="crossgrad compare">'
 FIGURES: Final = "figures"
 _BEGINNING: Final = 2000
@@ -46,11 +46,11 @@ def check_free(folder: Path, owned: Iterable[str] = ()) -> None:
     if next(others, None) is None and not (folder / PAGE).exists():
         return
     raise UserError(
-        "the folder holds something else than a comparison",
+        "the folder contains files that do not belong to a comparison",
         where=folder,
-        expected="a new folder, an empty one, or one that compare wrote",
+        expected="a new or empty folder, or a folder that compare wrote",
         found=", ".join(sorted(path.name for path in folder.iterdir())[:5]),
-        todo="choose another --out, or remove it",
+        todo="choose another --out, or remove the folder",
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-#: From this many seconds on, amounts are shown without decimals.
+#: Amounts of at least this many seconds are shown without decimals.
 _WHOLE: Final = 10.0
 
 
@@ -114,6 +114,6 @@ SECONDS: Final = Cost("seconds", "train_seconds", "training seconds", "s", "seco
 CPU_SECONDS: Final = Cost(
     "cpu_seconds", "cpu_seconds", "CPU seconds of training", "s CPU", "CPU seconds"
 )
-VIEWS: Final = Cost("views", "views", "training views rendered", "views", "views")
+VIEWS: Final = Cost("views", "views", "rendered training views", "views", "views")
 STEPS: Final = Cost("steps", "step", "optimizer steps", "steps", "steps")
 COSTS: Final = (SECONDS, CPU_SECONDS, VIEWS, STEPS)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 DRAWS: Final = 2000
 _TWO: Final = 2
 _SEED: Final = 20_150_101
-#: From this number of pairs on, the interval comes from the bootstrap.
+#: The interval is computed by bootstrap if there are at least this many pairs.
 BOOTSTRAP_FROM: Final = 10
 #: Level of the interval for a difference, and level of the interval for equivalence.
 WIDE, NARROW = 0.95, 0.90
@@ -21,7 +21,7 @@ _UNKNOWN = (-inf, inf)
 Interval: TypeAlias = tuple[float, float]
 #: Upper limit of the number of pairs that is suggested for one comparison.
 MOST_PAIRS: Final = 1000
-#: Up to this number of comparisons, verdicts are not corrected for multiple tests.
+#: Verdicts of up to this number of comparisons are not corrected for multiple tests.
 UNCORRECTED: Final = 5
 
 

@@ -77,9 +77,9 @@ def standing_table(c: Comparison) -> Table:
             [arm, *(_standing(c, arm, scene) for scene in c.scenes), *_against(c, arm, reference)]
             for arm in c.ranking
         ],
-        caption=f"{c.quantity.label} at the end of the runs, mean \u00b1 standard deviation over "
-        f"seeds{unit}; arms from the best to the worst; differences are paired by scene and seed, "
-        "with 95 % intervals.",
+        caption=f"{c.quantity.label} at the end of the runs, mean ± standard deviation over "
+        f"seeds{unit}. Arms are sorted from best to worst. Differences are paired by "
+        "scene and seed, with 95 % intervals.",
     )
 
 
@@ -120,9 +120,9 @@ def cost_table(c: Comparison) -> Table:
             f"{len(c.main[arm])}" + (f" + {failed} failed" if failed else ""),
         ]
         rows.append(row)
-    columns = [_ARM, *(Column(cost.title) for cost in c.costs), Column("primitives at the end")]
+    columns = [_ARM, *(Column(cost.title) for cost in c.costs), Column("Gaussians at the end")]
     columns += [Column(name, in_terminal=False) for name in ("at most", "memory, MiB", "runs")]
-    caption = "What a run costs, in the mean. Seconds are those of training."
+    caption = "Mean cost of a run. Seconds are training seconds."
     return Table(columns, rows, caption=caption)
 
 
@@ -137,33 +137,33 @@ def _mean(values: Sequence[float | None], cost: Cost | None = None) -> str:
 def contrast_tables(c: Comparison) -> tuple[Table, ...]:
     """Return the tables of contrasts that are not empty."""
     tables = (
-        contrast_table(c.ends, "At the ends of the runs", "The primary comparison."),
+        contrast_table(c.ends, "At the end of the runs", "The primary comparison."),
         contrast_table(
             c.equal,
             "At equal cost",
-            "Read where the run that spent least had its last evaluation, by scene; costs that are "
-            "the same at the ends of all runs have no row. * : runs were read before their ends, "
-            "where a schedule stretched to more had not come to its end; only runs of that length "
-            "show what they reach.",
+            "Read at the last evaluation of the run that spent least, by scene; costs "
+            "that are equal at the end of all runs have no row. * : these runs were read "
+            "before their end, when their schedule was not complete; only runs of that "
+            "length show the quality that the arm reaches.",
             {"equal": where_text},
         ),
         contrast_table(
             c.regimes,
             "By regime",
-            "At the ends of the runs, over all held-out views and over those of each regime.",
+            "At the end of the runs, over all held-out views and over the views of each regime.",
             {"views": where_text},
         ),
         contrast_table(
             c.others,
             "Other figures",
-            "At the ends of the runs, over all held-out views.",
+            "At the end of the runs, over all held-out views.",
             {"figure": lambda each: each.quantity.label},
         ),
         contrast_table(
             c.gains,
-            "What longer runs gain",
-            "Within an arm, runs of one length against those of the next shorter one, paired by "
-            "scene and seed.",
+            "Gain of longer runs",
+            "Within an arm, runs of one length compared with runs of the next shorter "
+            "length, paired by scene and seed.",
             {"arm": where_text},
         ),
     )
@@ -186,8 +186,8 @@ def contrast_table(
     """
     if len(contrasts) > UNCORRECTED:
         caption += (
-            f" Verdicts are corrected with Holm's method over the {len(contrasts)} comparisons of "
-            "this table; intervals are not."
+            f" Verdicts are corrected with Holm's method over the {len(contrasts)} "
+            "comparisons of this table; intervals are not corrected."
         )
     columns = [
         *(Column(name, "text") for name in (*first, "first", "second")),
@@ -206,7 +206,9 @@ def contrast_table(
 def _contrast_texts(contrast: Contrast, estimate: Estimate) -> list[str]:
     inconclusive = contrast.verdict is Verdict.INCONCLUSIVE
     small = contrast.verdict is Verdict.DIFFERENT and contrast.is_small
-    qualified = " (below the margin)" * small + ", scenes differ" * bool(contrast.opposed)
+    qualified = " (below the margin)" * small + ", with different signs on different scenes" * bool(
+        contrast.opposed
+    )
     note = narrative.needed_text if inconclusive else narrative.opposed_text
     return [
         contrast.first,
@@ -241,8 +243,8 @@ def reached_table(c: Comparison) -> Table:
         [*columns, Column("reached")],
         rows,
         "Time to a quality",
-        "Median over runs of what had been spent when the quality was first reached. A run that "
-        "never got there counts as infinite and stays in the denominator.",
+        "Median over runs of the cost until the quality was first reached. A run "
+        "that never reached it counts as infinite.",
     )
 
 
@@ -252,7 +254,7 @@ def settings_table(c: Comparison) -> Table:
     return Table(
         [Column("setting", "text"), *(Column(arm.name, "text") for arm in c.arms)],
         [[key, *(arm.settings[key] for arm in c.arms)] for key in settings],
-        "What differs between the arms",
+        "Settings that differ between the arms",
     )
 
 

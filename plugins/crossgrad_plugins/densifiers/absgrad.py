@@ -33,7 +33,9 @@ class AbsGradDensityControl(AxisSplit):
     needs = frozenset({"abs_gradient"})
 
     criterion: Literal["abs", "gsplat", "quantile"] = Field(
-        "abs", description="which statistic clones and which splits: abs, gsplat or quantile"
+        "abs",
+        description="statistics that select Gaussians to clone and to split: abs, gsplat or "
+        "quantile",
     )
     grad_threshold: float = Field(2e-4, gt=0, description="of g: abs (clones) and quantile")
     abs_threshold: float = Field(4e-4, gt=0, description="of ga: abs (splits)")
@@ -42,7 +44,7 @@ class AbsGradDensityControl(AxisSplit):
     @override
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         used = _THRESHOLDS[self.criterion]
-        why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave it out"
+        why = f"criterion {self.criterion} uses {' and '.join(sorted(used))}; leave the option out"
         unused = dict.fromkeys(frozenset().union(*_THRESHOLDS.values()) - used, why)
         return {**super().unused_options(selection), **unused}
 

@@ -17,7 +17,9 @@ class AdaptiveDensityControl(AxisSplit):
     W/2, H/2). Each view contributes the gradient of its own loss.
     """
 
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to densify at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which Gaussians are densified"
+    )
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:

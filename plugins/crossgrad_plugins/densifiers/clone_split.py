@@ -108,10 +108,18 @@ class CloneSplit(Densifier):
     reset_options = frozenset({"prune_scale", "reset_opacity"})
     budgeted = True
 
-    split_scale: float = Field(0.01, gt=0, description="split above, clone below; scene extents")
+    split_scale: float = Field(
+        0.01,
+        gt=0,
+        description="Gaussians with larger scales are split, others cloned; scene extents",
+    )
     prune_opacity: float = Field(0.005, ge=0, lt=1, description="prune below")
-    prune_scale: float = Field(0.1, gt=0, description="prune above, scene extents")
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="cap of an opacity reset")
+    prune_scale: float = Field(
+        0.1, gt=0, description="Gaussians with larger scales are pruned; scene extents"
+    )
+    reset_opacity: float = Field(
+        0.01, gt=0, lt=1, description="upper limit of opacities in an opacity reset"
+    )
 
     @abstractmethod
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
@@ -252,15 +260,16 @@ class AxisSplit(CloneSplit):
 
     division: Literal["drawn", "axis"] = Field(
         "drawn",
-        description="what grows becomes: drawn, a clone if it is small, else two drawn from it, as "
-        "published; axis, two side by side on its longest axis",
+        description="replacement of a growing Gaussian: drawn clones a small one and splits a "
+        "large one into two random samples, as published; axis replaces it by two on "
+        "its longest axis",
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.division != "axis" or self.by_size:
             return {}
-        return {"split_scale": "with division axis nothing depends on the size; leave it out"}
+        return {"split_scale": "with division axis the size has no effect; leave the option out"}
 
     @property
     def by_size(self) -> bool:

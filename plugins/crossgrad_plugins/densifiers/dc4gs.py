@@ -27,7 +27,7 @@ def inconsistency(sums: Tensor) -> Tensor:
     Source: DC4GS.
     """
     x, y, absolute_x, absolute_y, number = sums
-    # Without pixels: (1 - 0 / 1) times a ga of 0. Rounding can make the mean longer than 1.
+    # Without pixels this is (1 - 0 / 1) times a ga of 0. Rounding can make the mean longer than 1.
     rest = (1.0 - torch.sqrt(x * x + y * y) / number.clamp(min=1.0)).clamp(min=0.0)
     found: Tensor = rest * torch.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     return found
@@ -42,14 +42,15 @@ def plane_scores(bins: Tensor) -> Tensor:
     left, right = [bins[0]], [bins[-1]]
     for plane in range(1, PLANES):
         left.append(left[-1] + bins[plane])
-        # Sum from the other end. The total minus the left side would leave rounding errors for
-        # empty bins.
+        # Sum from the other end, because the total minus the left side would leave rounding errors
+        # in empty bins.
         right.append(right[-1] + bins[-1 - plane])
     sides = zip(left, reversed(right), strict=True)
     return torch.stack([(inconsistency(a) + inconsistency(b)) / 2.0 for a, b in sides])
 
 
-#: The candidate planes as shares of the axis, which is six standard deviations long.
+#: The positions of the candidate planes as shares of the axis, which is six standard deviations
+#: long.
 NODES = np.arange(1, 6) / 6.0
 #: Further positions at which the polynomial is evaluated.
 GRID = np.linspace(1.0 / 12.0, 11.0 / 12.0, 1000)
@@ -95,8 +96,12 @@ class DirectionalConsistency(CloneSplit):
 
     needs = frozenset({"directions"})
 
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to clone at")
-    split_threshold: float = Field(4e-4, gt=0, description="mean (1 - R) ga, NDC, to split at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which Gaussians are cloned"
+    )
+    split_threshold: float = Field(
+        4e-4, gt=0, description="mean (1 - R) ga, NDC, above which Gaussians are split"
+    )
 
     @override
     def observed(self, context: DensifyContext, state: PluginState) -> PluginState:
@@ -119,7 +124,8 @@ class DirectionalConsistency(CloneSplit):
         parting = screen_statistics.mean(state.per_primitive, "inconsistency", "renders")
         clone = (gradient >= self.grad_threshold) & small
         split = (parting >= self.split_threshold) & ~small
-        # In units of the thresholds, clones and splits can be compared if the budget is short.
+        # In units of their thresholds, clones and splits can be ranked together if the budget is
+        # short.
         urge = torch.where(small, gradient / self.grad_threshold, parting / self.split_threshold)
         return Growth(clone=clone, split=split, strength=urge)
 

@@ -25,7 +25,7 @@ from crossgrad_core.plugin import (
 MARKED, ERROR, VISITS = "marked", "error", "visits"
 #: Number of rendered views of each regime.
 DRAWN = "drawn"
-#: The power of the visits in the rank of a primitive: between a sum (0) and a mean (1).
+#: Power of the number of renders in the rank of a primitive: between a sum (0) and a mean (1).
 VISITS_POWER = 0.75
 
 
@@ -84,21 +84,28 @@ class CountsMarkedPixels(Densifier, ABC):
 
     count: Literal["render", "running"] = Field(
         "render",
-        description="what counts: render some views at each edit, or running: the views that the "
-        "steps since the last edit have rendered",
+        description="views in which pixels are counted. render: some views, rendered at each "
+        "edit; running: the views rendered in the steps since the last edit",
     )
-    views: int = Field(10, ge=1, description="training views rendered at each edit, at random")
+    views: int = Field(
+        10, ge=1, description="number of random training views rendered at each edit"
+    )
     share: float = Field(
-        0.25, gt=0, le=1, description="running: share of the steps whose views count"
+        0.25, gt=0, le=1, description="running: share of the steps whose views are counted"
     )
     regimes: bool = Field(
-        False, description="count by regime, and grow where the views of any regime ask for it"
+        False, description="count by regime, and grow if the views of any regime require it"
     )
     error_threshold: float = Field(
-        0.1, ge=0, lt=1, description="error of a pixel above which it counts; share of the largest"
+        0.1,
+        ge=0,
+        lt=1,
+        description="error above which a pixel is counted, as a share of the largest error",
     )
     importance: float = Field(
-        5.0, ge=0, description="grow where more pixels of a view err on average, whole numbers"
+        5.0,
+        ge=0,
+        description="grow above this mean number of counted pixels per view; a whole number",
     )
 
     def counted(self, context: DensifyContext, state: PluginState) -> PluginState:
@@ -145,8 +152,8 @@ class CountsMarkedPixels(Densifier, ABC):
             renders: True if the running variant also renders views.
         """
         if self.count == "render":
-            return {"share": "count render has views of its own; leave it out"}
-        why = "count running renders no views; leave it out"
+            return {"share": "count render selects its own views; leave the option out"}
+        why = "count running renders no extra views; leave the option out"
         return {} if renders else {"views": why}
 
     def _sums(self, context: DensifyContext, state: PluginState) -> dict[str, Tensor]:
@@ -170,7 +177,9 @@ class CountsMarkedPixels(Densifier, ABC):
     ) -> None:
         """Add the counts of a view to the sums, in place."""
         if view.screen.count is None:
-            raise RuntimeError("the rasterizer was asked for a count and gave none")
+            raise RuntimeError(
+                "the rasterizer returned no pixel counts, although they were requested"
+            )
         column = self._column(context, view.view)
         counts = view.screen.count(erroneous(view, self.error_threshold))
         marked, shown = (torch.zeros_like(sums[MARKED][:, 0]) for _ in range(2))

@@ -28,11 +28,10 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: Steepness of the gate and the opacity at which it is half open (3DGS-MCMC).
+#: Steepness of the gate, and the opacity at which it is half open (3DGS-MCMC).
 GATE_STEEPNESS = 100.0
 GATE_OPACITY = 0.005
-#: Shifts below this share of a Gaussian's own size are left out, because float32 cannot represent
-#: them.
+#: Shifts below this share of a Gaussian's size are skipped, because float32 cannot represent them.
 NEGLIGIBLE = 1e-7
 
 
@@ -59,7 +58,7 @@ def position_noise(
     log_scales = parameters["scales"].detach()
     opacity = sigmoid(parameters["opacities"].detach())
     factor = strength * sigmoid(GATE_STEEPNESS * (GATE_OPACITY - opacity))
-    # Column by column: reducing rows of three is much slower on the CPU.
+    # Process column by column, because reducing rows of three is much slower on the CPU.
     a, b, c = log_scales.unbind(1)
     largest = torch.exp(torch.maximum(torch.maximum(a, b), c))
     rows = (factor * largest > NEGLIGIBLE).nonzero().squeeze(1)
@@ -82,7 +81,7 @@ def rotated(vectors: Tensor, quats: Tensor, *, back: bool = False) -> Tensor:
     return along - w * turned if back else along + w * turned
 
 
-#: Larger numbers of copies are treated as this number (the published bound).
+#: Maximum number of copies that is used in the formula (the published bound).
 MOST_COPIES = 51
 #: Step of the quadrature, in standard deviations. The integrand is entire, so the relative error of
 #: the trapezoidal rule is exp(-c / step). For 51 opaque copies it is 2e-12 at step 0.2, and below
@@ -188,17 +187,21 @@ class MarkovChainMonteCarlo(Densifier):
     observes: ClassVar[bool] = False
 
     cap: int = Field(1_000_000, ge=0, description="most Gaussians")
-    growth: float = Field(0.05, ge=0, le=1, description="share added per pass")
-    dead_opacity: float = Field(0.005, gt=0, lt=1, description="relocated at or below")
-    noise: float = Field(5e5, ge=0, description="noise of positions, per learning rate; 0 for none")
+    growth: float = Field(0.05, ge=0, le=1, description="share of Gaussians added per edit")
+    dead_opacity: float = Field(
+        0.005, gt=0, lt=1, description="Gaussians with at most this opacity are relocated"
+    )
+    noise: float = Field(
+        5e5, ge=0, description="noise added to positions, per learning rate; 0 for none"
+    )
     opacity_weight: float = Field(0.01, ge=0, description="weight of the mean opacity in the loss")
     scale_weight: float = Field(
         0.01, ge=0, description="weight of the mean scale in the loss, per scene extent"
     )
     initial_opacity: float | None = Field(
-        0.5, gt=0, lt=1, description="opacity at the start; none keeps the backbone's"
+        0.5, gt=0, lt=1, description="initial opacity; null uses the backbone's"
     )
-    initial_scale: float = Field(0.1, gt=0, description="factor of the scales at the start")
+    initial_scale: float = Field(0.1, gt=0, description="factor of the initial scales")
 
     @override
     def window(self, schedule: Schedule) -> Schedule:

@@ -28,7 +28,7 @@ from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
 #: Shortest interval between edits, in views (the published interval of the larger variant).
 SHORTEST_INTERVAL = 100
-#: Key of the number of late prunings that are done.
+#: Key of the number of completed late prunings.
 LATE = "late"
 
 
@@ -45,24 +45,44 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
 
     needs = frozenset({"abs_gradient", "count"})
 
-    split_scale: float = Field(0.001, gt=0, description="split above, clone below; scene extents")
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to clone at")
-    abs_threshold: float = Field(1.2e-3, gt=0, description="mean absolute gradient to split at")
+    split_scale: float = Field(
+        0.001,
+        gt=0,
+        description="Gaussians with larger scales are split, others cloned; scene extents",
+    )
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which Gaussians are cloned"
+    )
+    abs_threshold: float = Field(
+        1.2e-3, gt=0, description="mean absolute gradient above which Gaussians are split"
+    )
     interval: float = Field(
-        1 / 60, gt=0, lt=1, description="share of the run from edit to edit, at least 100 views"
+        1 / 60,
+        gt=0,
+        lt=1,
+        description="interval between edits as a share of the run, at least 100 views",
     )
-    prune_share: float = Field(0.5, gt=0, le=1, description="share of the candidates that goes")
-    cap_opacity: float = Field(0.8, gt=0, le=1, description="cap after each edit; 1 for none")
+    prune_share: float = Field(
+        0.5, gt=0, le=1, description="share of the candidates that is pruned"
+    )
+    cap_opacity: float = Field(
+        0.8, gt=0, le=1, description="upper limit of opacities after each edit; 1 for none"
+    )
     late_prunings: tuple[float, ...] = Field(
-        (0.6, 0.7, 0.8, 0.9), description="shares of the run; once density control is over"
+        (0.6, 0.7, 0.8, 0.9),
+        description="times of late prunings as shares of the run, after the end of density control",
     )
-    late_opacity: float = Field(0.1, ge=0, lt=1, description="late prunings remove below")
-    late_score: float = Field(0.9, gt=0, le=1, description="... and above this share in the error")
+    late_opacity: float = Field(
+        0.1, ge=0, lt=1, description="late prunings remove Gaussians below this opacity"
+    )
+    late_score: float = Field(
+        0.9, gt=0, le=1, description="... and with more than this share in the error"
+    )
 
     @override
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         late = len(self.late_prunings) > 0
-        why = "there are no late_prunings; leave it out"
+        why = "there are no late_prunings; leave the option out"
         unused = {} if late else {"late_opacity": why, "late_score": why}
         return {**super().unused_options(selection), **self.idle_counting(renders=late), **unused}
 
@@ -113,7 +133,7 @@ class MultiViewDensityControl(CountsMarkedPixels, AxisSplit):
     def _capped(self, context: DensifyContext, edit: Edit) -> Edit:
         """Return the edit with opacities limited to the cap; lower opacities keep their moments."""
         if self.cap_opacity == 1.0 or "opacities" in edit.values:
-            return edit  # A reset has a lower cap.
+            return edit  # A reset uses a lower cap.
         after = edited_parameters(context, edit)
         capped = context.backbone.capped_opacities(after, self.cap_opacity)
         rows = (capped < after["opacities"].detach()).nonzero().squeeze(1)

@@ -24,7 +24,8 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_plugins.densifiers.error_pixel_counts import CountsMarkedPixels
 
-#: Prefix of the names in the gate's state; names of the other densifier do not have it.
+#: Prefix of the names in the gate's state, which keeps them apart from the names of the other
+#: densifier.
 OWN = "gate/"
 #: Hooks of the other densifier that the gate implements for it.
 _ANSWERED = frozenset({"crossgrad_densify", "crossgrad_validate_selection"})
@@ -41,8 +42,8 @@ def densifier_of(value: object) -> Densifier:
     further = {each for each in dir(value) if each.startswith("crossgrad_")} - _ANSWERED
     if further or not value.edits or isinstance(value, CountsMarkedPixels):
         raise ValueError(
-            f"{component_name(value)} can only stand alone: it has further hooks, never edits, or "
-            "asks several views itself"
+            f"{component_name(value)} cannot be used inside another densifier: it has "
+            "further hooks, never edits, or renders several views itself"
         )
     return value
 
@@ -56,7 +57,7 @@ class MultiViewGate(CountsMarkedPixels):
     """
 
     of: Annotated[Densifier, BeforeValidator(densifier_of), PlainSerializer(plain_component)] = (
-        Field(cast("Any", "adc"), description="the densifier behind the gate: adc, anchor, octree")
+        Field(cast("Any", "adc"), description="inner densifier: adc, anchor, octree")
     )
 
     @property
@@ -119,10 +120,12 @@ class MultiViewGate(CountsMarkedPixels):
             return
         if not bool(may_grow[edit.source[edit.fresh]].all()):
             raise UserError(
-                f"densifier {component_name(self.of)} grows what it may not",
+                f"densifier {component_name(self.of)} grew Gaussians that the gate does not "
+                "allow to grow",
                 where="densifier multiview-gate",
-                expected="a densifier that looks at `context.may_grow`",
-                todo="name another one with --set densifier.of=NAME, or use it without the gate",
+                expected="a densifier that respects `context.may_grow`",
+                todo="choose another densifier with --set densifier.of=NAME, or use it without "
+                "the gate",
             )
 
 

@@ -21,9 +21,14 @@ class PixelDensityControl(AxisSplit):
 
     needs = frozenset({"pixels"})
 
-    grad_threshold: float = Field(2e-4, gt=0, description="scaled NDC gradient to densify at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="scaled NDC gradient above which Gaussians are densified"
+    )
     depth_threshold: float = Field(
-        0.37, gt=0, description="Gaussians nearer to the camera count for less; scene extents"
+        0.37,
+        gt=0,
+        description="distance to a camera below which Gaussians receive a lower weight; scene "
+        "extents",
     )
 
     @override
@@ -43,7 +48,7 @@ class PixelDensityControl(AxisSplit):
         means = record.gaussians.means
         pose = record.view.camera.world_to_camera.to(means, non_blocking=True)
         x, y, z = means.unbind(1)
-        # No matrix product: its rounding depends on the number of threads.
+        # Do not use a matrix product: its rounding depends on the number of threads.
         depths = x * pose[2, 0] + y * pose[2, 1] + z * pose[2, 2] + pose[2, 3]
         # The unit of the local frame is the extent of the training cameras.
         return (depths / self.depth_threshold).square().clamp(max=1.0)

@@ -115,11 +115,20 @@ class RevisingDensification(CloneSplit):
     observes: ClassVar[bool] = False
 
     error: ErrorKind = Field("ssim", description="error of a pixel: ssim (1 - SSIM) or l1")
-    error_threshold: float = Field(0.1, gt=0, description="share of the error to grow at, pixels")
-    growth_budget: float = Field(0.05, gt=0, le=1, description="most growth per edit, share")
-    views: int = Field(32, ge=1, description="training views that are measured per edit, at most")
+    error_threshold: float = Field(
+        0.1, gt=0, description="error above which a Gaussian grows, pixels"
+    )
+    growth_budget: float = Field(
+        0.05, gt=0, le=1, description="maximum growth per edit, as a share"
+    )
+    views: int = Field(
+        32, ge=1, description="maximum number of training views that are measured per edit"
+    )
     opacity_decrease: float = Field(
-        0.001, ge=0, lt=1, description="taken off all opacities per edit; 0 resets them instead"
+        0.001,
+        ge=0,
+        lt=1,
+        description="amount subtracted from all opacities per edit; 0 resets them instead",
     )
 
     @override
@@ -163,7 +172,7 @@ class RevisingDensification(CloneSplit):
 
 def halved_logits(logits: Tensor) -> Tensor:
     """Return logits [R] of o' = 1 - sqrt(1 - o); two copies with o' are as opaque as one."""
-    transparency = logsigmoid(-logits) / 2  # log of sqrt(1 - o)
+    transparency = logsigmoid(-logits) / 2  # This is the log of sqrt(1 - o).
     shared = torch.log(-torch.expm1(transparency)) - transparency
     return torch.where(logits < _FAINT, logits - log(2.0), shared)
 

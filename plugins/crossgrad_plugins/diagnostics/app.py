@@ -98,9 +98,9 @@ def diagnose(
     """
     if scene is not None and run is not None:
         raise UserError(
-            "either a scene is diagnosed or a run",
+            "both a scene and a run were named; only one of them can be diagnosed",
             where="SCENE, --run",
-            todo="leave SCENE out: the run knows its scene",
+            todo="leave SCENE out: the run stores the path of its scene",
         )
     _check_free(out)
     check_folder(out or run or Path("runs"))
@@ -117,7 +117,7 @@ def diagnose(
         try:
             report = diagnose_scene(config, options)
         except TrainingFailedError as error:
-            return _failed(f"{error}; nothing was probed before")
+            return _failed(f"{error}; nothing was probed before this error")
         folder = out or Path("runs") / report.scene / "diagnose" / stamp
     _write(report, folder)
     return 0 if report.failure is None else _failed(report.failure)
@@ -131,9 +131,9 @@ def _failed(why: str) -> int:
 def _check_free(out: Path | None) -> None:
     if out is not None and (out / PROBES).exists():
         raise UserError(
-            "the folder holds a report already",
+            "the output folder already contains a report",
             where=out,
-            todo="choose another --out, or remove it",
+            todo="choose another --out, or remove the report",
         )
     if out is not None:
         check_new(*(out / name for name in FILES))
@@ -187,7 +187,7 @@ def diagnose_scene(config: RunConfig, options: Options) -> Report:
     except TrainingFailedError as error:
         if watch.last is None:
             raise
-        model = f"{model}, which failed; probed before that"
+        model = f"{model}, which failed; the probes before the failure are shown"
         return replace(_report(model, watch, model_of(setup, state), options), failure=str(error))
     return _report(model, watch, model_of(setup, state), options)
 

@@ -17,7 +17,7 @@ class Given:
 
     scene: Path | None = argument(
         "SCENE",
-        "Scene folder. Default: the bundled example scene, or the one of --run.",
+        "Scene folder. Default: the bundled example scene, or the scene of --run.",
         default=None,
     )
     run: Path | None = option(
@@ -28,7 +28,7 @@ class Given:
     )
     accept_scene: bool = option(
         False,
-        "With --run: take the scene although photos, masks, points or held-out views have changed.",
+        "With --run: continue although photos, masks, points or held-out views have changed.",
         heading=_MODEL,
         flag="--accept-scene",
     )
@@ -45,16 +45,16 @@ class Given:
     seed: int = option(0, "Seed of the vanilla run and of the probes.", "N", heading=_MODEL, min=0)
     grouping: str | None = option(
         None,
-        "Which views are near and far. Default: the grouping of --run, or else radial.",
+        "Grouping into near and far views. Default: the grouping of --run, or else radial.",
         "NAME",
         heading=_PROBE,
     )
     views: int = option(
-        12, "Probed training views of each group, at most.", "N", heading=_PROBE, min=2
+        12, "Maximum number of probed training views of each group.", "N", heading=_PROBE, min=2
     )
     probes: int | None = option(
         None,
-        "Probes during the vanilla run; the last one is at its end. Default: 4.",
+        "Number of probes during the vanilla run, including one at its end. Default: 4.",
         "N",
         heading=_PROBE,
         min=1,
@@ -67,25 +67,25 @@ class Given:
     )
     out: Path | None = option(
         None,
-        "Folder for the CSV files and the picture. Default: below runs/SCENE/diagnose, or "
-        "RUN/diagnose.",
+        "Folder for the CSV files and the figure. Default: a folder below "
+        "runs/SCENE/diagnose, or RUN/diagnose.",
         "DIR",
     )
     device: str | None = option(
         None,
-        "Where tensors live. Default: auto, or the device of --run.",
+        "Device of the tensors. Default: auto, or the device of --run.",
         "auto|cpu|cuda|cuda:N",
     )
-    threads: int | None = option(None, "CPU threads. Default: all there are.", "N")
+    threads: int | None = option(None, "Number of CPU threads. Default: all.", "N")
 
 
 @command_of(Given)
 def diagnose(given: Given) -> None:
-    """Measure a scene: camera regimes, gradient conflict, variance.
+    """Measure camera regimes, gradient conflict and gradient variance.
 
-    Trains a short vanilla run (or takes --run), probes the gradients of single views at frozen
-    parameters, and writes CSV files and a picture. The variance is split into the part within
-    groups of views and the part between them.
+    Trains a short vanilla run, or uses the run of --run. Then it measures the gradients of single
+    views at fixed parameters, and writes CSV files and a figure. The variance is split into the
+    part within groups of views and the part between groups.
     """
     vanilla = {
         "--seconds": given.seconds, "--max-size": given.max_size, "--probes": given.probes
@@ -122,5 +122,7 @@ def diagnose(given: Given) -> None:
 def _refuse_idle(idle: list[str], run: Path | None) -> None:
     """Refuse options that have no effect on the diagnosed scene or run."""
     if idle:
-        why = "without --run" if run is None else "with --run: a run is probed once, as it is"
-        raise UserError(f"{' and '.join(idle)} does nothing {why}", todo="leave it out")
+        why = (
+            "without --run" if run is None else "with --run: a run is probed once, without training"
+        )
+        raise UserError(f"{' and '.join(idle)} has no effect {why}", todo="leave it out")

@@ -38,9 +38,9 @@ class SceneExposure:
     def lines(self) -> list[str]:
         """Return the lines for a terminal."""
         verdict = (
-            "the photos differ in exposure; a run models that by itself (--exposure auto)"
+            ("the photos differ in exposure; a run models this by default (--exposure auto)")
             if self.differ
-            else "no exposure needs a model (--exposure none)"
+            else "the exposures need no model (--exposure none)"
         )
         return ["exposure", f"  {self.evidence}", f"  {verdict}"]
 
@@ -61,7 +61,8 @@ def _rows(scene: Scene, gains: TrackGains) -> list[Row]:
     told = exposure_values(scene)
     known = zip(scene.views, gains.gains, gains.known, strict=True)
     of_tracks = {view.name: float(gain) for view, gain, is_known in known if is_known}
-    # EXIF only gives differences, so its values are shifted to the tracks if photos have both.
+    # EXIF data give only differences, so their values are shifted to the tracks if photos have
+    # both.
     both = [of_tracks[name] - value for name, value in told.items() if name in of_tracks]
     shift = median(both) if both else -sum(told.values()) / max(1, len(told))
     trained = frozenset(scene.train)

@@ -189,7 +189,7 @@ def _draw_rule(axes: "Axes", exposure: SceneExposure) -> None:
     axes.bar(range(3), values, 0.6, color=(_EXPOSURE_COLORS[0], "0.6", _EXPOSURE_COLORS[2]))
     for place, limit in enumerate(limits):
         axes.plot([place - 0.4, place + 0.4], [limit, limit], color=_BLACK, linewidth=1.5)
-    names = ("gains\n(above the line)", "observations", "gains taken out\n(below the line)")
+    names = ("gains\n(above the line)", "observations", "gains removed\n(below the line)")
     axes.set_xticks(range(3), names, fontsize=7)
     axes.set_ylabel("deviation, stops")
     axes.set_title("photos differ" if exposure.differ else "photos agree", fontsize=10)

@@ -32,7 +32,7 @@ class Groups:
     def __post_init__(self) -> None:
         if min(self.sizes) < SMALLEST_GROUP:
             raise UserError(
-                "a variance needs two views of each group",
+                "the variance cannot be estimated: each group needs two views",
                 where="diagnostics",
                 found=f"{self.sizes[0]} near and {self.sizes[1]} far views",
                 todo="probe more views, or choose another grouping",
@@ -100,7 +100,8 @@ class GroupedGramian:
         centring = np.eye(n + m) - averaging
         deviations = centring @ ordered @ centring
         difference = np.concatenate([np.full(n, 1.0 / n), np.full(m, -1.0 / m)])
-        # A view's part in the mean would correlate its length with its position along the gap.
+        # Leave the view out of the mean: otherwise its length would correlate with its position
+        # along the gap.
         own = np.diag(deviations) / np.concatenate([np.full(n, n - 1.0), np.full(m, 1.0 - m)])
         along = centring @ (ordered @ difference - own)
         return cls(

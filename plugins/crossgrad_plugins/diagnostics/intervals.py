@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups, split_of
 from crossgrad_plugins.diagnostics.resampling import Resamples
 
-#: Maximum share of the error of the ratio's interval that is moved from its lower to its upper
-#: end, and the share of sigma_w^2 in the variance from which on this maximum applies. A sample
-#: with too few long gradients makes sigma_w^2 too small and the ratio too large.
+#: Maximum share of the error of the ratio's interval that is moved from its lower to its upper end,
+#: and the share of sigma_w^2 in the variance above which this maximum applies. A sample with too
+#: few long gradients makes sigma_w^2 too small and the ratio too large.
 _MOVED = 0.4
 _WITHIN_RULES = 1.0 / 3.0
 #: The unbiased estimate of tr(Sigma^2) needs four views of each group.
 SMALLEST_FOR_INTERVALS = 4
-#: A variance below this size, relative to the squared lengths, is rounding error.
+#: A variance below this size, relative to the squared lengths, counts as a rounding error.
 _NEGLIGIBLE = 1e-13
 #: Share of the error of sigma_w^2's interval that is put on its upper end. A few views miss rare
 #: long gradients more often than they contain too many, so the error is not split evenly.
@@ -278,7 +278,8 @@ def inverted(pivot: Callable[[float], Pivot], start: float, level: float) -> Int
         start: Positive value of about the size of the upper end.
         level: Confidence level of the interval.
     """
-    # If 0 is rejected from above, so are all larger values; [0, 0] would wrongly claim exactly 0.
+    # If 0 is rejected from above, all larger values are rejected too; [0, 0] would wrongly claim
+    # exactly 0.
     if not pivot(0.0).above(level, lower_end=False):
         return UNKNOWN
     return Interval(

@@ -10,7 +10,7 @@ from crossgrad_core.plugin import Model, Observer, RunInfo, hookimpl
 if TYPE_CHECKING:
     from crossgrad_plugins.diagnostics.watch import Watch
 
-#: Number of probes of a run, if the user does not set an interval.
+#: Number of probes of a run if the user sets no interval.
 _PROBES = 8
 
 
@@ -26,13 +26,16 @@ class Diagnostics(Observer):
     every: int | None = Field(
         None, ge=1, description="steps between probes; default: an eighth of the run"
     )
-    views: int = Field(12, ge=2, description="probed training views of each group, at most")
-    grouping: str | None = Field(
-        None, description="which views are near and far; default: the run's grouping, else radial"
+    views: int = Field(
+        12, ge=2, description="maximum number of probed training views of each group"
     )
-    seed: int = Field(0, ge=0, description="seed of the choice of views and of the bootstrap")
+    grouping: str | None = Field(
+        None,
+        description="grouping into near and far views; default: the run's grouping, else radial",
+    )
+    seed: int = Field(0, ge=0, description="seed for the choice of views and for the bootstrap")
 
-    # The results so far; they are not part of the run's state.
+    # The results so far, which are not part of the run's state.
     _run: RunInfo | None = PrivateAttr(default=None)
     _watch: "Watch | None" = PrivateAttr(default=None)
 

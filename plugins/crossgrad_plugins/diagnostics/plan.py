@@ -55,11 +55,11 @@ def require_views(scene: Scene) -> None:
     least = 2 * SMALLEST_GROUP
     if len(scene.train) < least:
         raise UserError(
-            "too few training photos to be probed",
+            "the scene has too few training photos for a probe",
             where=scene.name,
-            expected=f"{least} at least: two groups of {SMALLEST_GROUP}",
+            expected=f"at least {least}: two groups of {SMALLEST_GROUP}",
             found=str(len(scene.train)),
-            todo="take more photos of the scene, or diagnose another one",
+            todo="use more photos of the scene, or diagnose another scene",
         )
 
 
@@ -99,9 +99,9 @@ def plan_probe(
         members = [i for i, own in enumerate(labels) if own == label]
         if len(members) < SMALLEST_GROUP:
             raise UserError(
-                "a probe needs two training views of each group",
+                "a probe needs at least two training views in each group",
                 where=f"grouping {grouping}",
-                found=f"{len(members)} of group {label}",
+                found=f"{len(members)} in group {label}",
                 todo="choose another grouping",
             )
         count = min(per_group, len(members))
@@ -114,7 +114,7 @@ def _outermost(scene: Scene, labels: tuple[str, ...]) -> tuple[str, str]:
     names = sorted(set(labels))
     if len(names) == 1:
         raise UserError(
-            "a probe compares two groups of views",
+            "a probe compares two groups of views, but the grouping made only one",
             where="grouping",
             found=f"one group, {names[0]}",
             todo="choose another grouping",

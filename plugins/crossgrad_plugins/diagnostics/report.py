@@ -165,7 +165,7 @@ def read_probes(path: Path) -> list[Row]:
     """
     if not path.is_file():
         return []
-    todo = "remove the file; the rows of earlier steps are then missing from it"
+    todo = "remove the file; a new file then starts without the rows of earlier steps"
     header, *lines = read_rows(path, "the table of probes", todo) or [[]]
     rows: list[Row] = [dict(zip(header, map(_value, line), strict=False)) for line in lines]
     for line, row in zip(lines, rows, strict=True):
@@ -173,7 +173,7 @@ def read_probes(path: Path) -> list[Row]:
             raise UserError(
                 "the table of probes cannot be read",
                 where=path,
-                expected=f"{len(header)} cells, one of them a step",
+                expected=f"{len(header)} cells, including a step",
                 found=",".join(line),
                 todo=todo,
             )

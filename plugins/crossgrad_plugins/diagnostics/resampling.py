@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from crossgrad_plugins.diagnostics.grouped import GroupedGramian, Groups
 
-#: Minimum number of different cameras of a group in a resample; with fewer it is drawn again,
-#: because it would have no variance.
+#: Minimum number of different cameras of a group in a resample. A resample with fewer cameras would
+#: have no variance, so it is drawn again.
 _FEWEST_CAMERAS = 3
 
 _Array = NDArray[np.float64]
@@ -57,7 +57,8 @@ class GroupResamples:
         halves = (squared[:, None] + squared[None, :] - 2.0 * deviations) / 2.0
         to_others = counts @ halves
         self_share = (counts * counts).sum(axis=1) / n**2
-        # Conditional means of the pair kernel, one per camera, without pairs of a camera's copies.
+        # Conditional means of the pair kernel, one per camera; pairs of copies of a camera are left
+        # out.
         conditional = 2.0 * to_others / (n - counts)
         mean_along = counts @ along / n
         about_along = along[None, :] - mean_along[:, None]

@@ -30,7 +30,7 @@ from crossgrad_plugins.diagnostics.report import Report
 from crossgrad_plugins.diagnostics.table import Row, per_pair_conflict, table
 from crossgrad_plugins.groupings.heights import altitudes, upward
 
-#: Groupings by which the same probe is also evaluated (the paper's prediction P4).
+#: Groupings for which the same probe is also evaluated (the paper's prediction P4).
 GROUPINGS = ("radial", "altitude", "footprint", "kmeans", "gmm")
 
 
@@ -51,7 +51,8 @@ def distances_of(scene: Scene) -> dict[str, NDArray[np.float64]]:
 def camera_rows(scene: Scene) -> list[Row]:
     """Return the bimodality of heights and log-distances, and the variance of the distances."""
     axis, source = upward(scene)
-    # Name -> values, and Var(r) / mean(r)^2 of a distance; heights have an arbitrary origin.
+    # Name -> values of a distance and Var(r) / mean(r)^2. Heights have no such ratio, because their
+    # origin is arbitrary.
     heights = altitudes(scene, scene.train_views, axis)
     samples = {f"height ({source})": (heights, float("nan"))}
     for name, values in distances_of(scene).items():
@@ -89,7 +90,7 @@ def grouping_rows(scene: Scene, measurement: Measurement, seed: int) -> list[Row
         near = plan.near([measurement.views[place] for place in places])
         probed = min(int(near.sum()), int((~near).sum()))
         if probed < SMALLEST_GROUP:
-            rows.append({"grouping": name, "note": "too few probed views in one of its groups"})
+            rows.append({"grouping": name, "note": "one of its groups has too few probed views"})
             continue
         rows += _read_by(plan.grouping, plan.cameras, _part(measurement, places), near)
     return rows
@@ -169,7 +170,7 @@ class Watch:
 
     def due(self, step: int) -> bool:
         """Return True if a probe is due after this step."""
-        # The probe at the end replaces a probe shortly before it.
+        # The probe at the end replaces a probe that was made shortly before.
         return step == self.total or (step % self.every == 0 and step <= self.total - self.every)
 
     @hookimpl
@@ -194,7 +195,11 @@ class Watch:
             UserError: There was no probe.
         """
         if self.last is None:
-            raise UserError("the model was never probed", where=scene.name, todo="train longer")
+            raise UserError(
+                "the model was never probed, because training was too short",
+                where=scene.name,
+                todo="train for more steps",
+            )
         return Report(
             scene=scene.name,
             title=f"{scene.name}: {which}",
@@ -207,6 +212,6 @@ class Watch:
 
 def _shortcomings(measurement: Measurement) -> Iterator[str]:
     if measurement.dropped:
-        yield f"left out, gradient not finite: {', '.join(measurement.dropped)}"
+        yield f"left out, because their gradient is not finite: {', '.join(measurement.dropped)}"
     if measurement.share < 1.0:
-        yield f"gradients of a random {measurement.share:.0%} of the primitives"
+        yield f"gradients of a random {measurement.share:.0%} of the Gaussians"

@@ -128,7 +128,7 @@ def _constant_band(gaussians: Gaussians) -> NDArray[np.float64]:
     if gaussians.colors is not None:
         return (_array(gaussians.colors) - 0.5) / SH_C0
     if gaussians.sh_dc is None:
-        message = "Gaussians carry neither colors nor sh_dc"
+        message = "the Gaussians contain neither colors nor sh_dc"
         raise ValueError(message)
     return _array(gaussians.sh_dc)[:, 0]
 

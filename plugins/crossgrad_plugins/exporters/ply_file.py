@@ -79,12 +79,17 @@ def write_ply(
     valid = _representable(moved)
     if not valid.all():
         moved = moved.selected(valid)
-        notes.append(f"{path.name}: {np.sum(~valid):,} Gaussians that are not finite left out")
+        notes.append(
+            f"{path.name}: {np.sum(~valid):,} Gaussians left out, because they are not finite"
+        )
     tags = [f"{_MODE_TAG} {cloud.render_mode}"]
     if offset.any():
         text = " ".join(_plain(value) for value in offset)
         tags.append(f"{_OFFSET_TAG} {text}")
-        notes.append(f"{path.name}: coordinates are relative to {text} (float32 is too coarse)")
+        notes.append(
+            f"{path.name}: coordinates are relative to {text}, because float32 is not "
+            "precise enough"
+        )
     header = _header(len(moved), [*tags, *comments])
     with atomic_file(path, len(header) + 4 * len(PROPERTIES) * len(moved)) as file:
         file.write(header)
@@ -212,11 +217,11 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
     names = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or any(name not in columns for name in names):
         raise UserError(
-            "PLY file with an unusual number of spherical harmonics",
+            "the PLY file has an unusual number of spherical-harmonics coefficients",
             where=path,
             expected="0, 9, 24 or 45 properties f_rest_0, f_rest_1 ...",
             found=f"{count}",
-            todo="export the file again with whole bands of spherical harmonics",
+            todo="export the file again with complete bands of spherical harmonics",
         )
     return names
 
@@ -224,7 +229,7 @@ def _rest_names(columns: Collection[str], path: Path) -> list[str]:
 def _require_gaussians(count: int, path: Path) -> None:
     if count == 0:
         raise UserError(
-            "PLY file without Gaussians",
+            "the PLY file contains no Gaussians",
             where=path,
             expected="at least one vertex",
             found="0 vertices",
@@ -238,10 +243,10 @@ def _check_rotations(quats: NDArray[np.float32], path: Path) -> None:
     wrong = (lengths < shortest) | (lengths > longest)
     if wrong.any():
         raise UserError(
-            "PLY file with a rotation of length zero or of no length that float32 can square",
+            "the PLY file contains a rotation whose length is zero, too small or too large",
             where=path,
             expected=f"quaternions rot_0 ... rot_3 of length {shortest:g} to {longest:g}",
-            found=f"{int(wrong.sum()):,} of {len(quats):,} out of this range",
+            found=f"{int(wrong.sum()):,} of {len(quats):,} outside this range",
             todo="remove these Gaussians, or export the file again",
         )
 
@@ -254,12 +259,12 @@ def _require_properties(names: Collection[str], path: Path) -> None:
     todo = (
         "decompress it, e.g. with splat-transform"
         if packed
-        else f"--points {path} starts from its points; --init takes a file of Gaussians"
+        else (f"use --points {path} to start from its points; --init needs a file of Gaussians")
         if points
         else "export the Gaussians, not the sparse points or a mesh"
     )
     raise UserError(
-        "compressed PLY file" if packed else "PLY file without Gaussians",
+        "the PLY file is compressed" if packed else "the PLY file contains no Gaussians",
         where=path,
         expected="the properties of a standard 3DGS PLY file",
         found=f"no {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}",  # noqa: PLR2004
@@ -274,7 +279,7 @@ def _check_finite(column: NDArray[np.generic], name: str, path: Path, top: float
     valid = (numbers >= -_LARGEST) & (numbers <= top)
     if not valid.all():
         raise UserError(
-            "PLY file with numbers that are not finite",
+            "the PLY file contains numbers that are not finite",
             where=path,
             found=f"{np.sum(~valid):,} of {len(column):,} values of {name}",
             todo="remove these Gaussians, or export the file again",
@@ -296,7 +301,7 @@ def _offset(comments: Sequence[str], path: Path) -> NDArray[np.float64]:
     offset = np.array([float(word) for word in match.groups()] if match else [np.nan] * 3)
     if not (np.abs(offset) <= _LARGEST).all():
         raise UserError(
-            "PLY file with an unreadable offset",
+            "the coordinate offset in the PLY file cannot be read",
             where=path,
             expected="three numbers",
             found=text,
@@ -309,11 +314,11 @@ def _check_coordinates(comments: Sequence[str], path: Path) -> None:
     found = _tagged(comments, COORDINATES_TAG)
     if found is not None:
         raise UserError(
-            "PLY file in other coordinates than the scene's",
+            "the PLY file uses other coordinates than the scene",
             where=path,
-            expected="the coordinates of the scene's input",
+            expected="the coordinates of the scene's input files",
             found=found,
-            todo="export it again with --coordinates input",
+            todo="export the file again with --coordinates input",
         )
 
 
@@ -324,9 +329,9 @@ def _render_mode(comments: Sequence[str], path: Path) -> RenderMode:
     if text == "mip":
         return "mip"
     raise UserError(
-        "PLY file for another renderer",
+        "the PLY file was made for another renderer",
         where=path,
         expected=f"{_MODE_TAG} default or mip",
         found=text,
-        todo=f"remove the comment if its Gaussians are meant to be drawn as in {_MODE_TAG} default",
+        todo=f"remove the comment if the Gaussians should be rendered as with {_MODE_TAG} default",
     )

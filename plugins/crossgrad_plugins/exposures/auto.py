@@ -27,7 +27,7 @@ class Auto(Exposure):
     def fitted_to(self, scene: Scene) -> Fitted:
         gains = deciding_gains(scene)
         if gains.differ:
-            # Imported late, because a run without exposure does not need it.
+            # Import it here, because a run without exposure does not need it.
             from crossgrad_plugins.exposures.gain import Gain
 
             # The messages of `Gain` contain the evidence.
@@ -64,4 +64,4 @@ class NoExposure(Exposure):
             return ()
         if not gains.differ:
             return ()
-        return (f"the photos differ in exposure, which --exposure gain models: {gains.evidence}",)
+        return ((f"the photos differ in exposure, which --exposure gain models: {gains.evidence}"),)

@@ -39,7 +39,7 @@ def _of_file(path: Path) -> float | None:
     try:
         with opened(path, "the photo's EXIF header cannot be read") as image:
             return _value(image)
-    except UserError:  # Decoding the photo raises it again, if it is one of the photo.
+    except UserError:  # If the photo itself is damaged, decoding raises the error again.
         return None
 
 

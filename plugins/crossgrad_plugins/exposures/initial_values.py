@@ -25,9 +25,10 @@ _FAR = 4.0
 _NAMED = 3
 #: Maximum number of neighbours that predict a photo.
 TELLING = 4
-#: Up to this number of photos, neighbours and regimes predict each photo alike.
+#: Up to this number of photos, neighbours and regimes predict every photo equally well.
 _SAME = 2
-#: Smaller distances count as this one, so that a photo taken twice does not outweigh all others.
+#: Smaller distances are set to this distance, so that a photo taken twice does not outweigh all
+#: others.
 _NEAREST = 1e-3
 _Floats: TypeAlias = NDArray[np.float64]
 # Cached, because a run requests each held-out photo at every evaluation, and scenes do not change.
@@ -56,7 +57,10 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     """
     names = [view.name for view in scene.train_views]
     if len(names) == 1:
-        return Starts(np.zeros(1), ("exposure: one training photo has no other to differ from",))
+        return Starts(
+            np.zeros(1),
+            ("exposure: there is only one training photo, so there are no differences",),
+        )
     tracks = training_gains(scene) if start in {"auto", "tracks"} else None
     told = exposure_values(scene) if start in {"auto", "exif"} else {}
     of_tracks: dict[str, float] = {}
@@ -71,14 +75,15 @@ def starts_of(scene: Scene, start: Start) -> Starts:
     messages = [] if tracks is None else [f"exposure: {tracks.evidence}"]
     messages += _reported_by("EXIF", [name for name in of_exif if name not in of_tracks])
     if start != "none":
-        messages += _reported_by(f"{by}, for want of usable tracks and EXIF", rest)
+        messages += _reported_by(f"{by}, because there are no usable tracks and no EXIF data", rest)
     messages += outliers(names, stops)
     if scene.test_views and neighbours_of(scene).tell(stops[:, None]):
         near, regime = neighbours_of(scene).errors(stops[:, None])
         messages.append(
-            "exposure: held-out photos without EXIF are told from the training photos nearest in "
-            f"pose: off by {near:.2f} stops (root mean square) where each training photo is left "
-            f"out, the mean of its regime by {regime:.2f}"
+            "exposure: held-out photos without EXIF data get the exposure of the "
+            "training photos with the nearest poses: leave-one-out error on training "
+            f"photos {near:.2f} stops (root mean square), with the mean of the regime "
+            f"{regime:.2f}"
         )
     return Starts(stops, tuple(messages))
 
@@ -105,7 +110,7 @@ def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[
         for row in missing:
             rows, weights = neighbours.rows_and_weights(views[row].camera)
             filled[row] = weights @ told[rows]
-        return filled, "the photos nearest in pose"
+        return filled, "the photos with the nearest poses"
     for row in missing:
         own = [each for each in known if views[each].regime == views[row].regime]
         filled[row] = stops[own or known].mean()
@@ -114,7 +119,10 @@ def _filled(stops: NDArray[np.float64], views: Sequence[View]) -> tuple[NDArray[
 
 def _reported_by(source: str, names: Sequence[str]) -> Iterable[str]:
     if names:
-        yield f"exposure: {len(names)} photos start from {source} ({_some(names)})"
+        yield (
+            f"exposure: the initial values of {len(names)} photos come from {source} "
+            f"({_some(names)})"
+        )
 
 
 def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
@@ -122,9 +130,9 @@ def outliers(names: Sequence[str], stops: Iterable[float]) -> Iterable[str]:
     far = [name for name, stop in zip(names, stops, strict=True) if abs(stop) > _FAR]
     if far:
         yield (
-            f"exposure: {len(far)} photos are more than {_FAR:g} stops from the mean "
-            f"({_some(far)}): little of what they show can be told from black or white; leaving "
-            "them out may be better"
+            f"exposure: {len(far)} photos differ by more than {_FAR:g} stops from the "
+            f"mean ({_some(far)}); they are almost black or white, and leaving them out "
+            "may give better results"
         )
 
 
@@ -191,7 +199,7 @@ class Neighbours:
         """The other photos [P, N] that predict each photo, and their weights."""
         count = min(TELLING + 1, len(self._places))
         rows, weights = self._told(self._places, count)
-        # Photos at the same position come in any order, so a photo is excluded wherever it appears.
+        # Photos at the same position can be in any order, so exclude the photo wherever it appears.
         weights[rows == np.arange(len(rows))[:, None]] = 0.0
         return rows, weights / weights.sum(axis=1, keepdims=True)
 

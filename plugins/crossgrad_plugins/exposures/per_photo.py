@@ -28,13 +28,13 @@ class ExposurePerPhoto(Exposure):
     parameter: ClassVar[str]
 
     rate: float = Field(
-        0.002, ge=0, description="learning rate at the start of the run; 0 keeps the start"
+        0.002, ge=0, description="learning rate at the start of the run; 0 keeps the initial values"
     )
-    decay: float = Field(0.01, gt=0, le=1, description="what is left of the rate at the end")
+    decay: float = Field(0.01, gt=0, le=1, description="factor of the learning rate at the end")
     start: Start = Field(
         "auto",
-        description="where the values start: tracks (SfM observations), exif, none (neutral), or "
-        "auto: tracks, else EXIF",
+        description="initial values: tracks (SfM observations), exif, none (neutral), or auto: "
+        "tracks, else EXIF",
     )
 
     @abstractmethod
@@ -107,4 +107,4 @@ class ExposurePerPhoto(Exposure):
         """Report `decay` as unused if the rate is 0."""
         if self.rate:
             return {}
-        return {"decay": "exposure.rate is 0: the values stay where they start"}
+        return {"decay": "exposure.rate is 0: the values do not change"}

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum deviation of a rotation with rounded digits; it is made orthonormal again.
+#: Maximum deviation of a rotation whose digits were rounded; the rotation is made orthonormal
+#: again.
 _ROUNDED: Final = 1e-3
 _EXACT: Final = 1e-12
 _LAST_ROW: Final = np.array([0.0, 0.0, 0.0, 1.0])
@@ -19,8 +20,8 @@ FEWEST, _FEWEST_TO_REJECT = 3, 8
 #: Number of triples that are tried, maximum number of points per trial, and maximum number of
 #: rejection passes.
 _TRIPLES, _MOST_TRIED, _PASSES = 500, 100, 50
-#: Residuals beyond this many medians are outliers. Of normal errors, one in 10^5 is beyond it if
-#: two axes have equal errors, and fewer if three have.
+#: Residuals beyond this many medians are outliers. One of 10^5 normal errors exceeds it if two axes
+#: have equal errors, and fewer exceed it if three axes have equal errors.
 _FAR: Final = 4.0
 #: Residuals below this share of the extent are rounding errors.
 _ROUNDING: Final = 1e-9
@@ -124,7 +125,7 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
     than half of the points agree.
     """
     if len(points) < FEWEST:
-        return f"there are {len(points)} of them, and {FEWEST} are needed"
+        return f"there are {len(points)} of them, but at least {FEWEST} are needed"
     kept = np.ones(len(points), dtype=bool)
     if len(points) >= _FEWEST_TO_REJECT:
         kept = _agreeing(points, measured)
@@ -136,10 +137,10 @@ def fit_similarity(points: NDArray[np.float64], measured: NDArray[np.float64]) -
     along, *across = np.linalg.svd(posed, compute_uv=False)
     width = float(np.hypot(*across))
     if not along > 0.0:
-        return "they stand all at one place"
+        return "they are all at the same position"
     tilt = sigma / width if width > _THINNEST * along else np.inf
     if tilt > _LARGEST_TILT:
-        return "they stand in one line, or closer to one than their errors: any turn about it fits"
+        return "they are on a line, within their errors, so the rotation about it is unknown"
     return Fit(frame, errors, kept, tilt)
 
 
@@ -155,7 +156,8 @@ def _agreeing(points: NDArray[np.float64], measured: NDArray[np.float64]) -> NDA
     best = int(np.argmin(medians))
     frame = Frame3D(rotations[best], shifts[best], float(scales[best]))
     least = _ROUNDING * float(np.abs(measured - measured.mean(axis=0)).max())
-    # The residuals are computed again with other rounding; half of the points must remain.
+    # The residuals are computed again with other rounding, but at least half of the points must
+    # remain.
     half = max(float(medians[best]) * (1.0 + _ROUNDING), least)
     kept = np.linalg.norm(measured - frame.points(points), axis=1) <= half
     for _ in range(_PASSES):

@@ -20,7 +20,7 @@ _SHOWN: Final = 80
 GEOCENTRIC: Final = "epsg:4978"
 #: Distance in metres on both sides of a place between which a projection is linearized.
 _NEAR: Final = 10.0
-#: Accuracy in metres that needs no message.
+#: Accuracy in metres for which no message is needed.
 _KNOWN_WELL: Final = 1.0
 #: Maximum relative difference of scale between directions; a UTM zone has 0.001.
 _UNEVEN: Final = 0.005
@@ -59,9 +59,9 @@ class Projection:
             from pyproj.exceptions import CRSError, ProjError
         except ImportError as error:
             raise UserError(
-                "coordinates of an EPSG code need pyproj",
+                "coordinates of an EPSG code need the package pyproj",
                 where=where,
-                found="it is not installed",
+                found="pyproj is not installed",
                 todo='pip install "crossgrad[geo]"',
             ) from error
         try:
@@ -80,9 +80,14 @@ class Projection:
     def messages(self) -> tuple[str, ...]:
         """Messages about the accuracy of coordinates in this system."""
         if self.accuracy is None:
-            return (f"{self.code}: PROJ does not say how exactly; it may be off by metres",)
+            return (
+                (
+                    f"{self.code}: PROJ does not report the accuracy; positions may be wrong by "
+                    "metres"
+                ),
+            )
         if self.accuracy > _KNOWN_WELL:
-            return (f"{self.code}: exact to {self.accuracy:g} m, says PROJ",)
+            return (f"{self.code}: accurate to {self.accuracy:g} m, according to PROJ",)
         return ()
 
     def points(self, geocentric: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,35 +114,36 @@ class Projection:
         here, *sides = self.points(to_enu.inverse.points(ends))
         stretch = (np.array(sides[:3]) - np.array(sides[3:])).T / (2.0 * _NEAR)
         if not np.isfinite(stretch).all():
-            raise self._unusable(where, "the scene is outside of where it is defined")
+            raise self._unusable(where, "the scene is outside the area of the coordinate system")
         left, sizes, right = np.linalg.svd(stretch)
         rotation = left @ right
         if np.linalg.det(rotation) < 0.0:
             raise self._unusable(where, "its axes are left-handed")
         if sizes[0] > (1.0 + _UNEVEN) * sizes[2]:
             raise self._unusable(
-                where, f"a metre is {sizes[2]:.4g} to {sizes[0]:.4g} units, by direction"
+                where,
+                f"one metre is {sizes[2]:.4g} to {sizes[0]:.4g} units, depending on the direction",
             )
         scale = float(np.cbrt(sizes.prod()))
         return Frame3D(rotation, here - scale * rotation @ place, scale)
 
     def _unusable(self, where: str, found: str) -> UserError:
         return UserError(
-            f"Gaussians cannot be written in {self.code}",
+            f"Gaussians cannot be exported in {self.code}",
             where=where,
             expected="a right-handed system with the same unit on all axes",
             found=found,
-            todo="take UTM (--coordinates utm), or enu",
+            todo="use UTM (--coordinates utm) or enu",
         )
 
 
 def _unknown(where: str, found: str) -> UserError:
     return UserError(
-        "PROJ cannot compute these coordinates",
+        "PROJ cannot convert to these coordinates",
         where=where,
         found=found,
-        todo="check the code, or take one of WGS 84 or ETRS89 without a height system, such as "
-        "epsg:32633 or epsg:25833",
+        todo="check the code, or use a code of WGS 84 or ETRS89 without a height system, "
+        "such as epsg:32633 or epsg:25833",
     )
 
 

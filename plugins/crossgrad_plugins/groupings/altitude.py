@@ -37,11 +37,12 @@ class Altitude(Grouping):
 
     up: Literal["auto", "cameras", "pca"] | tuple[float, float, float] = Field(
         "auto",
-        description="the upward axis: x, y, z in the scene's frame; cameras: mean of the cameras' "
-        "up axes; pca: axis of least variance of the positions; auto: cameras where they agree",
+        description="upward axis: x, y, z in the scene's frame; cameras: mean of the cameras' up "
+        "axes; pca: axis of least variance of the positions; auto: cameras if their "
+        "up axes agree, else pca",
     )
     cut: Literal["median", "otsu", "gap"] = Field(
-        "median", description="median height, Otsu's threshold, or the widest gap"
+        "median", description="threshold: median height, Otsu's threshold, or the widest gap"
     )
 
     @override

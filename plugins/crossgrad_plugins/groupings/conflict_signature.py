@@ -47,9 +47,11 @@ class ConflictSignature(Regrouping):
 
     needs_probe: ClassVar[bool] = True
 
-    at: int = Field(500, ge=1, description="step after which gradients group the views")
+    at: int = Field(
+        500, ge=1, description="step after which the views are grouped by their gradients"
+    )
     cameras: int = Field(
-        96, ge=2, description="probe at most so many training views, evenly spaced by name"
+        96, ge=2, description="maximum number of probed views, evenly spaced by name"
     )
 
     @override
@@ -59,7 +61,7 @@ class ConflictSignature(Regrouping):
         require_training_views(scene, "conflict-signature")
         if probe is None:
             early = Radial().fit(scene, rng)
-            later = f"grouping conflict-signature: by gradients after step {self.at}, until then:"
+            later = f"grouping conflict-signature: by gradients after step {self.at}, before that:"
             return GroupingRule(early.labels, (later, *early.notes))
         count = min(self.cameras, len(scene.train))
         probed = np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))
@@ -68,14 +70,17 @@ class ConflictSignature(Regrouping):
         chosen = [scene.train_views[i] for i in probed]
         near = smaller_mean_first(sides, radial_distances(scene, chosen))
         train = [NEAR if side == near else FAR for side in sides]
-        require_groups("conflict-signature", train, (NEAR, FAR), "the directions of gradients")
+        require_groups("conflict-signature", train, (NEAR, FAR), "gradient directions")
         tree = cKDTree(centers_of(chosen))
 
         def labels(views: Sequence[View]) -> tuple[str, ...]:
             _, nearest = tree.query(centers_of(views))
             return tuple(train[i] for i in nearest)
 
-        note = f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed are near"
+        note = (
+            f"grouping conflict-signature: {train.count(NEAR)} of {len(train)} probed "
+            "views are near"
+        )
         return GroupingRule(labels, (note,))
 
     @property
@@ -90,9 +95,9 @@ class ConflictSignature(Regrouping):
         try:
             return self.fit(model.scene, rng, ModelProbe(model, rng))
         except UserError as error:
-            # Gradients that all agree form one group; the run then keeps its present groups.
+            # If all gradients agree, they form one group, and the run keeps its present groups.
             early = Radial().fit(model.scene, rng)
-            return GroupingRule(early.labels, (f"the groups stay as they are: {error.what}",))
+            return GroupingRule(early.labels, (f"the groups do not change: {error.what}",))
 
 
 def mean_cosines(gramians: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -120,11 +125,12 @@ def spectral_cut(cosines: NDArray[np.float64]) -> NDArray[np.int64]:
     root = np.sqrt(similarity.sum(axis=1))
     # The second smallest eigenvalue of I - S is the second largest of S. The largest eigenvalue of
     # S is 1, with a known eigenvector. Two groups without any similarity have the eigenvalue 1
-    # twice; removing the known eigenvector leaves the other one.
+    # twice, so the known eigenvector is removed to find the other one.
     scaled = similarity / root[:, None] / root[None, :]
     first = root / np.linalg.norm(root)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2.0 - 2.0 * np.outer(first, first))
-    # The known eigenvalue is -1 now, and no other is smaller. For two identical cameras 0 remains.
+    # The known eigenvalue is now -1, and no other eigenvalue is smaller. For two identical cameras
+    # the other eigenvalue is 0.
     if len(values) == 1 or min(values[-1], values[-1] - values[-2]) <= _SMALLEST_GAP:
         return np.zeros(len(values), dtype=np.int64)
     return (vectors[:, -1] > 0.0).astype(np.int64)

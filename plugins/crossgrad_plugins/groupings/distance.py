@@ -104,7 +104,9 @@ class Anchors(Grouping):
 
     labels: ClassVar[tuple[str, ...]] = (NEAR, MIDDLE, FAR)
 
-    share: float = Field(0.3, gt=0.0, le=0.5, description="share of the cameras on either side")
+    share: float = Field(
+        0.3, gt=0.0, le=0.5, description="share of the cameras in each of the two groups"
+    )
 
     @override
     def fit(
@@ -136,7 +138,7 @@ def rule_by_shares(
     low, high = (float(bound) for bound in np.quantile(train, (share, 1.0 - share)))
     quantity = "distance from their mean"
     require_groups(grouping, _three(train, low, high), needed, quantity)
-    note = f"grouping {grouping}: near up to {low:.4g}, far beyond {high:.4g} local units"
+    note = f"grouping {grouping}: near up to {low:.4g}, far above {high:.4g} local units"
     return GroupingRule(lambda views: _three(radial_distances(scene, views), low, high), (note,))
 
 

@@ -53,10 +53,10 @@ class Footprint(Grouping):
         blind = np.isnan(own)
         if blind.all():
             raise UserError(
-                "grouping footprint needs SfM points that the photos show",
+                "grouping footprint needs SfM points that are visible in photos",
                 where=scene.name,
-                found="no SfM point in any training image",
-                todo="choose grouping radial, which needs camera positions only",
+                found="no SfM point is visible in a training photo",
+                todo="choose grouping radial, which needs only camera positions",
             )
         known, places = own[~blind], scene.centers[~blind]
 
@@ -69,7 +69,10 @@ class Footprint(Grouping):
         require_groups("footprint", halves(train, threshold), (NEAR, FAR), "projected footprint")
         note = f"grouping footprint: near from {-threshold:.4g} pixels per local unit"
         if blind.any():
-            note += f"; training views without SfM points go with the nearest other: {blind.sum()}"
+            note += (
+                "; training views without SfM points join the group of the nearest other "
+                f"view: {blind.sum()}"
+            )
         return GroupingRule(lambda views: halves(sizes(views), threshold), (note,))
 
     @override

@@ -38,7 +38,9 @@ class GaussianMixture(Grouping):
     Source: expectation maximisation (Dempster et al. 1977) in one dimension.
     """
 
-    restarts: int = Field(10, ge=1, description="starting points; the most likely fit is kept")
+    restarts: int = Field(
+        10, ge=1, description="number of random starts; the most likely fit is used"
+    )
 
     @override
     def fit(
@@ -50,7 +52,7 @@ class GaussianMixture(Grouping):
         mixture = _fit(np.log(away), self.restarts, rng)
         if mixture is None or len(set(mixture.labels(away))) == 1:
             median = Radial().fit(scene, rng)
-            fallback = "grouping gmm: the mixture is degenerate, the median split is used instead"
+            fallback = "grouping gmm: the mixture is degenerate; the median split is used instead"
             return GroupingRule(median.labels, (fallback, *median.notes))
         near, far = np.exp(mixture.means)
         note = f"grouping gmm: components at {near:.4g} and {far:.4g} local units"
@@ -121,7 +123,8 @@ def _maximised(
     likelihood: float,
 ) -> _Mixture:
     """Return the mixture with the weighted moments of the cameras; shares [N, 2] are weights."""
-    # A component without any camera keeps finite numbers; `_usable` rejects it by its weight.
+    # A component without any camera keeps finite values; `_usable` rejects it because of its
+    # weight.
     totals = np.maximum(shares.sum(axis=0), np.finfo(np.float64).tiny)
     means = (shares * logs[:, None]).sum(axis=0) / totals
     squares = (shares * (logs[:, None] - means) ** 2).sum(axis=0) / totals

@@ -21,8 +21,8 @@ def altitudes(scene: Scene, views: Sequence[View], up: NDArray[np.float64]) -> N
 
     Rounding differences between equal heights are removed, as in `radial_distances`.
     """
-    # Not a matrix product: its rounding depends on the number of rows, and a median threshold
-    # equals one of the heights exactly.
+    # Do not use a matrix product: its rounding depends on the number of rows, and a median
+    # threshold equals one of the heights exactly.
     return without_rounding(scene, ((centers_of(views) - scene.middle) * up).sum(axis=1))
 
 
@@ -45,10 +45,10 @@ def upward(scene: Scene, up: Up = "auto") -> tuple[NDArray[np.float64], str]:
         return _flattest(scene), "axis of least variance of the camera positions"
     if length < _SHORTEST_MEAN:
         raise UserError(
-            "the cameras' up axes cancel",
+            "the upward direction cannot be computed: the up axes of the cameras cancel out",
             where="up",
-            expected="cameras that are held upright more often than not",
-            todo="set up to pca or to an axis such as [0, 0, 1]",
+            expected="most cameras held upright",
+            todo="set `up` to pca or to an axis such as [0, 0, 1]",
         )
     return axis / length, "mean of the cameras' up axes"
 
@@ -58,11 +58,11 @@ def _given(up: tuple[float, float, float]) -> NDArray[np.float64]:
     length = float(np.linalg.norm(axis))
     if not np.isfinite(length) or length == 0.0:
         raise UserError(
-            "an upward axis needs a direction",
+            "the upward axis is not a valid direction",
             where="up",
-            expected="three finite numbers that are not all zero",
+            expected="three finite numbers, not all of them zero",
             found=str(list(up)),
-            todo="give the axis as three numbers, such as [0, 0, 1], or leave it on auto",
+            todo="give the axis as three numbers, such as [0, 0, 1], or use auto",
         )
     return axis / length
 

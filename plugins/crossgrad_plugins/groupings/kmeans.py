@@ -33,7 +33,9 @@ class KMeans(Grouping):
     Source: Lloyd's algorithm with k-means++ seeding (Arthur and Vassilvitskii 2007).
     """
 
-    restarts: int = Field(10, ge=1, description="seedings; the tightest clustering is kept")
+    restarts: int = Field(
+        10, ge=1, description="number of random starts; the tightest clustering is used"
+    )
 
     @override
     def fit(

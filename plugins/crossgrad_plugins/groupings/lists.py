@@ -57,7 +57,7 @@ def read_labels(path: Path) -> dict[str, str]:
     Raises:
         UserError: The file is missing, a row does not have two columns, or a name has two labels.
     """
-    todo = "check the path; the file is text in UTF-8 with rows `name,label`"
+    todo = "check the path; the file must be UTF-8 text with rows `name,label`"
     rows = [row for row in read_rows(path, "the list of labels", todo) if row]
     table: dict[str, str] = {}
     for row in rows:
@@ -66,16 +66,17 @@ def read_labels(path: Path) -> dict[str, str]:
         cells = [cell.strip() for cell in row]
         if len(cells) != 2 or not all(cells):  # noqa: PLR2004 - a name and a label
             raise UserError(
-                "a row of the list of labels is not a name and a label",
+                "a row in the list of labels does not consist of a name and a label",
                 where=path,
                 expected="image.jpg,near",
                 found=",".join(row),
-                todo="write two columns: a view (or folder, ending with a slash) and its label",
+                todo="write two columns: the name of a view (or of a folder, ending with a slash) "
+                "and its label",
             )
         name, label = cells
         if table.setdefault(name, label) != label:
             raise UserError(
-                "a view has two labels",
+                "a view has two labels in the list",
                 where=path,
                 found=f"{name}: {table[name]}, {label}",
                 todo="remove one of the two rows",
@@ -98,9 +99,9 @@ def _listed(name: str, table: Mapping[str, str], path: Path) -> str:
         if folder in table:
             return table[folder]
     raise UserError(
-        "a view has no label",
+        "a view has no label in the list",
         where=path,
-        expected="a row for every view, or for a folder that holds it",
+        expected="a row for every view, or for a folder that contains it",
         found=name,
         todo=f"add the row `{name},LABEL`",
     )
@@ -111,15 +112,15 @@ def _require_two(train: set[str], path: Path | None) -> None:
         return
     if path is None:
         raise UserError(
-            "grouping lists finds one folder of training views only",
+            "grouping lists found training views in only one folder",
             where="grouping",
-            expected="photos in two or more folders below the image folder, or a file",
+            expected="photos in at least two folders below the image folder, or a file of labels",
             todo="name a CSV file (view name, label): --set grouping.file=labels.csv",
         )
     raise UserError(
-        "the list of labels gives all training views one label",
+        "all training views have the same label in the list",
         where=path,
-        expected="two labels or more",
+        expected="at least two different labels",
         found=", ".join(sorted(train)),
         todo="give some training views another label, or choose another grouping",
     )

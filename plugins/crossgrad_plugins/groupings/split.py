@@ -10,7 +10,7 @@ from crossgrad_core.plugin import GroupingRule, Quantity, Scene, UserError, View
 
 #: The threshold between near and far: the median distance, or Otsu's threshold of its logarithm.
 Cut: TypeAlias = Literal["median", "otsu"]
-CUT: Final = "where near ends: the median, or Otsu's cut of the logarithms"
+CUT: Final = "threshold between near and far: the median, or Otsu's threshold of the logarithms"
 NEAR, MIDDLE, FAR = "near", "middle", "far"
 
 
@@ -64,7 +64,7 @@ def require_training_views(scene: Scene, grouping: str) -> None:
     """
     if not scene.train:
         raise UserError(
-            f"grouping {grouping} has no training views to be fitted on",
+            f"grouping {grouping} cannot be computed: there are no training views",
             where=scene.name,
             todo="check the split: --split none trains on all images",
         )
@@ -88,12 +88,12 @@ def require_groups(
     if all(counts.values()):
         return
     raise UserError(
-        f"grouping {grouping} leaves a group without training views",
+        f"grouping {grouping} left a group without training views",
         where="grouping",
         expected=f"training views that differ in {quantity}",
         found=", ".join(f"{label}: {count}" for label, count in counts.items()),
-        todo="choose another grouping (lists takes folders or your own lists), "
-        "or, for a run, a sampler that needs none (epoch, random)",
+        todo="choose another grouping (lists uses folders or your own lists), or, for a "
+        "run, a sampler without groups (epoch, random)",
     )
 
 

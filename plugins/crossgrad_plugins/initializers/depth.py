@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 #: Number of neighbours whose distance from the plane is used.
 _NEIGHBOURS = 8
-#: In units of the longer side. Below the first value, all distances have the same weight. A point
-#: at the second value has the same weight as the plane.
+#: Distances in units of the longer side. All distances below the first value have the same weight.
+#: At the second value, a point has the same weight as the plane.
 _BLUR, _REACH = 0.02, 0.1
 #: The largest depth of a photo, as a multiple of the depth of its farthest points.
 _FARTHEST = 2.0

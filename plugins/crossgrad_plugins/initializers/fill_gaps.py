@@ -16,15 +16,17 @@ from crossgrad_plugins.initializers.depth import Depth, Sky, from_the_middle
 
 #: Number of observed points that a photo needs for an estimate of its depth.
 FEWEST: Final = 8
-#: Standard deviation of an added Gaussian, as a share of its cell's side.
+#: Standard deviation of an added Gaussian, as a share of the side of its cell.
 _SIZE: Final = 0.8
 _NEAREST: Final = 3
-#: A photo does not show points farther away than this multiple of its depth there.
+#: A photo does not show points that are farther away than this multiple of its depth at that
+#: position.
 _BEHIND: Final = 1.5
-#: A camera stands on the ground of a photo if its distance is at least this share of the photo's
+#: A camera is above the ground of a photo if its distance is at least this share of the photo's
 #: depth there, and if the ray down to it is at least this steep (sine).
 _GROUND, _STEEP = 0.75, 0.3
-#: Number of points that are used to find the extent of the scene, and the share that is not stray.
+#: Number of points from which the extent of the scene is computed, and the share of points that are
+#: not stray.
 _POINTS, _NOT_STRAY = 1000, 0.98
 
 
@@ -57,7 +59,7 @@ class _Filling:
         self.colors.append(colors)
 
 
-#: Results per scene; they are dropped with the scene.
+#: Cache of the results per scene; they are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Filled, _Filling]]" = WeakKeyDictionary()
 
 
@@ -70,12 +72,15 @@ class Filled(Initializer):
     hole. Ours.
     """
 
-    cells: int = Field(12, ge=2, le=200, description="along the longer side of a photo")
+    cells: int = Field(12, ge=2, le=200, description="points along the longer side of a photo")
     margin: float = Field(
-        0.5, ge=0.0, le=2.0, description="beyond each edge, in longer sides of the photo; 0: none"
+        0.5,
+        ge=0.0,
+        le=2.0,
+        description="margin beyond each edge of the photo, as a share of its longer side; 0: none",
     )
-    opacity: float = Field(0.5, gt=0.0, lt=1.0, description="of the added Gaussians")
-    views: int = Field(200, ge=1, description="photos that are looked at, at most")
+    opacity: float = Field(0.5, gt=0.0, lt=1.0, description="opacity of the added Gaussians")
+    views: int = Field(200, ge=1, description="maximum number of photos to fill")
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
@@ -94,10 +99,13 @@ class Filled(Initializer):
     def messages(self, scene: Scene) -> tuple[str, ...]:
         filling = self._filling(scene)
         beyond = len(filling.points) - len(scene.points) - filling.inside
-        aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were left aside"
+        aside = f"; {filling.left_aside} photos with fewer than {FEWEST} points were skipped"
         return (
-            f"start: {filling.inside} Gaussians fill what photos show without points, {beyond} "
-            f"stand beyond their edges{aside if filling.left_aside else ''}",
+            (
+                f"start: {filling.inside} Gaussians added inside photos where there are no "
+                f"points, {beyond} beyond the edges of "
+                f"photos{(aside if filling.left_aside else '')}"
+            ),
         )
 
     def _filling(self, scene: Scene) -> _Filling:
@@ -119,8 +127,8 @@ class Filled(Initializer):
         }
         known = [(view, depth) for view in views if (depth := deep[view]) is not None]
         filling.left_aside = len(views) - len(known)
-        # Near photos are filled first, with small Gaussians, so that no large ones are needed
-        # behind.
+        # Fill near photos first, with small Gaussians, so that no large Gaussians are needed behind
+        # them.
         known.sort(key=lambda each: each[1].median)
         air = _Air.of(known)
         for view, depth in known:
@@ -128,8 +136,8 @@ class Filled(Initializer):
         filling.inside = len(filling.points) - len(scene.points)
         if margin and known:
             pictures = _Pictures.of(deep)
-            # A camera may be on ground that another photo shows from above. The other photo shows,
-            # or hides, the surroundings of this camera.
+            # A camera may be above ground that another photo shows. The other photo then shows, or
+            # hides, the surroundings of this camera.
             centers = np.stack([view.camera.center.numpy() for view, _ in known])
             low = pictures.look_down_on(centers, sky.up)
             high = [each for each, inside in zip(known, low, strict=True) if not inside]
@@ -308,7 +316,7 @@ class _Pictures:
         homogeneous = np.column_stack([points, np.ones(len(points))])
         around = np.einsum("vij,nj->vni", self.matrices, homogeneous)
         pixels, depth = around[..., :2], around[..., 2]
-        # Both sides are multiplied by the depth, so that no division by zero can occur.
+        # Multiply both sides by the depth, so that no division by zero can occur.
         inside = ((pixels >= 0.0) & (pixels <= self.ends * depth[..., None])).all(axis=2)
         return pixels, depth, np.asarray(inside & (depth > 0.0))
 

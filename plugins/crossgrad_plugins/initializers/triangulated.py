@@ -22,17 +22,17 @@ from crossgrad_core.plugin import (
 )
 from crossgrad_core.scene.pycolmap_guard import guard_pycolmap
 
-#: Cosine of the largest angle between the axes of two cameras that are compared.
+#: Cosine of the largest angle between the axes of two cameras whose photos are matched.
 _ASKEW: Final = 0.5
 _FEWEST: Final = 3
 _GREY: Final = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
-#: Results per scene; they are dropped with the scene.
+#: Cache of the results per scene; they are deleted together with the scene.
 _KNOWN: "WeakKeyDictionary[Scene, dict[Triangulated, MorePoints]]" = WeakKeyDictionary()
 #: Lowe's ratio of the distance to the nearest descriptor to the distance to the second nearest
 #: (SIFT, section 7.1).
 _RATIO: Final = 0.8
-#: Smallest and largest angle between two rays. At smaller angles the intersection is not well
-#: defined; at larger angles the features are not the same.
+#: Smallest and largest angle between two rays. At smaller angles the intersection is inaccurate; at
+#: larger angles the features show different surfaces.
 _SMALLEST, _LARGEST = np.deg2rad(1.5), np.deg2rad(60.0)
 
 
@@ -78,10 +78,14 @@ class Triangulated(Initializer):
 
     alone: ClassVar[bool] = True
 
-    views: int = Field(200, ge=2, description="photos that are looked at, at most")
-    neighbours: int = Field(4, ge=1, le=50, description="photos that each one is compared with")
-    features: int = Field(2048, ge=16, le=65_536, description="features of a photo, at most")
-    pixels: float = Field(2.0, gt=0.0, description="of a point from its feature, at most")
+    views: int = Field(200, ge=2, description="maximum number of photos to match")
+    neighbours: int = Field(
+        4, ge=1, le=50, description="number of photos that each photo is matched with"
+    )
+    features: int = Field(
+        2048, ge=16, le=65_536, description="maximum number of features per photo"
+    )
+    pixels: float = Field(2.0, gt=0.0, description="maximum reprojection error of a point")
 
     @override
     def more_points(self, scene: Scene) -> MorePoints | None:
@@ -96,7 +100,7 @@ class Triangulated(Initializer):
     def messages(self, scene: Scene) -> tuple[str, ...]:
         more = self.more_points(scene)
         if more is None:
-            return ("start: the scene has points; none are triangulated",)
+            return ("start: the scene has points, so none are triangulated",)
         return (f"start: {len(more.positions)} points triangulated from pairs of photos",)
 
     def _found(self, scene: Scene) -> MorePoints:
@@ -107,11 +111,11 @@ class Triangulated(Initializer):
         kept = _best(pairs, met)
         if len(kept) < _FEWEST:
             raise UserError(
-                "no points could be triangulated",
+                "no points could be triangulated from the photos",
                 where=scene.name,
-                expected=f"at least {_FEWEST} points that two photos show",
+                expected=f"at least {_FEWEST} points, each visible in two photos",
                 found=f"{len(kept)} in {len(pairs)} pairs of photos",
-                todo="check that poses and photos belong together, or start from the points of a "
+                todo="check that the poses belong to the photos, or start from the points of a "
                 "file (--points FILE) or from random points (--init random)",
             )
         unknown = np.full(len(kept), np.nan)

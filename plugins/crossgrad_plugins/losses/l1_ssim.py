@@ -132,7 +132,7 @@ class L1SSIM(Loss):
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), eq. 7, with 1 - SSIM as D-SSIM.
     """
 
-    ssim_weight: float = Field(0.2, ge=0, le=1, description="w, share of 1 - SSIM in the loss")
+    ssim_weight: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss")
 
     @override
     def loss(

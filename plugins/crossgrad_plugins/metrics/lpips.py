@@ -29,8 +29,9 @@ def figure_of(name: str, label: str, net: Trunk, entry: str, scaling: str) -> Fi
         name=name,
         label=label,
         definition=f"LPIPS 0.1 with {net.name}, {scaling}; masked pixels are black in both images",
-        undefined=f"LPIPS needs the pretrained {net.name}, which no Python package ships: "
-        f"--set metrics.{entry}.trunk=FILE names it, for example {net.published} of torchvision",
+        undefined=f"LPIPS needs the pretrained {net.name}, which no Python package contains: "
+        f"name it with --set metrics.{entry}.trunk=FILE, for example {net.published} "
+        "of torchvision",
         falls=True,
     )
 
@@ -51,13 +52,13 @@ class Perceptual(Metric):
 
     trunk: Path | None = Field(
         None,
-        description="file with the network's weights as torchvision publishes them "
-        "(.pth or .safetensors); null without",
+        description="file with the weights of the network as torchvision publishes them (.pth or "
+        ".safetensors); null: LPIPS is not computed",
     )
     heads: Path | None = Field(
         None,
-        description="file with the linear heads of LPIPS 0.1; those of an installed torchmetrics "
-        "or lpips package by default",
+        description="file with the linear heads of LPIPS 0.1; by default the heads in an "
+        "installed torchmetrics or lpips package",
     )
 
     @field_validator("trunk", "heads")
@@ -73,14 +74,14 @@ class Perceptual(Metric):
             self._weights(self.trunk)
         elif self.heads is not None:
             place = f"metrics.{self.entry}"
-            return [f"{place}.heads does nothing without a network: --set {place}.trunk=FILE"]
+            return [f"{place}.heads has no effect without a network: --set {place}.trunk=FILE"]
         return []
 
     @override
     def described(self) -> Figure:
         if self.trunk is None:
             return self.figure
-        least = f"{self.net.name} needs images of at least {self.net.smallest} pixels a side"
+        least = f"{self.net.name} needs images whose sides have at least {self.net.smallest} pixels"
         definition = f"{self.figure.definition}; {self._weights(self.trunk).source}"
         return replace(self.figure, definition=definition, undefined=least)
 

@@ -16,7 +16,7 @@ from crossgrad_plugins.metrics.lpips_trunks import Convolution, Trunk
 #: Mean and standard deviation of ImageNet's colours for images in [-1, 1], as in LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Keeps the length of a feature vector above 0.
+#: Value that keeps the length of a feature vector above 0.
 _LEAST = 1e-8
 #: Packages that contain the published heads, and the folders of the heads in them.
 _PACKAGES = (
@@ -93,7 +93,7 @@ def read_weights(net: Trunk, trunk: Path, heads: Path | None, setting: str) -> W
 
 
 def _read_trunk(net: Trunk, path: Path, setting: str) -> tuple[tuple[Tensor, Tensor], ...]:
-    todo = f"--set {setting}=FILE names torchvision's {net.model}, such as {net.published}"
+    todo = f"--set {setting}=FILE must name torchvision's {net.model}, such as {net.published}"
     found = {name.removeprefix("features."): tensor for name, tensor in _read(path, todo).items()}
     pairs = []
     for layer in net.layers:
@@ -108,7 +108,9 @@ def _name(layer: Convolution, part: str) -> str:
 
 
 def _read_heads(net: Trunk, path: Path, setting: str) -> tuple[Tensor, ...]:
-    todo = f"--set {setting}=FILE names the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
+    todo = (
+        f"--set {setting}=FILE must name the linear heads of LPIPS 0.1 for {net.name}, {net.heads}"
+    )
     found = _read(path, todo)
     shapes: dict[str, tuple[int, ...]] = {
         f"lin{place}.model.1.weight": (1, layer.shape[0], 1, 1)
@@ -127,9 +129,10 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
             if file.is_file():
                 return file, package
     raise UserError(
-        f"there are no linear heads of LPIPS for {net.name}",
+        f"no file with the linear heads of LPIPS for {net.name} is installed",
         where=setting,
-        expected=f"a package that brings them ({', '.join(name for name, _ in _PACKAGES)})",
+        expected="a package that contains the heads "
+        f"({', '.join((name for name, _ in _PACKAGES))})",
         todo=f"pip install torchmetrics, or name the file: --set {setting}.heads={net.heads}",
     )
 
@@ -137,7 +140,7 @@ def _installed(net: Trunk, setting: str) -> tuple[Path, str]:
 def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
     """Return the tensors of a file by name; nothing in the file is executed."""
     if not path.is_file():
-        raise UserError("there is no file of weights", where=path, todo=todo)
+        raise UserError("the file of weights does not exist", where=path, todo=todo)
     try:
         if path.suffix == _SAFETENSORS:
             from safetensors.torch import load_file
@@ -148,7 +151,7 @@ def _read(path: Path, todo: str) -> Mapping[str, Tensor]:
     except Exception as error:  # Exceptions for damaged files are not documented.
         # Torch's own message ends with the advice to execute code from the file, so it is not
         # shown.
-        raise _unreadable(path, f"{type(error).__name__} as it was read", todo) from error
+        raise _unreadable(path, f"{type(error).__name__} while reading", todo) from error
     if not isinstance(found, Mapping):
         raise _unreadable(path, f"an object of type {type(found).__name__}", todo)
     return {name: tensor for name, tensor in found.items() if isinstance(tensor, Tensor)}
@@ -171,13 +174,13 @@ def _check(
     for name, shape in shapes.items():
         tensor = found.get(name)
         if tensor is None or tuple(tensor.shape) != shape:
-            told = "nothing of that name" if tensor is None else f"shape {list(tensor.shape)}"
+            told = "no tensor with that name" if tensor is None else f"shape {list(tensor.shape)}"
         elif not bool(torch.isfinite(tensor).all()):
             told = "numbers that are not finite"
         else:
             continue
         raise UserError(
-            "the file holds the weights of another network",
+            "the file contains the weights of another network",
             where=f"{path}: {name}",
             expected=f"shape {list(shape)}",
             found=told,

@@ -85,7 +85,7 @@ def _vgg(stages: tuple[tuple[int, int], ...]) -> tuple[Convolution, ...]:
                 )
             )
             number, channels_in = number + 2, width
-        number += 1  # Max pooling has a number of its own.
+        number += 1  # Max pooling has its own number in the sequence.
     return tuple(layers)
 
 

@@ -34,7 +34,7 @@ class TrackExposedPSNR(Metric):
         "to the photo at the SfM points that the view observed (3 x 3 means, least squares of sRGB "
         "values)",
         undefined=f"no held-out view has {LEAST} SfM observations that are neither too dark nor "
-        "cut off",
+        "saturated",
     )
 
     @override
@@ -61,7 +61,7 @@ def _closest(drawn: Tensor, compared: Compared) -> float | None:
     lit = light > 0.0
     if not lit.any():
         return 0.0
-    # The median is used, because a sum would be dominated by a single light far beyond white.
+    # Use the median, because a single light far beyond white would dominate a sum.
     stops = float(np.log2(np.median(wanted[lit] / light[lit])))
     for step in _STEPS:
         tried = stops + step * np.arange(-_TRIED, _TRIED + 1)

@@ -21,7 +21,7 @@ SSIM_SKIMAGE_TOO_SMALL = (
     f"scikit-image's SSIM needs kept pixels at least {RADIUS} pixels from the border, "
     f"in an image of {WINDOW} x {WINDOW} or more"
 )
-#: Number of rows that a thread processes at once, so that intermediate results stay in its cache.
+#: Number of rows that a thread processes at once, so that intermediate results stay in the cache.
 _ROWS = 128
 
 

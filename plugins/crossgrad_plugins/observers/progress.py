@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
-#: Counts that most steps report, so they are not shown.
+#: Counts that most steps report and that are therefore not shown.
 _OF_AGGREGATION = frozenset({"zero", "disjoint", "dropped", "conflict"})
 
 
@@ -43,10 +43,12 @@ class Progress(Observer):
 
     level: Literal["quiet", "normal", "verbose"] = Field(
         "normal",
-        description="quiet: nothing; normal: scene, decisions, progress, evaluations, messages; "
-        "verbose: also all notes and every change of density control",
+        description="quiet: print nothing; normal: scene, decisions, progress, evaluations, "
+        "messages; verbose: also all notes and every change of density control",
     )
-    interval: float = Field(10.0, gt=0.0, description="seconds between lines without a terminal")
+    interval: float = Field(
+        10.0, gt=0.0, description="seconds between lines if the output is not a terminal"
+    )
 
     # The state of the display; it is not part of the run's state.
     _pace: Pace = PrivateAttr(default_factory=lambda: Pace(1))
@@ -72,7 +74,7 @@ class Progress(Observer):
         for line in shown:
             self._say(f"- {line}")
         if run.notes and not verbose:
-            self._say(f"- further notes: {len(run.notes)} (in log.txt, or with -v)")
+            self._say(f"- more notes: {len(run.notes)} (in log.txt, or with -v)")
 
     @hookimpl
     def crossgrad_step_end(self, record: StepRecord) -> None:
@@ -153,5 +155,5 @@ class Progress(Observer):
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
         else:
-            # `tqdm` writes the line above the bar, which would otherwise be broken.
+            # `tqdm` writes the line above the bar; otherwise the line would break the bar.
             self._bar.write(showable(text), file=controls_of(sys.stderr))

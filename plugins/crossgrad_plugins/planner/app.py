@@ -29,7 +29,7 @@ _HEADER: Final = ("part", "decision", "evidence", "cost saved", "force with")
 #: Widths of the columns of a wide table; the evidence gets the remaining width.
 _WIDTHS: Final = (14, 20, 0, 18, 23)
 _GAP: Final = "  "
-#: Basis of a choice -> text after the choice.
+#: Basis of a choice -> text that follows the choice.
 _MARKS: Final = {"decided": "", "default": " (default)", "given": " (yours)"}
 
 
@@ -43,8 +43,8 @@ def lines_of(plan: Plan, width: int) -> Iterator[str]:
     if width >= _WIDE:
         yield ""
     changed = [f"{name} = {value}" for name, value in plan.settings.items()]
-    summary = f"changed: {', '.join(changed)}" if changed else "nothing is changed"
-    yield from wrap(f"{summary}; default: the evidence is missing or undecided", width)
+    summary = f"changed: {', '.join(changed)}" if changed else "no settings changed"
+    yield from wrap(f"{summary}; default: the evidence is missing or not conclusive", width)
     yield f"decided in {plan.seconds:.1f} s"
 
 
@@ -120,7 +120,7 @@ def plan(
         write_settings(write, {**made.applied_to(asked), "plan": "off"})
         return made, f"run it: crossgrad run --config {quote(str(write))}"
     if probe_seconds is not None:
-        return made, "--write FILE keeps this for crossgrad run --config FILE"
+        return made, "use --write FILE to save these settings for `crossgrad run --config FILE`"
     named = None if options.get("scene") is None else config.scene
     return made, f"run it: {_command(named, {**options, 'config': file}, assignments)}"
 
@@ -165,8 +165,8 @@ def show(made: Plan, way: str, *, as_json: bool) -> None:
 def _check_free(file: Path) -> None:
     if file.exists():
         raise UserError(
-            "the file is there already",
+            "the output file already exists",
             where=f"--write {file}",
-            todo="choose another name, or remove it",
+            todo="choose another name, or remove the file",
         )
     check_file(file)

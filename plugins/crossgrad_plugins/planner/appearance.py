@@ -6,11 +6,13 @@ from typing import Final
 from crossgrad_plugins.planner.evidence import Evidence
 from crossgrad_plugins.planner.finding import Finding, given
 
-#: Minimum share of the variance of tracks that view dependence must explain to be worth its cost.
+#: View dependence is worth its cost only if it explains at least this share of the variance of
+#: tracks.
 LEAST_SHARE: Final = 0.02
 #: Numbers per Gaussian without higher bands: position, shape, opacity, colour.
 _OTHER_NUMBERS: Final = 14
-#: If the footprints range over less than this factor, all photos show the scene at one scale.
+#: If the largest footprint is less than this many times the smallest, all photos show the scene at
+#: one scale.
 ONE_SCALE: Final = 2.0
 
 
@@ -18,7 +20,7 @@ def exposure(evidence: Evidence) -> Finding:
     """Decide whether each photo gets an exposure."""
     part, config = "exposure", evidence.config
     if evidence.is_given("exposure", "exposure_from") or not evidence.is_measured:
-        chosen = config.exposure.name if config.exposure else "as a run has it"
+        chosen = config.exposure.name if config.exposure else "default of a run"
         return given(part, chosen, "--exposure NAME")
     from crossgrad_plugins.exposures.tracks.gains import (
         LEAST_RATIO,
@@ -28,13 +30,15 @@ def exposure(evidence: Evidence) -> Finding:
     )
 
     rule = (
-        f"gain from {LEAST_SPREAD} stops, {LEAST_RATIO:.0f} standard errors and "
-        f"{LEAST_REDUCTION:.0%} less deviation on"
+        f"gain if the spread is at least {LEAST_SPREAD} stops and {LEAST_RATIO:.0f} "
+        f"standard errors, and the deviation falls by at least {LEAST_REDUCTION:.0%}"
     )
     source = "docs/exposure.md, six scenes"
     plain = Finding(part, "none", "default", "", rule, source, "--exposure gain")
     if not any(len(view.seen) for view in evidence.scene.train_views):
-        return plain.found("no SfM tracks tell how bright photos are beside each other")
+        return plain.found(
+            "no SfM tracks connect the photos, so their brightness cannot be compared"
+        )
     gains = deciding_gains(evidence.scene)
     photos = int(gains.known.sum())
     if not photos:
@@ -46,10 +50,11 @@ def exposure(evidence: Evidence) -> Finding:
         "photos": photos,
     }
     shown = plain.found(
-        f"gains of {photos} photos: {gains.spread:.2f} stops standard deviation (standard error "
-        f"{gains.error:.2f}), {gains.fit.reduction:.0%} off the deviation of tracks",
+        f"gains of {photos} photos: standard deviation {gains.spread:.2f} stops "
+        f"(standard error {gains.error:.2f}), which reduce the deviation of tracks by "
+        f"{gains.fit.reduction:.0%}",
         decided=True,
-        saved="a gain and its step per photo",
+        saved="one gain per photo and its updates",
         figures=figures,
     )
     if not gains.differ:
@@ -64,19 +69,22 @@ def degree(evidence: Evidence) -> Finding:
     name = config.backbone.name
     of_bands = ("backbone.sh_degree", "backbone.lr_f_rest", "sh_from", "rules.sparse-sh")
     if evidence.is_given(*of_bands, "data.init"):
-        chosen = config.backbone.options.get("sh_degree", "as you start it")
+        chosen = config.backbone.options.get("sh_degree", "as set at the start")
         return given(part, chosen, "--set backbone.sh_degree=N")
-    rule = f"0 where degree 1 explains less than {LEAST_SHARE:.0%} of tracks, its whole interval"
-    source = "ours: leave one out over the directions of a track, exposure taken out"
+    rule = (
+        f"0 if degree 1 explains less than {LEAST_SHARE:.0%} of the variation in "
+        "tracks, with its whole interval"
+    )
+    source = "ours: leave-one-out over the directions of a track, after removing exposure"
     force = "--set backbone.sh_degree=N"
-    usual = "as the backbone has it" if evidence.degree is None else str(evidence.degree)
+    usual = "default of the backbone" if evidence.degree is None else str(evidence.degree)
     plain = Finding(part, usual, "default", "", rule, source, force)
     if evidence.degree is None:
-        return plain.found(f"backbone {name} has no degree to set")
+        return plain.found(f"backbone {name} has no SH degree")
     if evidence.degree == 0:
-        return plain.found("too few views for more", decided=True)
+        return plain.found("too few views for a higher degree", decided=True)
     if not any(len(view.seen) for view in evidence.scene.train_views):
-        return plain.found("no SfM tracks tell how colours depend on the direction")
+        return plain.found("no SfM tracks show how colours depend on the direction")
     return _of_tracks(evidence, plain)
 
 
@@ -93,8 +101,8 @@ def _of_tracks(evidence: Evidence, plain: Finding) -> Finding:
     figures = {"tracks": found.tracks, "share": found.share, "low": found.low, "high": found.high}
     if found.tracks < FEWEST_TRACKS or isnan(found.share):
         return plain.found(
-            f"{found.tracks} tracks with {LEAST_OBSERVATIONS} views over {LEAST_RADIUS:.0f} "
-            f"degrees or more; {FEWEST_TRACKS} are needed",
+            f"{found.tracks} tracks with at least {LEAST_OBSERVATIONS} views over at "
+            f"least {LEAST_RADIUS:.0f} degrees; {FEWEST_TRACKS} are needed",
             figures=figures,
         )
     shown = (
@@ -115,9 +123,9 @@ def scale_filter(evidence: Evidence) -> Finding:
     """Decide whether Gaussians are filtered to the sampling of the photos."""
     part, name = "scale filter", evidence.config.backbone.name
     if evidence.is_given("backbone"):
-        return given(part, f"as backbone {name} has it", "--backbone mip")
+        return given(part, f"default of backbone {name}", "--backbone mip")
     spread = evidence.modes.spread
-    rule = f"none where footprints range over less than {ONE_SCALE:g}"
+    rule = f"none if footprints vary by less than {ONE_SCALE:g}"
     plain = Finding(part, "none", "default", "", rule, "Mip-Splatting's zoom", "--backbone mip")
     figures = {"range": spread}
     if spread < ONE_SCALE:
@@ -125,7 +133,8 @@ def scale_filter(evidence: Evidence) -> Finding:
             f"footprints range over {spread:.1f}", decided=True, saved="the filter", figures=figures
         )
     return plain.found(
-        f"footprints range over {spread:.1f}; at the distances of photos a filter gains 0.3 dB on "
-        "average, and a file drawn without it may lose 0.8; between them it gains up to 1.3",
+        f"footprints range over {spread:.1f}; at the distances of the photos a filter "
+        "gains 0.3 dB on average, and a file rendered without the filter may lose "
+        "0.8 dB; at distances between them it gains up to 1.3 dB",
         figures=figures,
     )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from crossgrad_core.commands import announce, argument, command_of, option
 
-_RUN = "Run (what you set here is not decided)"
+_RUN = "Run (the planner does not change settings that you give here)"
 _RESULTS = "Results"
 
 
@@ -18,15 +18,15 @@ class Options:
     )
     probe: float | None = option(
         None,
-        "Also train so many seconds and measure gradients: noise scale, variance between near and "
-        "far, conflict.",
+        "Also train for this many seconds and measure gradients: noise scale, "
+        "variance between near and far, conflict.",
         "SECONDS",
         min=1.0,
     )
-    config: Path | None = option(None, "YAML file with settings of the run.", "FILE", heading=_RUN)
+    config: Path | None = option(None, "YAML file of settings for the run.", "FILE", heading=_RUN)
     assignments: list[str] | None = option(
         None,
-        "One setting of the run, repeatable: exposure=none, backbone.sh_degree=3.",
+        "One setting of the run, such as exposure=none or backbone.sh_degree=3. Repeatable.",
         "KEY=VALUE",
         heading=_RUN,
         flag="--set",
@@ -37,10 +37,10 @@ class Options:
         None, "Longest image side; larger photos are resized.", "PIXELS", heading=_RUN
     )
     device: str | None = option(
-        None, "Where tensors live. Default: auto.", "auto|cpu|cuda|cuda:N", heading=_RUN
+        None, "Device of the tensors. Default: auto.", "auto|cpu|cuda|cuda:N", heading=_RUN
     )
-    threads: int | None = option(None, "CPU threads. Default: all there are.", "N", heading=_RUN)
-    as_json: bool = option(False, "Print JSON, with all figures.", heading=_RESULTS, flag="--json")
+    threads: int | None = option(None, "Number of CPU threads. Default: all.", "N", heading=_RUN)
+    as_json: bool = option(False, "Print all values as JSON.", heading=_RESULTS, flag="--json")
     write: Path | None = option(
         None,
         "Write the settings to this file, for `crossgrad run --config FILE`.",
@@ -51,12 +51,12 @@ class Options:
 
 @command_of(Options)
 def plan(given: Options) -> None:
-    """Decide on evidence what a run on a scene needs.
+    """Decide which components a run needs, and show the evidence.
 
-    Looks at cameras, photos, SfM points and tracks; trains nothing without --probe. Each part
-    stands in a table with the decision, the figure it rests on, what it saves, and the option that
-    overrules it. If evidence is missing, the default stays. `crossgrad run` decides likewise and
-    trains; with `--plan off` it does not. `crossgrad recipes show` lists what the recipe decides.
+    Reads cameras, photos, SfM points and tracks; trains only with --probe. A table shows each
+    decision, its evidence, what it saves, and the option that overrides it. If evidence is missing,
+    the default is used. `crossgrad run` makes the same decisions, except with `--plan off`.
+    `crossgrad recipes show` lists the decisions of the recipe.
     """
     announce(quiet=given.as_json)
     from crossgrad_plugins.planner import app

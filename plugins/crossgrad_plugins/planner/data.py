@@ -23,10 +23,10 @@ def start(evidence: Evidence) -> Finding:
     figures = {"points": points, "views": views}
     plain = Finding(
         part,
-        "as a run starts",
+        "default of a run",
         "default",
         "",
-        "points found in photos where there are none; random ones for a single photo",
+        "points found in photos if the scene has none; random points for a single photo",
         "docs/initializers.md",
         "--initializer NAME or --init random",
     )
@@ -64,7 +64,9 @@ def held_out(evidence: Evidence) -> Finding:
     lacking = sorted({view.regime for view in scene.train_views} - set(photos))
     if not lacking:
         return plain.found("every regime has held-out photos", decided=True)
-    return plain.found(f"no figure tells how good {' and '.join(lacking)} gets: none is held out")
+    return plain.found(
+        f"no metric shows the quality of {' and '.join(lacking)}: no photo of it is held out"
+    )
 
 
 def undistortion(evidence: Evidence) -> Finding:
@@ -75,7 +77,7 @@ def undistortion(evidence: Evidence) -> Finding:
         "photos are undistorted" if note else "none",
         "default",
         "",
-        "where the camera model is no pinhole",
+        "if the camera model is not a pinhole",
         "the scene's cameras",
         "undistorted photos",
     )
@@ -89,13 +91,13 @@ def masks(evidence: Evidence) -> Finding:
     part = "masks"
     if evidence.is_given("data.masks"):
         return given(part, evidence.config.data.masks, "--set data.masks=FOLDER")
-    note = evidence.scene_note("masks: ") or evidence.scene_note("does not count")
+    note = evidence.scene_note("masks: ") or evidence.scene_note("alpha < 0.5")
     plain = Finding(
         part,
         "masked pixels do not count" if note else "none",
         "default",
         "",
-        "where the scene has masks, or photos transparency",
+        "if the scene has masks, or photos with transparency",
         "the scene's folder",
         "--set data.masks=FOLDER",
     )
@@ -114,7 +116,7 @@ def background(evidence: Evidence) -> Finding:
         usual,
         "default",
         "",
-        "the colour that transparent photos were blended over, else black, as viewers draw",
+        "the colour that transparent photos were blended over, else black, as in viewers",
         "docs/initializers.md; docs/readers.md",
         "--background COLOR",
     )

@@ -33,7 +33,8 @@ class Evidence:
             names: Settings, such as `exposure`, `data.init` or `backbone.sh_degree`.
         """
         known = {n for n in self.config.model_fields_set if getattr(self.config, n) is not None}
-        # A run also stores its defaults; in the group `data`, a default value counts as not set.
+        # A run also stores its defaults; in the group `data`, a default value therefore counts as
+        # not set.
         own, usual = self.config.data, type(self.config.data)()
         known |= {f"data.{n}" for n in own.model_fields_set if getattr(own, n) != getattr(usual, n)}
         known |= {f"backbone.{name}" for name in self.config.backbone.options}

@@ -7,14 +7,14 @@ from typing import Literal, TypeAlias
 
 from crossgrad_core.plugin import Decision, Json
 
-#: Name -> figure of a finding.
+#: Name -> value of the evidence.
 Figures: TypeAlias = Mapping[str, float]
 #: Setting, or option of a component -> value.
 Settings: TypeAlias = Mapping[str, Json]
-#: The origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or
-#: undecided, so the default is kept. `given`: the user set it.
+#: Origin of a choice. `decided`: the evidence decided. `default`: the evidence is missing or not
+#: conclusive, so the default is used. `given`: the user set it.
 Basis: TypeAlias = Literal["decided", "default", "given"]
-#: The saving of a choice that a run without a plan makes, too.
+#: Text for the saving of a choice that a run without a planner also makes.
 NOTHING = "-"
 
 
@@ -121,4 +121,6 @@ class Finding:
 
 def given(part: str, choice: object, force: str) -> Finding:
     """Return the choice of the user, which applies without evidence from the scene."""
-    return Finding(part, str(choice), "given", "set by you", "what you set wins", "you", force)
+    return Finding(
+        part, str(choice), "given", "set by you", "your own setting has priority", "you", force
+    )

@@ -13,7 +13,7 @@ from crossgrad_plugins.planner.modes import FEWEST, LEAST_RATIO, LEAST_SHARE, ON
 if TYPE_CHECKING:
     from crossgrad_plugins.planner.probe import Probe
 
-#: Minimum sigma_b^2 / sigma_w^2 for pairs: they remove its share of a step's gradient variance.
+#: Minimum sigma_b^2 / sigma_w^2 for pairs: pairs remove this share of a step's gradient variance.
 LEAST_RHO: Final = 0.1
 #: Minimum share of views in the smaller mode for pairs. Pairs weight both modes equally, so with a
 #: smaller share, training would optimize another objective.
@@ -70,7 +70,9 @@ def pairs(evidence: Evidence) -> Finding:
     )
     plain = Finding(part, usual, "default", "", rule, "paper, Proposition 2", "--sampler near-far")
     if found.one:
-        return plain.found("one mode: no near and far", decided=True, saved="groups of views")
+        return plain.found(
+            "one mode: no near and far groups", decided=True, saved="groups of views"
+        )
     if not found.two:
         return plain.found("modes undecided")
     return _pairs_of_two_modes(evidence, plain)
@@ -82,7 +84,9 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     if probe is None:
         return plain.found(f"two modes; sigma_b^2 / sigma_w^2 is {_NOT_KNOWN}")
     if probe.problem or not isfinite(probe.rho_low + probe.rho_high):
-        return plain.found(f"the probe tells nothing: {probe.problem or _without_interval(probe)}")
+        return plain.found(
+            f"the probe is not conclusive: {probe.problem or _without_interval(probe)}"
+        )
     figures = {"rho": probe.rho, "rho_low": probe.rho_low, "rho_high": probe.rho_high}
     shown = f"sigma_b^2 / sigma_w^2 {probe.rho:.3f} [{probe.rho_low:.3f}, {probe.rho_high:.3f}]"
     if probe.rho_low < LEAST_RHO:
@@ -94,8 +98,9 @@ def _pairs_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     cut = evidence.modes.cut
     if cut.share < EVEN:
         return plain.found(
-            f"{shown}; but the smaller mode has {cut.share:.0%} of the views, and pairs would draw "
-            f"each of these {0.5 / cut.share:.1f} times as often: another objective",
+            f"{shown}; but the smaller mode has {cut.share:.0%} of the views, and pairs "
+            f"would draw each of them {0.5 / cut.share:.1f} times as often, which changes "
+            "the objective",
             figures={**figures, "smaller_share": cut.share},
         )
     grouping = cut.grouping
@@ -143,23 +148,25 @@ def views_per_step(evidence: Evidence) -> Finding:
     part = "views per step"
     if evidence.is_given("views_per_step"):
         return given(part, evidence.config.views_per_step, "--views K")
-    rule = "1, unless pairs are drawn: a second view of a step costs what a further step does"
+    rule = "1, unless pairs are drawn: a second view in a step costs as much as a further step"
     usual = str(max(evidence.view_plan.counts))
     plain = Finding(part, usual, "default", "", rule, _TWO_VIEWS, "--views K")
     if "sampler" in pairs(evidence).settings:
         return replace(plain, choice="2").found("a step has a near and a far view", decided=True)
     if evidence.is_given("sampler", "operator", "batch_rule", "densify_views", "backward"):
-        return plain.found("as suits what you set of sampler, operator and steps")
+        return plain.found("follows from your settings of sampler, operator and steps")
     probe, figures = evidence.probe, {}
     shown = _TWO_AGAINST_ONE
     if probe is not None and probe.problem:
-        shown += f"; the probe tells nothing: {probe.problem}"
+        shown += f"; the probe is not conclusive: {probe.problem}"
     elif probe is not None and not isnan(probe.noise_scale):
         figures = {"noise_scale": probe.noise_scale}
         known = isfinite(probe.noise_scale)
-        scale = f"{probe.noise_scale:.0f} views" if known else "beyond all views: no common part"
+        scale = (
+            f"{probe.noise_scale:.0f} views" if known else "larger than all views: no common part"
+        )
         shown += f"; gradient noise scale {scale}"
-    saved = "further renders of a step"
+    saved = "extra renders per step"
     return plain.found(shown, decided=True, saved=saved, figures=figures)
 
 
@@ -169,19 +176,24 @@ def operator(evidence: Evidence) -> Finding:
     usual = "+".join(link.name for link in evidence.config.operators)
     if evidence.is_given("operator"):
         return given(part, usual, "--operator NAME")
-    rule = f"projects where pairs are drawn and conflict exceeds {CHANCE:.0%} with its interval"
-    source = "paper; half of random directions conflict"
+    rule = (
+        "project conflicting gradients if pairs are drawn and the conflict is above "
+        f"{CHANCE:.0%} with its interval"
+    )
+    source = "paper; half of all random directions conflict"
     plain = Finding(part, usual, "default", "", rule, source, "--operator NAME")
-    apart = "gradients of each view kept apart"
+    apart = "separate gradients of each view"
     joint = evidence.config.backward == "joint"
     if joint or evidence.modes.one:
-        why = "--backward joint: one gradient of all" if joint else "one mode"
-        return plain.found(f"{why}: no near and far to conflict", decided=True, saved=apart)
+        why = "--backward joint: one gradient of all views" if joint else "one mode"
+        return plain.found(
+            f"{why}: no near and far groups that could conflict", decided=True, saved=apart
+        )
     probe = evidence.probe
     if probe is None:
-        return plain.found(f"conflict of near and far gradients is {_NOT_KNOWN}")
+        return plain.found(f"the conflict of near and far gradients is {_NOT_KNOWN}")
     if probe.problem or not isfinite(probe.conflict):
-        return plain.found(f"the probe tells nothing: {probe.problem or 'no pairs'}")
+        return plain.found(f"the probe is not conclusive: {probe.problem or 'no pairs'}")
     figures = {"conflict": probe.conflict, "conflict_low": probe.conflict_low}
     shown = f"{probe.conflict:.0%} of near-far pairs conflict, at least {probe.conflict_low:.0%}"
     if probe.conflict_low > CHANCE and _draws_pairs(evidence):
@@ -207,7 +219,8 @@ def _figures(found: Modes) -> str:
     shown = "undefined" if isnan(found.bimodality) else f"{found.bimodality:.2f}"
     cut = found.cut
     return (
-        f"{cut.quantity} cut in two separates {cut.separability:.0%} of its variance, the best of "
-        f"{ONE_OF} even samples {cut.usual:.0%}; far / near {cut.ratio:.1f}, smaller side "
-        f"{cut.share:.0%}; bimodality of distances {shown}"
+        f"splitting {cut.quantity} in two explains {cut.separability:.0%} of its "
+        f"variance, the best of {ONE_OF} even samples {cut.usual:.0%}; far / near "
+        f"{cut.ratio:.1f}, smaller side {cut.share:.0%}; bimodality of distances "
+        f"{shown}"
     )

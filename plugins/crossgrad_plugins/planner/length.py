@@ -33,20 +33,20 @@ def length(evidence: Evidence) -> Finding:
         usual,
         "default",
         "",
-        f"{PASSES} views of each training photo, {FEWEST_VIEWS:,} at least: more of them gain "
-        "little and take long, as Gaussians grow",
+        f"{PASSES} views of each training photo, at least {FEWEST_VIEWS:,}: more "
+        "views gain little and take long, because the number of Gaussians grows",
         "docs/plan.md, four scenes",
         _EXACTLY,
     )
     if not evidence.is_measured or config.schedule == "absolute":
-        return plain.found("a published schedule, which a shorter run would cut")
+        return plain.found("a published schedule, which a shorter run would cut off")
     if not photos:
         return plain.found("no training photos")
     shown = f"{most // photos:,} views of each of {photos:,} training photos"
     views = views_of_steps(evidence).paced(DEFAULT_STEPS).views(DEFAULT_STEPS)
     if seconds is None and most >= views:
         return plain.found(shown, decided=True, figures={"views": most})
-    saved = f"the rest of {usual}"
+    saved = f"the remaining part of {usual}"
     if seconds is None:
         saved = f"{1.0 - most / views:.0%} of the views of {usual}"
     because = f"more than {most // photos:,} views of each photo gain little"

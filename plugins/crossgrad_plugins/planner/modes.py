@@ -12,13 +12,13 @@ from crossgrad_core.plugin import Scene, bimodality, footprint_of
 from crossgrad_plugins.groupings.heights import altitudes, upward
 from crossgrad_plugins.groupings.split import log_distances, otsu_separability, otsu_threshold
 
-#: With a smaller ratio of distances, two modes show the scene at nearly the same size.
+#: If the ratio of their distances is smaller, two modes show the scene at nearly the same size.
 LEAST_RATIO: Final = 1.5
 #: Minimum number of views to detect two modes.
 FEWEST: Final = 10
-#: Minimum share of views in the smaller mode; a smaller group counts as outliers.
+#: Minimum share of views in the smaller mode; a smaller group is treated as outliers.
 LEAST_SHARE: Final = 0.1
-#: Of this many evenly spread samples, one may be separated as well as two modes.
+#: About one of this many evenly spread samples separates as well as two modes do.
 ONE_OF: Final = 100
 #: The kind of distance that is used if views show SfM points.
 DEPTH: Final = "depth over focal length"

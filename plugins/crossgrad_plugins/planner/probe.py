@@ -16,7 +16,7 @@ from crossgrad_plugins.diagnostics.table import ALL, Row, rows_of
 
 #: The optimizer sees gradients in Adam's metric.
 _METRIC: Final = "adam"
-#: Standard errors in half of a 95 % interval.
+#: Half of a 95 % interval in standard errors.
 _WIDE: Final = 1.96
 
 
@@ -52,7 +52,7 @@ def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Prob
         seconds: Training seconds.
         grouping: The grouping into near and far views.
     """
-    Progress().tell(f"training {seconds:g} seconds to measure gradients")
+    Progress().tell(f"training for {seconds:g} seconds to measure gradients")
     length = {"steps": None, "max_views": None, "seconds": seconds, "plan": "off"}
     options = Options(grouping=grouping, probes=1, seconds=seconds, seed=config.seed)
     try:
@@ -60,7 +60,7 @@ def probed(config: RunConfig, seconds: float, grouping: ComponentChoice) -> Prob
     except (UserError, TrainingFailedError) as error:
         return Probe(problem=error.what if isinstance(error, UserError) else str(error))
     whole = [row for row in rows_of(report.probes, _METRIC) if row["block"] == ALL]
-    return _of_row(whole[-1]) if whole else Probe(problem=report.failure or "no step was taken")
+    return _of_row(whole[-1]) if whole else Probe(problem=report.failure or "no step was made")
 
 
 def _of_row(row: Row) -> Probe:

@@ -15,8 +15,8 @@ from crossgrad_plugins.planner.length import most_views
 
 #: Far views per near view in the first part of a run; sampler `horizon` defines that part.
 FAR_TO_NEAR: Final = 5
-#: Limits, in degrees from the far views' mean direction: maximum for far views, minimum for near
-#: views.
+#: Maximum angle of far views and minimum angle of near views, in degrees from the mean direction of
+#: the far views.
 WITHIN, BEYOND = 45.0, 60.0
 
 
@@ -56,17 +56,18 @@ def view_schedule(evidence: Evidence) -> Finding:
     if evidence.is_given("sampler", "grouping"):
         return given(part, usual, "--sampler NAME")
     rule = (
-        f"far : near = {FAR_TO_NEAR} : 1 at first where far views look in one direction (median "
-        f"within {WITHIN:.0f} degrees) and near ones elsewhere ({BEYOND:.0f} or more), drone and "
-        f"street, and {EVEN:.0%} of the views or more on each side; in runs within seconds or of "
-        f"fewer than {REFERENCE:,} views"
+        f"draw far : near = {FAR_TO_NEAR} : 1 at first if far views look in one "
+        f"direction (median within {WITHIN:.0f} degrees) and near views elsewhere "
+        f"({BEYOND:.0f} degrees or more), as with drone and street photos, and if "
+        f"each side has at least {EVEN:.0%} of the views; in runs with a time limit "
+        f"or with fewer than {REFERENCE:,} views"
     )
     source = "Horizon-GS, 2 : 1; docs/samplers.md#far-views-first"
     plain = Finding(part, usual, "default", "", rule, source, "--sampler horizon")
     if not evidence.is_measured or evidence.is_given("operator", "views_per_step"):
-        return plain.found("measured with recipe auto and single views only")
+        return plain.found("measured only with recipe auto and single views")
     if not _in_short_run(evidence):
-        return plain.found("measured in shorter runs only")
+        return plain.found("measured only in shorter runs")
     if not evidence.modes.two:
         return plain.found("no two modes", decided=evidence.modes.one)
     return _schedule_of_two_modes(evidence, plain)
@@ -82,18 +83,18 @@ def _schedule_of_two_modes(evidence: Evidence, plain: Finding) -> Finding:
     found = directions(evidence.scene, cut.grouping)
     figures = {"far_degrees": found.far, "near_degrees": found.near}
     shown = (
-        f"from the mean direction of the far views these look {found.far:.0f} degrees away, near "
-        f"ones {found.near:.0f} (medians)"
+        "relative to the mean direction of the far views, far views look "
+        f"{found.far:.0f} degrees away, near views {found.near:.0f} (medians)"
     )
     made = plain.found(shown, decided=True, figures=figures)
     if not found.differ:
         return made
     sampler: dict[str, Json] = {"sampler": "horizon", "sampler.coarse": [FAR_TO_NEAR, 1]}
-    choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views to a near one at first"
+    choice = f"horizon by {cut.grouping.name}, {FAR_TO_NEAR} far views for each near view at first"
     return made.changed(
         choice,
         {**sampler, **settings_of(cut.grouping)},
-        "far views look one way, near views another",
+        "far views look in one direction, near views in others",
         f"--sampler {plain.choice}",
     )
 

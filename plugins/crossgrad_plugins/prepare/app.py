@@ -46,7 +46,7 @@ _MOST_POINTS, _MOST_LINKS = 20_000, 4_000
 #: Points beyond these percentiles are not drawn.
 _INNER: Final = (1.0, 99.0)
 _MARGIN: Final = 0.15
-#: Titles of both panels for a scene without a place on Earth, whose vertical is unknown.
+#: Titles of both panels for a scene that is not georeferenced, so its vertical is unknown.
 _TITLES: Final = ("first and second axis of the cameras", "first and third axis of the cameras")
 
 
@@ -168,12 +168,13 @@ def prepared(photos: Path, scene: Path, settings: Settings, threads: int | None 
     _check_lens(settings.lens)
     # A finished scene no longer needs its photos.
     plan = _planned(photos, settings, fewest=0 if layout.is_ready else 2)
-    if layout.is_ready:  # Write nothing: others may read it, and the disk may be read-only.
+    # Write nothing, because others may read the folder, and the disk may be read-only.
+    if layout.is_ready:
         return _carried_out(layout, agreed(layout, plan), 1)
     matching.check_gps(plan)
     with disk_errors(layout.work):
         layout.work.mkdir(parents=True, exist_ok=True)
-    with locked(scene, "preparing"), resume_hint("the same command goes on where this one ended"):
+    with locked(scene, "preparing"), resume_hint("run the same command again to continue"):
         clear_leftovers(layout)
         clear_damaged(layout)
         return _carried_out(layout, agreed(layout, plan), threads or len(available_cores()))
@@ -193,18 +194,20 @@ def made_or_ready(photos: Path, scene: Path, settings: Settings) -> list[str]:
     """
     layout, why = Layout(scene), ""
     if layout.is_ready and not layout.is_whole:
-        why = f"{layout.work} is gone, which says what it was made of"
+        why = f"{layout.work} is missing, which records how the scene was made"
     elif layout.is_ready and not has_photos(photos):
-        why = f"there are no photos in {photos} any more"
+        why = f"{photos} no longer contains photos"
     told = (
-        [f"{why}: the scene is taken as it is"]
+        [f"{why}: the scene is used unchanged"]
         if why
         else summary_lines(prepared(photos, scene, settings))
     )
     able = [name for name in entries("readers") if accepts(name, photos)]
     return told + [
-        f"the folder has poses of its own (reader {name}), which are not used; to train with them, "
-        "leave --prepare out"
+        (
+            f"the folder already has poses (reader {name}), which are not used; leave "
+            "--prepare out to train with them"
+        )
         for name in able[:1]
     ]
 
@@ -221,15 +224,15 @@ def _check_lens(name: str) -> None:
             where="--lens",
             expected=", ".join(known),
             found=name,
-            todo="cut them into perspective photos, and prepare those",
+            todo="cut them into perspective photos, and prepare these photos",
         )
     if name not in known:
         raise UserError(
-            "there is no such camera model",
+            "the camera model is unknown",
             where="--lens",
             expected=", ".join(known),
             found=name,
-            todo="leave it out for SIMPLE_RADIAL",
+            todo="leave the option out to use SIMPLE_RADIAL",
         )
 
 
@@ -238,7 +241,7 @@ def _planned(photos: Path, settings: Settings, fewest: int) -> Plan:
     progress = Progress(_PAUSE)
 
     def tell(done: int, of: int) -> None:
-        progress.tell(f"looking at photos: {done} of {of}")
+        progress.tell(f"reading photos: {done} of {of}")
 
     used, left_out = find_photos(photos, settings, tell, fewest)
     root = str(photos.resolve())

@@ -6,8 +6,8 @@ from typing import Final
 
 from crossgrad_core.commands import UserError, announce, argument, command_of, option
 
-_HOW = "How cameras are found"
-_COSTS = "What it may take"
+_HOW = "Pose estimation"
+_COSTS = "Limits"
 _CHOICES: Final[dict[str, tuple[str, ...]]] = {
     "features": ("sift",),
     "matching": ("auto", "exhaustive", "spatial", "retrieval", "sequential"),
@@ -21,57 +21,58 @@ class Options:
     """The options of the command."""
 
     photos: Path = argument(
-        "PHOTOS", "Folder of photos; those of different regimes in folders of their own."
+        "PHOTOS", "Folder of photos; put photos of different regimes into different folders."
     )
     scene: Path = argument(
-        "SCENE", "Folder of the scene; the same command goes on there after any interruption."
+        "SCENE", "Folder of the scene; after an interruption the same command continues there."
     )
     features: str = option("sift", "Kind of features.", "sift", heading=_HOW)
     matching: str = option(
         "auto",
-        "Which photos are compared: all, neighbours by GPS, those that look alike, or "
+        "Pairs of photos to match: all, neighbours by GPS, similar photos, or "
         "neighbours by name. auto decides by the number of photos and their GPS.",
         "auto|exhaustive|spatial|retrieval|sequential",
         heading=_HOW,
     )
     mapper: str = option(
         "auto",
-        "auto is incremental below 100 photos, and below 1000 in several folders.",
+        "auto is incremental below 100 photos, and below 1000 photos in several folders.",
         "auto|incremental|global",
         heading=_HOW,
     )
     cameras: str = option(
         "folder",
-        "Calibrates the photos of a folder together that come from one camera (EXIF), or each "
-        "photo by itself.",
+        "Calibrate all photos of one camera (EXIF) in a folder together, or each photo separately.",
         "folder|photo",
         heading=_HOW,
     )
     lens: str = option(
         "SIMPLE_RADIAL",
-        "Camera model of COLMAP: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.",
+        "Camera model of COLMAP: OPENCV for wide-angle lenses, OPENCV_FISHEYE for fisheye lenses.",
         "MODEL",
         heading=_HOW,
     )
     masks: Path | None = option(
         None,
-        "Folder of masks, black where a pixel does not count. Default: PHOTOS/masks, masks/ beside "
-        "photos, NAME_mask.png.",
+        "Folder of masks, in which black pixels are ignored. Default: PHOTOS/masks, "
+        "masks/ next to the photos, NAME_mask.png.",
         "DIR",
         heading=_HOW,
     )
     max_size: int | None = option(
         None,
-        "Longest side of the scene's photos. Default: as they are. Features are found at 3200 "
-        "pixels at most.",
+        "Longest side of the scene's photos. Default: unchanged. Features are "
+        "extracted at 3200 pixels at most.",
         "PIXELS",
         heading=_COSTS,
         min=64,
     )
-    max_features: int = option(8192, "Features of a photo, at most.", "N", heading=_COSTS, min=64)
+    max_features: int = option(
+        8192, "Maximum number of features per photo.", "N", heading=_COSTS, min=64
+    )
     threads: int | None = option(
         None,
-        "CPU threads. Default: all there are; fewer where memory is short.",
+        "Number of CPU threads. Default: all, or fewer if memory is small.",
         "N",
         heading=_COSTS,
         min=1,
@@ -80,10 +81,10 @@ class Options:
 
 @command_of(Options)
 def prepare(given: Options) -> None:
-    """Find the cameras of a folder of photos: from photos to a scene for `crossgrad run`.
+    """Estimate camera poses of photos and make a scene for training.
 
     The command finds features, matches and poses, and writes undistorted photos. If photos have
-    GPS, it also finds the place on Earth. A report (report.md, report.png) lists the photos in the
+    GPS, it also georeferences the scene. A report (report.md, report.png) lists the photos in the
     scene, the missing photos, and the reasons.
     """
     announce(quiet=True)
@@ -101,9 +102,9 @@ def prepare(given: Options) -> None:
 def _check_choice(name: str, value: str) -> None:
     if value not in _CHOICES[name]:
         raise UserError(
-            f"there is no such choice of {name}",
+            f"the value of {name} is unknown",
             where=f"--{name}",
             expected=" or ".join(_CHOICES[name]),
             found=value,
-            todo="leave it out to have it chosen",
+            todo="leave the option out to let crossgrad choose",
         )

@@ -14,14 +14,14 @@ from crossgrad_plugins.prepare.pycolmap_calls import quiet
 if TYPE_CHECKING:
     import pycolmap
 
-#: Least number of verified matches of a pair that is counted, the same as COLMAP requires for a
-#: pose. With fewer matches, most pairs of photos of repeated walls and pavements are wrong.
+#: Minimum number of verified matches of a counted pair, the same as COLMAP requires for a pose.
+#: With fewer matches, most pairs of photos of repeated walls and pavements are wrong.
 _MATCHES: Final = 30
-#: Largest distance in pixels between a match and its epipolar line, as in verification, and the
-#: least share of a pair's matches within this distance for agreement with two poses.
+#: Maximum distance in pixels between a match and its epipolar line, as in verification. Two poses
+#: agree with a pair if at least this share of its matches is within the distance.
 _PIXELS, _AGREEING = 4.0, 0.5
-#: A photo is misplaced if a smaller share of its matches agrees, and if at least this many of its
-#: pairs disagree. A single pair can be wrong by itself.
+#: A photo is misplaced if less than this share of its matches agrees, and if at least this many of
+#: its pairs disagree. One pair alone can be wrong.
 _SHARE, _AGAINST = 1.0 / 3.0, 2
 
 

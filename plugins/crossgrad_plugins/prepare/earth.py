@@ -24,7 +24,7 @@ _STEPS: Final = 1440
 #: Limits for the sine of the tilt of level photos (root mean square): the greatest at the best
 #: roll, and the least difference between best and worst roll that determines the roll.
 _LEVEL, _TELLING = 0.15, 0.3
-#: Least average amount by which photos show their top upwards or look down.
+#: Minimum average amount by which photos show their top upwards or look down.
 _UPRIGHT: Final = 0.3
 
 
@@ -100,7 +100,8 @@ def levelled(
     if tilts.max() - tilts.min() < _TELLING or tilts.min() > _LEVEL:
         return None
     upright = (_heights(up, along, angles) - _heights(ahead, along, angles)).mean(axis=0)
-    # After half a turn photos are equally level, but upside down in one of the two positions.
+    # After half a turn, the photos are equally level, but they are upside down in one of the two
+    # positions.
     best = int(np.argmin(np.where(upright > _UPRIGHT, tilts, np.inf)))
     if upright[best] <= _UPRIGHT or tilts[best] > _LEVEL:
         return None

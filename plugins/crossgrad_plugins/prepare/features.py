@@ -59,10 +59,10 @@ def found_features(layout: Layout, plan: Plan, threads: int) -> dict[str, int]:
     found = {name: counts.get(name, 0) for name in names}
     if not any(found.values()):
         raise UserError(
-            "no features could be found in any photo",
+            "no features were found in any photo",
             where=plan.photos,
-            expected="photos of something with texture, sharp and neither black nor white",
-            todo="look at the photos, or name another folder",
+            expected="sharp, textured photos that are neither black nor white",
+            todo="check the photos, or name another folder",
         )
     write_atomically(layout.features, json.dumps(found, indent=1).encode())
     return found
@@ -180,7 +180,7 @@ def _camera(plan: Plan, photos: Sequence[Photo]) -> "pycolmap.Camera":
         except (
             RuntimeError,
             ValueError,
-        ):  # Pillow read it and pycolmap cannot: it has no features.
+        ):  # Pillow can read the photo but pycolmap cannot, so the photo has no features.
             continue
     width, height = photos[0].width, photos[0].height
     focal = reading.default_focal_length_factor * max(width, height)

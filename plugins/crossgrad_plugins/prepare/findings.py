@@ -109,7 +109,7 @@ def lost_photos(
             photo.name,
             features[photo.name],
             partners[photo.name],
-            f"in another model, of {elsewhere[photo.name]} photos"
+            f"it belongs to another model, of {elsewhere[photo.name]} photos"
             if photo.name in elsewhere
             else _contradicted(*misplaced[photo.name])
             if photo.name in misplaced
@@ -123,8 +123,8 @@ def lost_photos(
 def _contradicted(agreeing: int, against: int) -> str:
     """Return the reason why a photo was taken out of a model."""
     return (
-        f"its matches contradict each other: {against} speak against the one place that {agreeing} "
-        "speak for (walls, windows or pavements that repeat?)"
+        f"its matches contradict each other: {agreeing} support its best position and "
+        f"{against} contradict it (repeated walls, windows or pavements?)"
     )
 
 
@@ -136,16 +136,16 @@ def _why(photo: Photo, features: int, partners: int, usual: tuple[float, float])
     if photo.brightness > _BRIGHT:
         reasons.append(f"overexposed (mean grey level {photo.brightness:.0f} of 255)")
     if photo.sharpness < _BLURRED_SHARE * usual[1]:
-        reasons.append("blurred, or of something without texture")
+        reasons.append("blurred, or without texture")
     if features == 0:
-        reasons.append("no feature could be found in it")
+        reasons.append("no features were found")
     elif features < max(_FEW, _LOW_SHARE * usual[0]):
-        reasons.append(f"few features ({features}; usual are {usual[0]:.0f})")
+        reasons.append(f"few features ({features}; typical: {usual[0]:.0f})")
     if features and not partners:
         reasons.append("no verified matches with any other photo")
     elif partners:
         reasons.append(
-            f"matches with {partners} photos, but too few of their points are in the model"
+            f"matches with {partners} photos, but the model contains too few of their points"
         )
     return "; ".join(reasons)
 
@@ -230,28 +230,28 @@ def _folders(plan: Plan, names: Iterable[str]) -> str:
     """Return the folders of photos as text, folders with most photos first."""
     inside = set(names)
     counted = Counter(photo.folder for photo in plan.used if photo.name in inside)
-    return " + ".join(folder or "photos in no folder" for folder, _ in counted.most_common(3))
+    return " + ".join(folder or "photos outside of folders" for folder, _ in counted.most_common(3))
 
 
 def _advice(first: str, second: str, heights: tuple[float, float] | None) -> str:
     """Return advice on photos that would join two parts."""
     if first == second:
-        return f"{first}: the photos fall apart; add some that overlap with both parts"
+        return f"{first}: the photos form separate parts; add photos that overlap with both parts"
     if heights is None:
         return (
-            f"photos between {first} and {second} are missing: take a ramp from where one stands "
-            f"to where the other does, each photo at most {_RUNG:g} times as far from the scene "
-            "as the one before, all looking at the same place"
+            f"photos between {first} and {second} are missing: take a series of photos "
+            f"from one position to the other, each at most {_RUNG:g} times as far from "
+            "the scene as the photo before, all looking at the same place"
         )
     low, high = max(1.0, heights[0]), max(1.0, heights[1])
     if high / low <= _RUNG**2:
         return (
-            f"{first} and {second} lie at like heights ({low:.0f} and {high:.0f} m) but share no "
-            "view: add photos that overlap with both"
+            f"{first} and {second} have similar heights ({low:.0f} and {high:.0f} m) but "
+            "no common view: add photos that overlap with both"
         )
     return (
-        f"fly a ramp from {low:.0f} to {high:.0f} m here, looking at what both show: photos at "
-        f"{', '.join(f'{rung:.0f}' for rung in fallbacks(low, high))} m"
+        f"fly from {low:.0f} to {high:.0f} m here, looking at an area that both show: "
+        f"photos at {', '.join(f'{rung:.0f}' for rung in fallbacks(low, high))} m"
     )
 
 

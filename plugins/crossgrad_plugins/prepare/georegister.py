@@ -19,8 +19,8 @@ FEWEST: Final = 3
 #: with which most photos agree is used.
 _ERRORS: Final = (3.0, 10.0, 30.0)
 _AGREEING: Final = 0.6
-#: Photos have to be this many GPS errors apart across their main direction. Along it this is
-#: enough only if the photos tell which way is up.
+#: Photos must be this many GPS errors apart across their main direction. A spread along the main
+#: direction is enough only if the photos show the upward direction.
 _SPREAD: Final = 3.0
 #: Cameras are on a line if their spread across it is below this share of the spread along it.
 _STRAIGHT: Final = 0.05
@@ -70,12 +70,14 @@ def placement_of(
     centers = centers_of(model)
     names = sorted(centers.keys() & positions.keys())
     if len(names) < FEWEST:
-        return None, f"{len(names)} of its photos have GPS, and {FEWEST} are needed"
+        return None, f"{len(names)} of its photos have GPS, but at least {FEWEST} are needed"
     here = np.array([centers[name] for name in names])
     there = np.array([positions[name] for name in names])
     found = _aligned(here, there) or _on_a_line(here, there)
     if found is None:
-        return None, "GPS and poses do not agree: no similarity brings most photos within 30 m"
+        return None, (
+            "GPS and poses do not agree: no similarity transform brings most photos within 30 m"
+        )
     similarity, agrees = found
     agreeing = frozenset(name for name, good in zip(names, agrees, strict=True) if good)
     residuals = dict(zip(names, _moved(similarity, here) - there, strict=True))
@@ -85,12 +87,14 @@ def placement_of(
         return placement, ""
     if along < _SPREAD * placement.rms:
         return None, (
-            f"GPS is not good enough: its photos lie {along:.1f} m apart, and GPS is "
-            f"{placement.rms:.1f} m off"
+            f"GPS is not accurate enough: its photos are {along:.1f} m apart, and the GPS "
+            f"error is {placement.rms:.1f} m"
         )
     upright = levelled(model, similarity, (middle, direction), tops)
     if upright is None:
-        return None, "GPS lies on a line, and the photos do not tell which way is up beside it"
+        return None, (
+            "the GPS positions are on a line, and the photos do not show the upward direction"
+        )
     residuals = dict(zip(names, _moved(upright, here) - there, strict=True))
     return Placement(upright, residuals, agreeing), ""
 

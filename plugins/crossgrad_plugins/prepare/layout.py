@@ -129,20 +129,20 @@ def check_ours(layout: Layout, photos: Path) -> None:
     inside = scene.resolve()
     if inside == photos.resolve() or photos.resolve() in inside.parents:
         raise UserError(
-            "the scene would lie among the photos",
+            "the output folder is inside the photo folder",
             where=scene,
             expected=f"a folder outside {photos}",
-            todo=f"name another one, such as {photos.resolve()}-scene",
+            todo=f"name another folder, such as {photos.resolve()}-scene",
         )
     if layout.plan.is_file() or not scene.is_dir():
         return
-    # Accept only the lock, and temporary files of a plan that a killed process left.
+    # Accept only the lock and temporary plan files that a killed process left.
     left = [path for path in scene.iterdir() if path.name not in {WORK, "run.lock"}]
     if left or (layout.work.is_dir() and any(not _is_hidden(p) for p in layout.work.iterdir())):
         raise UserError(
-            "the folder holds something else than a scene of crossgrad prepare",
+            "the folder contains files that do not belong to a scene of `crossgrad prepare`",
             where=scene,
-            expected="a new folder, an empty one, or one that prepare made",
+            expected="a new or empty folder, or a folder that `crossgrad prepare` made",
             found=", ".join(sorted(path.name for path in scene.iterdir())[:5]),
             todo="choose another folder, or remove it",
         )
@@ -152,19 +152,19 @@ def _check_whole(layout: Layout) -> None:
     """Refuse a finished scene with a missing or truncated part."""
     if not layout.is_whole:
         raise UserError(
-            "the scene is ready, but nothing tells any more which photos it was made of",
+            "the scene is ready, but the records of `crossgrad prepare` are missing",
             where=layout.work,
-            expected="what prepare left there",
-            found="a part of it" if layout.work.is_dir() else "no such folder",
-            todo=f"train on the scene as it is: crossgrad run {quote(str(layout.scene))} --plan "
-            "auto; or choose another folder to prepare the photos anew",
+            expected="the complete folder of records",
+            found="a part of the records" if layout.work.is_dir() else "no such folder",
+            todo=f"train on the scene unchanged: crossgrad run {quote(str(layout.scene))} "
+            "--plan auto; or choose another folder and prepare the photos again",
         )
     for made in (layout.models, layout.placed, layout.model):
         if not _is_sound(layout, made):
             raise UserError(
-                "a model of the scene is cut short, as a full disk leaves it",
+                "a model of the scene is incomplete, for example because the disk was full",
                 where=made,
-                todo=f"remove {layout.report} and run the same command again, which makes it anew",
+                todo=f"remove {layout.report} and run the same command again",
             )
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-#: Least number of points for a pose, as in COLMAP's incremental mapping, and least number of points
+#: Minimum number of points for a pose, as in COLMAP's incremental mapping. Minimum number of points
 #: that two photos of a model share, directly or through other photos, as for a verified pair.
 _POINTS, _SHARED = 30, 15
 
@@ -77,8 +77,8 @@ def _only(model: "pycolmap.Reconstruction", part: frozenset[int]) -> "pycolmap.R
     return alone
 
 
-#: Least number of photos for global mapping: for one folder, and for several folders. Folders may
-#: be joined by few matches, and global mapping misplaces such parts (docs/prepare.md).
+#: Minimum number of photos for global mapping: for one folder, and for several folders. Few matches
+#: may join folders, and global mapping then misplaces such parts (docs/prepare.md).
 _MANY, _MANY_OF_FOLDERS = 100, 1000
 #: Least number of photos in a model.
 _SMALLEST: Final = 3
@@ -195,7 +195,7 @@ def _options(threads: int) -> "pycolmap.IncrementalPipelineOptions":
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, 0
     options.min_model_size = _SMALLEST
-    # The fallback also places photos by pairs, but does not check how many pairs agree.
+    # The fallback also estimates poses from pairs, but it does not check how many pairs agree.
     options.structure_less_registration_fallback = False
     return options
 
@@ -211,7 +211,7 @@ def _looked_again(
     adjust = partial(_adjusted, threads, Path(plan.photos))
     with disk_errors(scratch):
         return waited(
-            "placing doubtful photos",
+            "finding poses for doubtful photos",
             lambda token: looked_again(
                 models, layout.database, scratch, partial(adjust, token), lambda: token.is_cancelled
             ),
@@ -257,9 +257,9 @@ def _global(layout: Layout, plan: Plan, threads: int, out: Path) -> Models:
 def _nothing(layout: Layout, plan: Plan) -> UserError:
     pairs = len(json.loads(layout.links.read_bytes()))
     return UserError(
-        "no camera could be found: no photos fit together",
+        "no camera pose could be estimated: no photos match well enough",
         where=plan.photos,
-        expected="photos that overlap by more than half, taken from different places",
+        expected="photos that overlap by more than half, taken from different positions",
         found=f"{len(plan.used)} photos; {pairs} pairs of them match ({layout.links})",
-        todo="add photos between those that there are, or choose another --lens or --matching",
+        todo="add photos between the existing photos, or choose another --lens or --matching",
     )

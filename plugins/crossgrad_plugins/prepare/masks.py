@@ -19,7 +19,8 @@ from crossgrad_core.scene.photos.shapes import check_mask, is_turned
 from crossgrad_core.scene.wording import count, name_some
 from crossgrad_plugins.prepare.plan import LeftOut, Photo, digest_of
 
-#: Folders with this name contain masks, and so do files next to photos whose stem ends like this.
+#: Folders with this name contain masks. Files next to photos are masks if their stem ends like
+#: this.
 _MASKS: Final = "masks"
 _ENDS: Final = ("_mask", ".mask")
 #: The level of a mask or of transparency below which a pixel does not count.
@@ -57,7 +58,7 @@ def sorted_out(root: Path, files: Sequence[str], wanted: Path | None) -> Sorted:
     """
     if wanted is not None and not wanted.is_dir():
         raise UserError(
-            "the mask folder is not there",
+            "the mask folder does not exist",
             where=wanted,
             todo="check the path, or leave --masks out",
         )
@@ -173,11 +174,11 @@ def _check_some(wanted: Path, photos: Sequence[str], masks: Mapping[str, Path]) 
         return
     names = ", ".join(dict.fromkeys(mask_names(photos[0])))
     raise UserError(
-        "no photo has a mask in the mask folder",
+        "the mask folder contains no mask for any photo",
         where=wanted,
         expected=f"one of {names} for the photo {photos[0]}",
         found=name_some(PhotoFolder(wanted).names) or "no image",
-        todo="name the masks after their photos, folders included, or leave --masks out",
+        todo="name the masks after their photos, including their folders, or leave --masks out",
     )
 
 
@@ -194,10 +195,10 @@ def _tell_folders(
                 name=name_some([f"{folder}/"]), why="the folder of masks (--masks), not of photos"
             )
         elif strays:
-            why = f"masks, but {count(len(strays), 'file')} of no photo: {name_some(strays)}"
+            why = f"masks; {count(len(strays), 'file')} without a photo: {name_some(strays)}"
             yield LeftOut(name=name_some([f"{folder}/"]), why=why)
         elif folder != _MASKS:
-            yield LeftOut(name=name_some([f"{folder}/"]), why="masks of the photos beside it")
+            yield LeftOut(name=name_some([f"{folder}/"]), why="masks of the photos next to it")
 
 
 def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
@@ -207,9 +208,9 @@ def _strays(beside: Iterable[str], photos: Iterable[str]) -> Iterator[LeftOut]:
     for name in beside:
         path = PurePosixPath(name)
         if str(path.with_suffix("")) not in masks:
-            why = "named as a mask, but of no photo: rename it if it is one"
+            why = "named like a mask, but without a photo: rename it if it is a photo"
         elif path.suffix != ".png":
-            why = "the name of a mask beside its photo has to end in .png"
+            why = "the name of a mask next to its photo must end in .png"
         else:
             continue
         yield LeftOut(name=name_some([name]), why=why)

@@ -75,8 +75,8 @@ def _sample(layout: Layout) -> NDArray[np.float32]:
     return np.concatenate(parts)
 
 
-#: Greatest number of photos for comparing all pairs: always, without GPS, and without GPS if the
-#: photos are in several folders, which only few pairs may join.
+#: Maximum number of photos for matching all pairs: always; without GPS; and without GPS if the
+#: photos are in several folders, which only few pairs may connect.
 _FEW, _SOME, _SOME_OF_FOLDERS = 60, 100, 250
 #: Least share of photos with GPS for choosing neighbours by GPS.
 _MOST_LOCATED: Final = 0.9
@@ -84,7 +84,8 @@ _MOST_LOCATED: Final = 0.9
 _NEAREST, _ALIKE, _NEXT = 40, 40, 5
 #: Number of next photos by name if nothing else determines neighbours.
 _NEXT_ALONE: Final = 20
-#: Greatest distance of neighbours by GPS in metres. Wrong GPS then finds no neighbours.
+#: Maximum distance of neighbours by GPS in metres. Wrong GPS positions therefore give no
+#: neighbours.
 _FARTHEST: Final = 500.0
 #: Greatest number of features of a photo that are used to look up similar photos.
 _LOOKED_UP: Final = 2000
@@ -138,7 +139,7 @@ def check_gps(plan: Plan) -> None:
     """
     if plan.settings.matching == "spatial" and len(plan.located) < 2:  # noqa: PLR2004 - a pair
         raise UserError(
-            "the photos have no GPS to tell neighbours by",
+            "--matching spatial needs GPS positions, and the photos have none",
             where="--matching spatial",
             found=f"{len(plan.located)} of {len(plan.used)} photos with GPS",
             todo="leave --matching out, or use --matching retrieval",
@@ -190,7 +191,7 @@ def _match(
 
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = threads
-    # A fixed seed for each pair makes results independent of order and interruptions.
+    # Each pair has a fixed seed, so that results do not depend on the order or on interruptions.
     verification.ransac.random_seed = 0
     verification.ransac.max_num_trials = _TRIALS
     compare = getattr(pycolmap, f"match_{way}")
@@ -207,7 +208,7 @@ def _pairing(each: str, layout: Layout, way: str, threads: int) -> object:
     options: Any
     if each == "spatial":
         options = pycolmap.SpatialPairingOptions()
-        # Photos from the ground are neighbours of photos taken above them.
+        # Photos from the ground are neighbours of aerial photos above them.
         options.ignore_z = True
         options.max_num_neighbors, options.max_distance = _NEAREST, _FARTHEST
     elif each == "vocabtree":

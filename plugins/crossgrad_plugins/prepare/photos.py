@@ -77,7 +77,8 @@ _REDUCIBLE: Final = 2
 #: Approximate longest side in pixels of the reduced photos that are inspected.
 _LOOKED_AT: Final = 1024
 _AT_ONCE: Final = 4
-#: Lock that makes large photos (a fixed share of the greatest size) be decoded one at a time.
+#: Lock for large photos (a fixed share of the maximum size), so that they are decoded one at a
+#: time.
 _LARGE: Final = Lock()
 Tell = Callable[[int, int], None]
 
@@ -130,7 +131,9 @@ def has_photos(root: Path) -> bool:
 def _check_folder(root: Path) -> None:
     if not root.is_dir():
         raise UserError(
-            "there is no such folder of photos" if not root.exists() else "photos are in a folder",
+            "the photo folder does not exist"
+            if not root.exists()
+            else "the path of the photos must be a folder",
             where=root,
             expected="a folder with photos",
             found="a file" if root.exists() else "",
@@ -144,7 +147,7 @@ def _check_text(folder: Path) -> None:
         str(folder).encode()
     except UnicodeEncodeError as error:
         raise UserError(
-            "the folder has a name that is no text",
+            "the name of the folder is not valid text",
             where=folder,
             expected="a path in UTF-8",
             todo="rename it",
@@ -220,7 +223,7 @@ def _read(root: Path, name: str, header: PhotoHeader, cameras: str) -> Photo:
         if image.mode == "F" or (image.format == "TIFF" and image.mode in _MODES_OF_TIFF):
             # COLMAP would write such photos in a format that no program reads.
             raise UserError(
-                "its values are none of a photo",
+                "the pixel values of the photo have a type that photos do not use",
                 where=path,
                 expected="8 or 16 bits",
                 found=f"{image.format}, {_VALUES[image.mode]}",
@@ -280,12 +283,12 @@ def _too_large(path: Path, header: PhotoHeader) -> UserError:
     usual, most = megapixels(pillow.MOST_PIXELS), megapixels(_REDUCIBLE * pillow.MOST_PIXELS)
     pixels = megapixels(header.width * header.height)
     return UserError(
-        "the photo is too large to be decoded at once",
+        "the photo is too large to be decoded",
         where=path,
-        expected=f"at most {usual}, or {most} as a JPEG file that is not progressive",
+        expected=f"at most {usual}, or {most} for a JPEG file that is not progressive",
         found=f"{header.width} x {header.height} pixels, {pixels}",
-        todo="save it smaller, such as at half its width and height, or take it out of the folder "
-        "(--max-size makes photos smaller only once they are decoded)",
+        todo="save it at a smaller size, such as half its width and height, or remove it "
+        "from the folder (--max-size applies only after decoding)",
     )
 
 
@@ -307,15 +310,15 @@ def _too_few(root: Path, used: Sequence[Photo], left_out: Sequence[LeftOut]) -> 
     """Return the error for too few usable photos."""
     first = "; ".join(f"{each.name}: {each.why}" for each in left_out[:3])
     nothing = not used and not left_out
-    todo = "name the folder that the photos are in"
+    todo = "name the folder that contains the photos"
     if left_out:
-        todo = "repair, convert or leave out what is named, or name another folder"
+        todo = "repair, convert or remove these photos, or name another folder"
     elif used:
-        todo = "add photos that overlap with it, taken from other places"
+        todo = "add photos that overlap with it, taken from other positions"
     return UserError(
-        "there are no photos in the folder" if nothing else "too few photos can be used",
+        "the folder contains no photos" if nothing else "too few photos can be used",
         where=root,
         expected=f"at least 2 photos ({', '.join(sorted(end[1:] for end in _READ))})",
-        found=f"{len(used)} that can be used" + (f"; {first}" if first else ""),
+        found=f"{len(used)} usable photos" + (f"; {first}" if first else ""),
         todo=todo,
     )

@@ -146,12 +146,12 @@ def _check_same(layout: Layout, known: Plan, plan: Plan) -> None:
     differs = _difference(known, plan, some=layout.is_ready)
     if differs:
         raise UserError(
-            "the scene was begun otherwise",
+            "the scene folder was begun with other photos or settings",
             where=layout.scene,
             expected="the same photos, masks and settings",
             found=differs,
-            todo="use those it was begun with, choose another folder for the scene, or remove this "
-            "one",
+            todo="use the original photos and settings, choose another scene folder, or "
+            "remove this folder",
         )
 
 
@@ -172,7 +172,7 @@ def read_plan(layout: Layout) -> Plan:
         ) from error
     if plan.format > FORMAT:
         raise UserError(
-            "the scene comes from a later version of crossgrad",
+            "the scene was prepared by a later version of crossgrad",
             where=layout.plan,
             found=f"format {plan.format}",
             expected=f"at most {FORMAT}",
@@ -190,7 +190,7 @@ def _difference(known: Plan, plan: Plan, *, some: bool) -> str:
         some: True if photos of the old plan may be missing from the new plan.
     """
     was, now = known.settings.model_dump(), plan.settings.model_dump()
-    # Only the content of masks is compared, not their folder.
+    # Compare only the content of masks, not their folder.
     told = [f"{key} was {was[key]}, now {now[key]}" for key in was
             if was[key] != now[key] and key != "masks"]  # fmt: skip
     after = {photo.name: photo for photo in plan.used}

@@ -312,7 +312,8 @@ def off_lines(
     here, there = (np.column_stack([points, np.ones(len(points))]) for points in rays)
     lines, back = here @ essential.T, there @ essential
     error = np.abs((there * lines).sum(axis=1))
-    # Two photos with the same centre have no epipolar lines, so nothing contradicts the poses.
+    # Two photos with the same centre have no epipolar lines, so their matches cannot contradict the
+    # poses.
     tiny = np.finfo(np.float64).tiny
     in_other = error / np.maximum(tiny, np.hypot(lines[:, 0], lines[:, 1])) * focals[1]
     in_one = error / np.maximum(tiny, np.hypot(back[:, 0], back[:, 1])) * focals[0]

@@ -84,9 +84,9 @@ def waited(
                         progress.tell(f"{what}: {told}")
         except (RuntimeError, ValueError, IndexError) as error:
             raise UserError(
-                f"pycolmap failed: {what}",
+                f"pycolmap failed in the stage {what}",
                 found=str(error),
-                todo="run the same command again; it goes on from the last complete stage",
+                todo="run the same command again; it continues after the last complete stage",
             ) from error
         except BaseException:
             token.cancel()
@@ -104,7 +104,8 @@ def rows_of(database: Path, table: str) -> int:
     try:
         done = subprocess.run(program, capture_output=True, timeout=_PATIENCE, check=True)
         return int(done.stdout)
-    except (OSError, ValueError, subprocess.SubprocessError):  # It is busy, or not made yet.
+    except (OSError, ValueError, subprocess.SubprocessError):
+        # The database is busy, or does not exist yet.
         return 0
 
 
@@ -117,7 +118,7 @@ def write_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
     try:
         with quiet():
             model.write(folder)
-    except (RuntimeError, ValueError) as error:  # A file could not even be made.
+    except (RuntimeError, ValueError) as error:  # The file could not be created.
         raise disk_full(folder, None) from error
     check_written(folder)
 

@@ -100,11 +100,11 @@ def looked_again(
         try:
             main = adjust(again.copy, place)
         except (RuntimeError, ValueError) as error:
-            _LOG.warning("doubtful photos stay where they are: pycolmap failed: %s", error)
+            _LOG.warning("doubtful photos keep their poses: pycolmap failed: %s", error)
             break
         _leave_out_impossible(main)
         look = again.look(main)
-        # Evidence for single photos need not hold after all of them are moved.
+        # Evidence for a single photo may no longer be valid after all photos have moved.
         if look.agreeing >= seen.agreeing:
             best, seen, gone = main, look, moved
     here = set(best.reg_image_ids())
@@ -199,7 +199,7 @@ class _Again:
                 if not support(pairs.sights(photo, poses), poses[photo]).enough:
                     model.deregister_frame(model.image(photo).frame_id)
             against = pairs.contradicting(poses_of(model))
-            # Mapping does not handle photos without a pair.
+            # Mapping cannot process photos without a pair.
             for photo in pairs.without(against) & poses_of(model).keys():
                 model.deregister_frame(model.image(photo).frame_id)
             for one, two in sorted(self._aside ^ against):

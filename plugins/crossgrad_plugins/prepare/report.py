@@ -146,11 +146,11 @@ def _masks(plan: Plan) -> Iterator[str]:
     masked = sum(photo.mask is not None for photo in plan.used)
     transparent = sum(photo.transparent for photo in plan.used)
     if masked:
-        yield f"masks: {masked} of {len(plan.used)} photos have one; black does not count"
+        yield f"masks: {masked} of {len(plan.used)} photos have one; black pixels are ignored"
     if transparent:
         yield (
-            f"transparency: {transparent} of {len(plan.used)} photos have it; pixels with alpha "
-            "below a half do not count, by masks in the scene"
+            f"transparency: {transparent} of {len(plan.used)} photos have it; masks in "
+            "the scene exclude pixels with alpha below one half"
         )
 
 
@@ -166,7 +166,10 @@ def _gps(report: Report) -> Iterator[str]:
     elif located:
         yield f"GPS: {located} photos have it, but {report.result.parts[0].unplaced}"
     else:
-        yield "GPS: no photo has it and an altitude; the scene's scale and direction are arbitrary"
+        yield (
+            "GPS: no photo has GPS with an altitude; the scale and the orientation of "
+            "the scene are arbitrary"
+        )
 
 
 def _missing(report: Report, most: int) -> Iterator[str]:
@@ -175,14 +178,14 @@ def _missing(report: Report, most: int) -> Iterator[str]:
     joined = [part for part in parts[1:] if part.joined]
     if joined:
         yield (
-            f"{len(joined) + 1} models are joined by GPS alone: expect them to be off by as much "
-            "as GPS is, and take photos between them for more"
+            f"{len(joined) + 1} models are joined only by GPS: their relative error is as "
+            "large as the GPS error; to reduce it, add photos between them"
         )
     if others:
         sizes = ", ".join(str(len(part.photos)) for part in others)
-        yield f"not joined to the scene: {len(others)} other models of {sizes} photos"
+        yield f"not joined to the scene: {len(others)} other models with {sizes} photos"
     for bridge in report.bridges:
-        yield f"a bridge is missing ({bridge.pairs} pairs match across): {bridge.advice}"
+        yield f"models are not connected ({bridge.pairs} pairs match across): {bridge.advice}"
     yield from _some([f"no pose: {each.name}: {each.why}" for each in report.lost], most)
     yield from _some([f"left out: {e.name}: {e.why}" for e in report.plan.left_out], most)
 
@@ -190,15 +193,20 @@ def _missing(report: Report, most: int) -> Iterator[str]:
 def _some(lines: Sequence[str], most: int) -> Iterator[str]:
     yield from lines[:most]
     if len(lines) > most:
-        yield f"... and {len(lines) - most} more of these, in report.md"
+        yield f"... and {len(lines) - most} more lines like this in report.md"
+
+
+def _sources(report: Report) -> str:
+    pairs, poses = report.ways[0], report.ways[1]
+    return f"Photos: `{report.plan.photos}`. Matched pairs: {pairs}. Poses: {poses}."
 
 
 def page_of(report: Report) -> str:
     """Return the report as Markdown text."""
     plan = report.plan
     everything = len(plan.used) + len(plan.left_out)
-    lines = ["# From photos to a scene", "", f"Photos: `{plan.photos}`. Compared: {report.ways[0]}."
-             f" Poses: {report.ways[1]}.", "", *(f"- {line}" for line in _in_short(report)),
+    lines = ["# From photos to a scene", "", _sources(report), "",
+             *(f"- {line}" for line in _in_short(report)),
              *(f"- {line}" for line in _missing(report, everything)), "",
              "![Where the photos were taken](report.png)", "", "## Folders", "",
              "| folder | photos | with a pose | features (median) | metres above ground |",

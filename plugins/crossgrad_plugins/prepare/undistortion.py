@@ -99,9 +99,9 @@ def _options(plan: Plan) -> "pycolmap.UndistortCameraOptions":
 
 
 def _moved(here: Path, there: Path) -> None:
-    if not _is_written(here):  # Pycolmap does not say why.
+    if not _is_written(here):  # Pycolmap does not report the reason.
         raise UserError(
-            "the undistorted photo could not be written",
+            "an undistorted photo could not be written",
             where=there,
             todo="check that the disk has room, and run the same command again",
         )

@@ -43,7 +43,10 @@ class GsplatRasterizer(Rasterizer):
     deterministic: ClassVar[bool] = False
 
     max_alpha: float = Field(
-        0.999, ge=0.999, le=0.999, description="cap of a Gaussian's alpha; gsplat 1.5 has no other"
+        0.999,
+        ge=0.999,
+        le=0.999,
+        description="upper limit of a Gaussian's alpha; gsplat 1.5 supports only this value",
     )
 
     @classmethod

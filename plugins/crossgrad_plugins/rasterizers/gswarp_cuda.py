@@ -24,7 +24,7 @@ from crossgrad_plugins.rasterizers.gpu.nested import Call, Drawing, drawn, empty
 from crossgrad_plugins.rasterizers.gpu.self_test import self_test
 from crossgrad_plugins.rasterizers.reference.harmonics import coefficients_of, view_colors
 
-#: gswarp does not render Gaussians up to this depth, in the units of its input.
+#: gswarp does not render Gaussians that are nearer than this depth, in the units of its input.
 _NEAR = 0.2
 
 
@@ -39,13 +39,21 @@ class GswarpRasterizer(Rasterizer):
     deterministic: ClassVar[bool] = False
 
     max_alpha: float = Field(
-        0.99, ge=0.99, le=0.99, description="cap of a Gaussian's alpha; gswarp has no other"
+        0.99,
+        ge=0.99,
+        le=0.99,
+        description="upper limit of a Gaussian's alpha; gswarp supports only this value",
     )
     dilation: float = Field(
-        0.3, ge=0.3, le=0.3, description="dilation of the 2-D covariance, px^2; gswarp has no other"
+        0.3,
+        ge=0.3,
+        le=0.3,
+        description="dilation of the 2-D covariance, px^2; gswarp supports only this value",
     )
     footprint: Literal["3-sigma"] = Field(
-        "3-sigma", description="as the original code; gswarp has no other"
+        "3-sigma",
+        description="size of the rendered footprint, as in the original code; gswarp supports "
+        "only this value",
     )
 
     @classmethod
@@ -68,10 +76,15 @@ class GswarpRasterizer(Rasterizer):
             reasons.append(f"{missing}, or leave --rasterizer out")
         if selection.backbone.sets_dilation and selection.backbone.response in self.responses:
             name = selection.names["backbone"]
-            reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, and backbone {name} by its own")
+            reasons.append(
+                f"rasterizer gswarp always dilates by 0.3 px^2, but backbone {name} sets its "
+                "own dilation"
+            )
         if selection.resolution.strided:
             name = selection.names["resolution"]
-            reasons.append(f"rasterizer gswarp dilates by 0.3 px^2, resolution {name} by less")
+            reasons.append(
+                f"rasterizer gswarp always dilates by 0.3 px^2, but resolution {name} needs less"
+            )
         return reasons
 
     @override

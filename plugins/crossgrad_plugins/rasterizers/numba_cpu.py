@@ -104,11 +104,11 @@ def _require_fitting(gaussians: Gaussians) -> None:
     """Raise an error for tensors of inconsistent shapes, because kernels do not check bounds."""
     if misfit := gaussians.misfit():
         raise UserError(
-            "these Gaussians cannot be drawn",
-            where="what the backbone decodes",
-            expected="tensors with a row for each Gaussian (crossgrad_core.plugin.Gaussians)",
+            "the Gaussians of the backbone cannot be rendered",
+            where="the result of the backbone's `decode`",
+            expected="tensors with one row for each Gaussian (crossgrad_core.plugin.Gaussians)",
             found=misfit,
-            todo="repair `decode` of the backbone; `crossgrad plugins check` looks at it",
+            todo="repair `decode` of the backbone; `crossgrad plugins check` tests it",
         )
 
 
@@ -185,7 +185,7 @@ class _Draw(torch.autograd.Function):
         call: _Call = ctx.call
         frame = call.frame
         if frame is None:
-            raise RuntimeError("the forward pass did not run")
+            raise RuntimeError("the backward pass was called before the forward pass")
         v = np.zeros_like(frame.image) if v_image is None else _array(v_image)
         found = backward(
             frame,

@@ -98,7 +98,7 @@ class TorchRasterizer(Rasterizer):
         size = (camera.width, camera.height)
         with torch.no_grad():
             index, boxes, published = self._drawn(gaussians, camera)
-        # Gaussians that are not drawn never enter the graph, so that they cannot pass on a NaN.
+        # Gaussians that are not rendered never enter the graph, so that they cannot pass on a NaN.
         drawn = _rows(gaussians, index)
         projection, shapes, colors = self._splats(drawn, camera)
         screen = Screen(torch.zeros(len(gaussians), dtype=torch.int32, device=index.device))

@@ -19,7 +19,7 @@ BLENDER_FILE: Final = "transforms_train.json"
 #: The pose file of nerfstudio and of a MatrixCity block, and the key that only MatrixCity uses.
 TRANSFORMS_FILE: Final = "transforms.json"
 _ROTATION: Final = b'"rot_mat"'
-#: Folders that are searched for blocks, and the greatest depth: small_city/aerial/train/block_1.
+#: Folders that are searched for blocks, and the maximum depth: small_city/aerial/train/block_1.
 _BLOCKS: Final = re.compile(r"aerial|street|train|test|(block|small_city|big_city|bridge).*")
 _DEEPEST: Final = 4
 #: The reconstruction of OpenSfM, and the reconstruction in an OpenDroneMap project.
@@ -28,7 +28,7 @@ OPENSFM_FILES: Final = ("reconstruction.json", "opensfm/reconstruction.json")
 NAME_COLUMN: Final = "name"
 POSE_COLUMNS: Final = ("x", "y", "alt", "heading", "pitch", "roll")
 COLUMNS: Final = frozenset({NAME_COLUMN, *POSE_COLUMNS, "f"})
-#: A file with at least this many of the columns is probably meant as a RealityCapture CSV.
+#: A file is probably meant as a RealityCapture CSV if it has at least this many of the columns.
 _NEARLY: Final = 5
 #: Names in UC-GS scenes: the prefix of a folder of held-out photos, and the word in photo names.
 _TEST: Final = "test"
@@ -181,17 +181,18 @@ class Kind:
             return inside.file(found[0].name, found[0])
         several = f"several {self.form}s" if found else f"no {self.form}"
         raise UserError(
-            f"the scene has {several} of {self.program}",
+            f"the scene contains {several} of {self.program}, and it is not clear which "
+            "one to read",
             where=inside.scene,
             expected=self.expected,
             found=", ".join(path.name for path in found) or "none",
-            todo="name it, with --set reader.file=NAME, or export it",
+            todo="name the file, with --set reader.file=NAME, or export it",
         )
 
 
 METASHAPE: Final = Kind(
     *("XML", "Metashape", ".xml", _is_metashape),
-    "one file of File > Export > Export Cameras, with a chunk in a document",
+    "one file of File > Export > Export Cameras that contains a chunk in a document",
 )
 REALITYCAPTURE: Final = Kind(
     *("CSV", "RealityCapture", ".csv", _has_columns),

@@ -12,8 +12,11 @@ from crossgrad_core.scene.calibration import Calibration
 from crossgrad_plugins.georeference.frames import SAME, Frame3D
 
 _OPENGL: Final = np.diag([1.0, -1.0, -1.0])
-_UNDISTORT = "undistort the photos with the program that posed them and export them as pinhole ones"
-_CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective ones first"
+_UNDISTORT = (
+    "undistort the photos with the program that estimated their poses, and "
+    "export them with pinhole cameras"
+)
+_CUT = f"{_UNDISTORT}; cut 360-degree photos into perspective photos first"
 
 
 def from_opengl(
@@ -76,7 +79,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
     return UserError(
         f"photos of {kind} cannot be undistorted",
         where=where,
-        expected="a perspective camera, with Brown's distortion or a fisheye's",
+        expected="a perspective camera with Brown's distortion or a fisheye distortion",
         found=kind,
         todo=todo,
     )
@@ -85,7 +88,7 @@ def refuse_lens(kind: str, where: object, todo: str = _CUT) -> UserError:
 def refuse_term(term: str, value: float, where: object) -> UserError:
     """Return the error for a lens term that COLMAP's models do not contain."""
     return UserError(
-        f"the lens has a term that cannot be undistorted: {term}",
+        f"the lens model has a term that crossgrad cannot undistort: {term}",
         where=where,
         expected=f"{term} = 0",
         found=f"{value:g}",

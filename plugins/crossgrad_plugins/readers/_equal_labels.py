@@ -65,15 +65,15 @@ def paired(
     if unclear or twice:
         found = next(names for names in fits if len(names) > 1) if unclear else sorted(counts)
         raise UserError(
-            "several cameras or photos have one label"
+            "several cameras or photos have the same label"
             if unclear
-            else "several cameras have one photo",
+            else "several cameras refer to the same photo",
             where=name_some(unclear or twice),
-            expected="labels with the folders of the photos, or sensors or groups called like "
-            "these folders",
+            expected="labels that include the folders of the photos, or sensors or groups named "
+            "after these folders",
             found=f"photos {name_some(found)}",
-            todo="name the sensors or camera groups after the folders of their photos, and export "
-            "the cameras again",
+            todo="name the sensors or camera groups after the folders of their photos, and "
+            "export the cameras again",
         )
     labels = Counter(camera.label for camera in cameras)
     missing = [
@@ -154,7 +154,9 @@ def _by_order(cameras: Sequence[Labelled], fits: list[list[str]]) -> list[str]:
             for i, names in found.items():
                 fits[i] = names
             pairs = ", ".join(f"{owner or 'none'} {place}" for owner, place in places.items())
-            return [f"photos of equal labels are paired by the order of {of}s and folders: {pairs}"]
+            return [
+                (f"photos with equal labels are paired by the order of {of}s and folders: {pairs}")
+            ]
     return []
 
 

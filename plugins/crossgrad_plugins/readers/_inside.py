@@ -85,7 +85,7 @@ class Inside:
         plain = self._plain(text, base)
         if plain is None or not is_file(self.scene / plain):
             other = files.find(plain or text)
-            # Keep suffix and case: the photo is paired, and a note is written, later.
+            # Keep suffix and case: the photo is matched, and a note is written, later.
             if other is not None and (plain is None or not same_spelling(plain, other)):
                 return other
         return self.name(text, where, base)
@@ -125,23 +125,23 @@ class Inside:
 
 def _outside(where: object, found: str) -> UserError:
     return UserError(
-        "a file name leads out of the scene",
+        "a file name points outside the scene folder",
         where=where,
-        expected="a file below the scene's folder, relative to it",
+        expected="a path relative to the scene folder and inside it",
         found=found,
-        todo="copy the file into the scene and mend the name, or name the folder that holds "
-        "everything as the scene",
+        todo="copy the file into the scene folder and correct the name, or use a folder "
+        "that contains all files as the scene",
     )
 
 
 def _impossible(where: object, text: str) -> UserError:
     return UserError(
-        "a name that no file can have",
+        "a file name is not valid",
         where=where,
         expected=f"UTF-8 without control characters, at most {LONGEST_PART} bytes for a file or "
         f"folder and {LONGEST_NAME} in all",
         found=ascii(text),
-        todo="mend the name in the file, or export it again",
+        todo="correct the name in the file, or export the file again",
     )
 
 

@@ -17,7 +17,7 @@ from crossgrad_core.scene.raw import FARTHEST
 LARGEST: Final = 512 << 20
 #: Largest width or height of a photo, in pixels.
 LONGEST_SIDE: Final = 10_000_000
-_AGAIN = "mend the file, or export it again"
+_AGAIN = "correct the file, or export it again"
 _LONGEST: Final = 80
 
 
@@ -53,9 +53,9 @@ class Fields:
         Raises:
             UserError: Always.
         """
-        here = repr(self.value[key])[:_LONGEST] if key in self.value else "no such field"
+        here = repr(self.value[key])[:_LONGEST] if key in self.value else "the field is missing"
         raise UserError(
-            "a field of the scene cannot be read",
+            "a field of the scene file cannot be read",
             where=self.where(key),
             expected=expected,
             found=here if found is None else found,
@@ -105,10 +105,10 @@ class Fields:
         """Return a list of texts."""
         value = self.value.get(key)
         if not isinstance(value, list):
-            self.wrong(key, "a list of texts")
+            self.wrong(key, "a list of strings")
         texts = [each for each in value if isinstance(each, str)]
         if len(texts) != len(value):
-            self.wrong(key, "a list of texts")
+            self.wrong(key, "a list of strings")
         return texts
 
     def inner(self, key: str) -> "Fields":
@@ -133,7 +133,7 @@ class Fields:
         place = f"{self.place}{'.' if self.place else ''}{name}"
         if not isinstance(value, dict):
             raise UserError(
-                "a field of the scene cannot be read",
+                "a field of the scene file cannot be read",
                 where=f"{self.file}: {place}",
                 expected="an object",
                 found=repr(value)[:_LONGEST],
@@ -152,9 +152,9 @@ def read_json(path: Path) -> object:
         return json_in(path, LARGEST)
     except FileNotFoundError as error:
         raise UserError(
-            "a file of this format is missing",
+            "a file that this scene format needs is missing",
             where=path,
-            todo="name another scene, or the --reader that it is for (`auto` finds out by itself)",
+            todo="name another scene, or the --reader of its format (`auto` detects the format)",
         ) from error
     except ValueError as error:
         raise _unreadable(path, str(error)) from error

@@ -97,7 +97,9 @@ def _rigid(
 ) -> NDArray[np.float64]:
     rotation = rotation_of(turn)
     if rotation is None:
-        fields.wrong(key, "an orthonormal, right-handed rotation, and a shift", str(turn.tolist()))
+        fields.wrong(
+            key, "an orthonormal, right-handed rotation and a translation", str(turn.tolist())
+        )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, shift
     return pose

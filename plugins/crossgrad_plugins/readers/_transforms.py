@@ -98,7 +98,7 @@ def read_frame(
     matrix = transform_of(frame, "transform_matrix")
     rotation = rotation_of(matrix[:, :3])
     if rotation is None:
-        frame.wrong("transform_matrix", "an orthonormal, right-handed rotation, and a shift")
+        frame.wrong("transform_matrix", "an orthonormal, right-handed rotation and a translation")
     calibration = read_lens(inside, frame, whole, photo)
     return Posed(photo, calibration, from_opengl(rotation, matrix[:, 3], world), mask)
 
@@ -151,7 +151,7 @@ def _completing(frame: Fields, whole: Fields) -> Fields:
               if any(key in frame for key in way)]  # fmt: skip
     own = _says_fisheye(frame)
     if own is not None and own != bool(_says_fisheye(whole)):
-        others += _WAYS[1]  # Distortion of another kind of lens.
+        others += _WAYS[1]  # These are distortion parameters of another kind of lens.
     hidden = frozenset[str]().union(*others)
     return replace(whole, value={k: v for k, v in whole.value.items() if k not in hidden})
 
@@ -227,5 +227,5 @@ def raw_views(frames: Sequence[Posed]) -> tuple[str, tuple[RawView, ...]]:
 
 def _existing(path: Path, frame: Fields) -> Path:
     if not is_file(path):
-        frame.wrong("mask_path", "a mask that is there", f"no file {path}")
+        frame.wrong("mask_path", "an existing mask", f"no file {path}")
     return path

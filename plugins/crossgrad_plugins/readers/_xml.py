@@ -43,9 +43,9 @@ class _Builder:
         self._depth += 1
         self._count += 1 + len(attributes)
         if self._count > _MOST:
-            raise _RefusedError(f"more than {_MOST:,} elements and attributes")
+            raise _RefusedError(f"the file contains more than {_MOST:,} elements and attributes")
         if self._depth > _DEEPEST:
-            raise _RefusedError(f"elements more than {_DEEPEST} deep within each other")
+            raise _RefusedError(f"the elements are nested more than {_DEEPEST} levels deep")
         self.tree.start(tag, attributes)
 
     def end(self, tag: str) -> None:
@@ -53,7 +53,9 @@ class _Builder:
         self.tree.end(tag)
 
     def doctype(self, name: str, *rest: object) -> None:
-        raise _RefusedError("a document type, which may declare entities")
+        raise _RefusedError(
+            "the file has a document type, which is not allowed because it may declare entities"
+        )
 
 
 def read_xml(path: Path) -> Element:
@@ -84,10 +86,10 @@ def _parsed(path: Path) -> Element:
     with open_file(path) as file:
         while piece := file.read(_PIECE):
             if file.tell() > LARGEST:
-                raise _RefusedError(f"a file of more than {size_text(LARGEST)}")
+                raise _RefusedError(f"the file is larger than {size_text(LARGEST)}")
             parser.Parse(piece, False)
             if file.tell() - parser.CurrentByteIndex > _LONGEST:
-                raise _RefusedError(f"a tag or comment of more than {size_text(_LONGEST)}")
+                raise _RefusedError(f"a tag or comment is longer than {size_text(_LONGEST)}")
     parser.Parse(b"", True)
     return builder.tree.close()
 

@@ -34,11 +34,13 @@ class BlenderReader(Reader):
     folder: str = Field(".", description="folder of the transforms files within the scene")
     background: Literal["white", "black", "none"] = Field(
         "white",
-        description="behind photos with transparency; none: pixels with alpha below a half do not "
-        "count",
+        description="background colour behind photos with transparency; none: pixels with alpha "
+        "below one half are ignored",
     )
     points: str | None = Field(
-        None, description="PLY of points within the scene; by itself one beside the transforms"
+        None,
+        description="PLY file of points within the scene; by default a PLY file next to the "
+        "transforms file",
     )
 
     @override

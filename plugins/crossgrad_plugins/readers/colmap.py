@@ -26,7 +26,7 @@ from crossgrad_plugins.readers.colmap_files.folder import (
 from crossgrad_plugins.readers.colmap_files.model import model_files, read_model
 from crossgrad_plugins.readers.place.place import by_code, by_file, by_gps
 
-#: The file with the place on Earth, in the model's folder or in the scene's folder.
+#: Name of the file with the georeference, in the model's folder or in the scene's folder.
 _GEOREF = "georef.json"
 #: Below this length, or above its inverse, the square of a quaternion's length is not accurate.
 _SHORTEST = 1e-100
@@ -43,13 +43,11 @@ class ColmapReader(Reader):
     model: str | None = Field(
         None, description="folder of the model within the scene, such as sparse/1"
     )
-    crs: str | None = Field(
-        None, description="coordinate system that the poses are in, such as epsg:32633"
-    )
+    crs: str | None = Field(None, description="coordinate system of the poses, such as epsg:32633")
     gps: Path | None = Field(
         None,
-        description="what tells where photos were taken: a folder with the photos as the camera "
-        "wrote them, or a list as geo.txt; by itself georef.json, geo.txt, database.db, the photos",
+        description="source of the photo positions: a folder with the original photos, or a list "
+        "such as geo.txt; by default georef.json, geo.txt, database.db, the photos",
     )
 
     @override
@@ -69,7 +67,8 @@ class ColmapReader(Reader):
         """
         if self.crs is not None and self.gps is not None:
             raise UserError(
-                "the coordinate system of the poses leaves nothing for GPS to tell",
+                "reader.crs and reader.gps cannot be combined: the poses already have a "
+                "coordinate system",
                 where="reader.crs, reader.gps",
                 todo="leave one of them out",
             )
@@ -160,11 +159,11 @@ def _checked_camera(image: ColmapImage, model: ColmapModel, folder: Path) -> int
     if image.camera in model.cameras:
         return image.camera
     raise UserError(
-        f"image {image.name} has no camera",
+        f"the camera of image {image.name} is missing in the model",
         where=folder,
         expected=f"one of {sorted(model.cameras)[:10]}",
         found=f"camera id {image.camera}",
-        todo="cameras and images must be of one model: export it again",
+        todo="use cameras and images of the same model: export it again",
     )
 
 
@@ -185,9 +184,10 @@ def _make_pose(image: ColmapImage, folder: Path) -> NDArray[np.float64]:
     largest = np.abs(image.quaternion).max()
     if not (_SHORTEST < largest < 1 / _SHORTEST) or not np.isfinite(image.translation).all():
         raise UserError(
-            "a pose is not finite",
+            "a pose contains numbers that are not finite",
             where=f"{folder}: image {image.name}",
-            found=f"quaternion {image.quaternion.tolist()}, shift {image.translation.tolist()}",
+            found=f"quaternion {image.quaternion.tolist()}, translation "
+            f"{image.translation.tolist()}",
             todo="remove the image from the model, or estimate the poses again",
         )
     pose = np.eye(4)

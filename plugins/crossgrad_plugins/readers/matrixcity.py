@@ -37,7 +37,7 @@ class MatrixCityReader(Reader):
     """
 
     points: str | None = Field(
-        None, description="PLY of points within the scene; by itself one in its folder"
+        None, description="PLY file of points within the scene; by default a PLY file in its folder"
     )
 
     @override
@@ -51,11 +51,11 @@ class MatrixCityReader(Reader):
         files = _accepts.pose_files(path)
         if not files:
             raise UserError(
-                "the scene has no block of MatrixCity",
+                "the folder contains no MatrixCity block",
                 where=path,
                 expected=f"{_accepts.TRANSFORMS_FILE} with the poses and {_PHOTOS}/ with the "
                 "photos of a block",
-                todo="name the folder of a block, or one that holds blocks",
+                todo="name the folder of a block, or a folder that contains blocks",
             )
         frames = {name: _read(inside, name) for name in files}
         images, views = raw_views([frame for block in frames.values() for frame in block])
@@ -85,10 +85,10 @@ def _read(inside: Inside, name: str) -> list[Posed]:
 def _frame(inside: Inside, frame: Fields, whole: Fields, photos: str) -> Posed:
     index = frame.number("frame_index")
     if index != int(index) or index < 0:
-        frame.wrong("frame_index", "a whole number, 0 or more")
+        frame.wrong("frame_index", "a whole number of at least 0")
     photo = inside.name(f"{int(index):04d}.png", frame.where("frame_index"), photos)
     matrix = transform_of(frame, "rot_mat")
     rotation = rotation_of(_TO_UNIT * matrix[:, :3])
     if rotation is None:
-        frame.wrong("rot_mat", "a hundredth of a right-handed rotation, and a shift")
+        frame.wrong("rot_mat", "a right-handed rotation scaled by 1/100, and a translation")
     return Posed(photo, read_lens(inside, frame, whole, photo), from_opengl(rotation, matrix[:, 3]))

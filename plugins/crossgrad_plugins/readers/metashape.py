@@ -60,15 +60,16 @@ class MetashapeReader(Reader):
 
     images: str = Field("images", description="folder of the photos within the scene")
     file: str | None = Field(
-        None, description="XML file within the scene; by itself the one with a chunk"
+        None, description="XML file within the scene; by default the XML file that contains a chunk"
     )
     frame: Literal["local", "chunk"] = Field(
         "local",
-        description="local: the chunk's transform is applied, then east-north-up where it is on "
-        "Earth; chunk: the chunk's own coordinates. A PLY of points is taken to be in the same",
+        description="local: apply the chunk's transform, then convert to east-north-up if it is "
+        "georeferenced; chunk: the chunk's own coordinates. A PLY of points must use "
+        "the same coordinates",
     )
     points: str | None = Field(
-        None, description="PLY of points within the scene; by itself one in its folder"
+        None, description="PLY file of points within the scene; by default a PLY file in its folder"
     )
 
     @override
@@ -121,7 +122,7 @@ def _chunk(file: Path) -> Element:
 
 def _missing(file: Path, what: str) -> UserError:
     return UserError(
-        "the XML of Metashape cannot be read",
+        "the XML file of Metashape cannot be read",
         where=file,
         expected=f"an element {what}",
         found="none",
@@ -154,15 +155,15 @@ def _cameras(chunk: Element, file: Path) -> tuple[list[_Camera], list[str]]:
     notes = []
     if slaves:
         notes.append(
-            f"Metashape: {count(slaves, 'slave camera')} posed by their masters and the offsets of "
-            "their sensors"
+            f"Metashape: {count(slaves, 'slave camera')} with poses from their masters "
+            "and the offsets of their sensors"
         )
     if len(posed) < len(elements):
         notes.append(f"Metashape: {count(len(elements) - len(posed), 'camera')} without a pose")
     if len(kept) < len(posed):
         notes.append(
-            f"Metashape: component {best} is taken, {count(len(posed) - len(kept), 'camera')} of "
-            "others left out"
+            f"Metashape: component {best} is used, "
+            f"{count(len(posed) - len(kept), 'camera')} of other components left out"
         )
     return kept, notes
 

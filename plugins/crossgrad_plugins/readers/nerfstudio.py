@@ -43,8 +43,8 @@ class NerfstudioReader(Reader):
     file: str = Field(_accepts.TRANSFORMS_FILE, description="file of the frames within the scene")
     points: str | None = Field(
         None,
-        description="PLY of points within the scene; by itself what the file names, or one "
-        "beside it",
+        description="PLY file of points within the scene; by default the PLY that the file "
+        "names, or one next to it",
     )
 
     @override
@@ -65,7 +65,7 @@ class NerfstudioReader(Reader):
         check_seen(points, views, whole.file)
         notes = [f"nerfstudio: {count(len(views), 'posed image')}, {points.note}"]
         if "fisheye_crop_radius" in whole:
-            notes.append("nerfstudio: fisheye_crop_radius is left out; masks can take its place")
+            notes.append("nerfstudio: fisheye_crop_radius is not supported; use masks instead")
         raw = raw_scene(inside, images, views, points, *notes)
         if options.split == "auto" and not has_lists(path):
             names = [view.name for view in views]
@@ -91,7 +91,7 @@ def _applied(whole: Fields) -> Frame3D:
     matrix = transform_of(whole, "applied_transform")
     rotation = rotation_of(matrix[:, :3])
     if rotation is None:
-        whole.wrong("applied_transform", "an orthonormal, right-handed rotation, and a shift")
+        whole.wrong("applied_transform", "an orthonormal, right-handed rotation and a translation")
     return Frame3D(rotation, scale * matrix[:, 3], scale)
 
 
@@ -111,20 +111,20 @@ def _split(
     for key in filter(None, (_TRAIN, held_out)):
         if not lists[key] & set(posed):
             raise UserError(
-                "no name in a split list is the photo of a frame",
+                "no name in a split list matches the photo of a frame",
                 where=whole.where(key),
-                expected=f"names as the frames' file_path has them, such as {min(posed)}",
+                expected=f"names as in the frames' file_path, such as {min(posed)}",
                 found=name_some(whole.texts(key)) or "no name",
-                todo="mend the list, or use --split every",
+                todo="correct the list, or use --split every",
             )
     test = lists[held_out] if held_out else frozenset[str]()
     both = sorted(lists[_TRAIN] & test)
     if both:
         raise UserError(
-            "views are listed for training and for testing",
+            "a view is listed for both training and testing",
             where=f"{whole.where(_TRAIN)} and {held_out}",
             found=name_some(both),
-            todo="leave each name in one of both lists, or use --split every",
+            todo="remove each name from one of the two lists, or use --split every",
         )
     return lists[_TRAIN], test
 

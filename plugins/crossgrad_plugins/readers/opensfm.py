@@ -49,8 +49,8 @@ class OpenSfmReader(Reader):
     images: str = Field("images", description="folder of the photos within the scene")
     file: str | None = Field(
         None,
-        description="reconstruction file within the scene; by itself reconstruction.json, also in "
-        "opensfm/",
+        description="reconstruction file within the scene; by default reconstruction.json, also "
+        "in opensfm/",
     )
 
     @override
@@ -86,10 +86,10 @@ class OpenSfmReader(Reader):
         there = [name for name in names if (inside.scene / name).is_file()]
         if not there:
             raise UserError(
-                "the scene has no reconstruction of OpenSfM",
+                "the scene folder contains no OpenSfM reconstruction",
                 where=inside.scene,
                 expected=" or ".join(names),
-                todo="name the folder that OpenSfM or OpenDroneMap worked in",
+                todo="name the project folder of OpenSfM or OpenDroneMap",
             )
         return inside.file(there[0], "reader.file")
 
@@ -99,12 +99,13 @@ def _choose(file: Path) -> tuple[Fields, list[str]]:
     whole = Fields({"reconstructions": read_json(file)}, file)
     models = whole.items("reconstructions")
     if not models:
-        whole.wrong("reconstructions", "a list with a reconstruction", "an empty list")
+        whole.wrong("reconstructions", "a list that contains a reconstruction", "an empty list")
     counts = [len(model.members("shots")) for model in models]
     best = int(np.argmax(counts))
     others = ", ".join(str(number) for i, number in enumerate(counts) if i != best)
     note = (
-        f"OpenSfM: the reconstruction with most photos is taken; left out are those with {others}"
+        "OpenSfM: the reconstruction with the most photos is used; reconstructions "
+        f"left out have {others}"
     )
     return models[best], [note] if others else []
 

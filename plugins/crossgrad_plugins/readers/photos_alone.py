@@ -19,7 +19,9 @@ class PhotosAloneReader(Reader):
     """
 
     scene: Path | None = Field(
-        None, description="folder of the prepared scene; None: beside the photos, with -scene"
+        None,
+        description="folder of the prepared scene; by default the photo folder's name with "
+        "-scene, next to it",
     )
 
     @override
@@ -34,7 +36,7 @@ class PhotosAloneReader(Reader):
         photos = path.resolve()
         if not photos.name and self.scene is None:
             raise UserError(
-                "the prepared scene has no place beside the photos",
+                "the folder for the prepared scene cannot be created next to the photos",
                 where=photos,
                 todo="name its folder with --set reader.scene=FOLDER",
             )

@@ -48,10 +48,11 @@ class RealityCaptureReader(Reader):
 
     images: str = Field("images", description="folder of the photos within the scene")
     file: str | None = Field(
-        None, description="CSV file within the scene; by itself the one that has its columns"
+        None,
+        description="CSV file within the scene; by default the CSV file with the expected columns",
     )
     points: str | None = Field(
-        None, description="PLY of points within the scene; by itself one in its folder"
+        None, description="PLY file of points within the scene; by default a PLY file in its folder"
     )
 
     @override
@@ -104,7 +105,7 @@ def _rows(file: Path) -> list[_Row]:
         raise _wrong(file, f"a column {missing[0]}", ", ".join(header) or "an empty file")
     twice = [name for name in header if name and header.count(name) > 1]
     if twice:
-        raise _wrong(file, "a name for each column", f"two columns {twice[0]}")
+        raise _wrong(file, "a name for each column", f"the column {twice[0]} twice")
     first = next((i for i, row in enumerate(rows) if column_names(row) == header), None)
     if first is None:
         raise _wrong(file, "a header without quotes", "quotes before the header, or in it")
@@ -138,7 +139,7 @@ def _numbers(cells: Mapping[str, str], file: Path, number: int) -> Fields:
 
 def _wrong(file: Path, expected: str, found: str) -> UserError:
     return UserError(
-        "the CSV of RealityCapture cannot be read",
+        "the CSV file of RealityCapture cannot be read",
         where=file,
         expected=expected,
         found=found,

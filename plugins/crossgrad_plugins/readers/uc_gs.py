@@ -33,7 +33,7 @@ class UcGsReader(ColmapReader):
         test = frozenset(view.name for view in raw.views if _accepts.is_held_out(view.name))
         train = frozenset(view.name for view in raw.views) - test
         views = tuple(replace(view, place=_place(view.name)) for view in raw.views)
-        note = f"UC-GS: {count(len(test), 'posed image')} for testing by folder or name"
+        note = f"UC-GS: {count(len(test), 'posed image')} held out by folder or name"
         split = (train, test) if train and test else None
         raw = replace(raw, views=views, split=split, notes=(*raw.notes, note))
         return self.placed(build_scene(raw, options), raw)

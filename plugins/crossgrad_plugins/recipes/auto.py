@@ -22,10 +22,10 @@ MANY_PHOTOS: Final = 100
 #: `REFERENCE` / steps to this power. The power is below 1: the sum of the rates falls with the
 #: length, but not as fast.
 SHORTNESS: Final = 0.45
-#: The largest factor, which runs of about 1,000 steps use.
+#: Largest factor, which runs of about 1,000 steps use.
 MOST: Final = 4.5
-#: A run that renders each training photo fewer times than this, on average, has few passes. It ends
-#: long before it overfits.
+#: A run has few passes if it renders each training photo fewer times than this, on average. Such a
+#: run ends long before it overfits.
 FEW_PASSES: Final = 40
 #: Power and largest factor of the learning rates in runs with few passes.
 FEW_PASSES_SHORTNESS, FEW_PASSES_MOST = 0.65, 6.3
@@ -41,19 +41,19 @@ SCALE_RATIO: Final = 0.5
 #: Share of a short run with few passes before SH bands above the first are rendered. Earlier, these
 #: bands cost time and improve little.
 SH_START: Final = 0.5
-#: The highest SH degree.
+#: Highest SH degree.
 MOST_DEGREES: Final = 3
-#: Share of the run, at its end, over which constant learning rates decay.
+#: Share of the run, at its end, in which constant learning rates decay.
 LR_TAIL: Final = 0.25
 #: Share of the Gaussians that a view omits, if the median point is seen by at most `FEW_PHOTOS`
 #: photos.
 DROPOUT, FEW_PHOTOS = 0.3, 5
-#: Smallest number of edits of budgeted growth, in runs of at least this many views. In shorter
-#: runs, new primitives have no time to converge and can cost 1 dB.
+#: Minimum number of edits of budgeted growth, in runs of at least this many views. In shorter runs,
+#: new Gaussians have no time to converge and can cost 1 dB.
 EDITS, SHORTEST_RUN_WITH_EDITS = 6, 600
-#: The reason that the table shows while only the duration of a run in seconds is known.
+#: Reason that the table shows while only the duration of the run in seconds is known.
 UNKNOWN: Final = "decided when the length is planned"
-#: The page that shows how these values were measured.
+#: Page that shows how these values were measured.
 SCHEDULES: Final = "docs/schedules.md"
 
 
@@ -125,7 +125,7 @@ class Choice:
         given: Literal["unbounded", "budget"] | None = self.given.get("growth")
         if given is not None:
             return given
-        # A bound that the user sets is a limit, not a target.
+        # A limit that the user sets is not a target.
         named = self.given["max_gaussians"] not in {None, "auto"}
         led = budgeted and self.facts.unit == "views"
         return "budget" if led and not named else "unbounded"
@@ -160,30 +160,34 @@ def components(choice: Choice) -> list[Decision]:
         Decision(
             "views_per_step",
             facts.views_per_step.setting,
-            facts.views_because or "usual for the sampler",
+            facts.views_because or "default of the sampler",
             override="--views K" if facts.views_because else "",
         ),
         Decision(
             "densifier",
             name,
-            f"short run of {MANY_PHOTOS} photos or more" if swapped else "usual for the backbone",
+            f"short run with at least {MANY_PHOTOS} photos"
+            if swapped
+            else "default of the backbone",
             f"{facts.photos} training photos; {SCHEDULES}",
             f"--densifier {usual}" if swapped else "",
         ),
         Decision(
             "resolution",
             SHORT_RESOLUTION if first else RESOLUTION,
-            "pixels are most of a step on a CPU" if first else "all pixels in every step",
+            "pixels take most of the time of a step on a CPU"
+            if first
+            else "all pixels in every step",
             "docs/resolutions.md",
             f"--resolution {RESOLUTION}" if first else "",
         ),
         Decision(
             "initializer",
             start,
-            "adds points where the scene has few" if facts.own_points else "the points of --init",
+            "adds points in areas with few points" if facts.own_points else "the points of --init",
             "docs/initializers.md",
         ),
-        Decision("exposure", EXPOSURE, "as the photos need it", "docs/exposure.md"),
+        Decision("exposure", EXPOSURE, "depends on the photos", "docs/exposure.md"),
         _dropout(facts),
     ]
 
@@ -195,7 +199,7 @@ def _dropout(facts: Facts) -> Decision:
         "rules.dropout",
         few and {"share": DROPOUT},
         "few photos show each point" if few else "enough photos show each point",
-        f"a point lies in {photos:g} of {facts.photos} photos (median); docs/few-photos.md",
+        f"a point is visible in {photos:g} of {facts.photos} photos (median); docs/few-photos.md",
         "--no-rule dropout" if few else "",
     )
 
@@ -223,19 +227,21 @@ def growth(choice: Choice) -> list[Decision]:
         Decision(
             "min_refinements",
             edits,
-            "the curve needs some edits" if edits else "as many as the schedule has",
+            "the budget schedule needs some edits"
+            if edits
+            else "the number of edits in the schedule",
             SCHEDULES,
         ),
         Decision(
             "reset_every",
             resets,
-            "the curve already limits growth" if led else "as published",
+            "the budget schedule already limits growth" if led else "as published",
             SCHEDULES,
             f"--set reset_every={schedule.reset_every or 3000}" if led else "",
         ),
     ]
     if "division" in type(choice.densifier).model_fields:
-        why = "children side by side leave no holes" if led else "as published"
+        why = "two Gaussians on the longest axis leave no holes" if led else "as published"
         division, force = ("axis", "--set densifier.division=drawn") if led else ("drawn", "")
         rows.append(Decision("densifier.division", division, why, SCHEDULES, force))
     return rows
@@ -252,8 +258,9 @@ def _budget(choice: Choice) -> Decision:
     return Decision(
         "max_gaussians",
         most,
-        "the number that suits the length" if most else "no bound at the published length",
-        f"{facts.start} primitives at first, photos of {facts.pixels / 1e6:.2f} MP; {SCHEDULES}",
+        "a number that suits the length" if most else "no limit at the published length",
+        f"{facts.start} Gaussians at the start, photos of "
+        f"{facts.pixels / 1000000.0:.2f} MP; {SCHEDULES}",
         "--max-gaussians N",
     )
 
@@ -271,7 +278,7 @@ def rates(choice: Choice) -> list[Decision]:
         Decision(
             "rate_factor",
             factor,
-            f"published rates are for {REFERENCE:,} steps",
+            f"published learning rates are for {REFERENCE:,} steps",
             SCHEDULES,
             "--rate-factor 1" if factor != 1.0 else "",
         ),
@@ -339,11 +346,11 @@ def steps(choice: Choice) -> list[Decision]:
     banded = any(block.rests for block in facts.backbone.trained_blocks())
     late = share > 0.0 and banded and facts.given.get("sh_from") != MOST_DEGREES
     return [
-        Decision("step_order", "optimize-first", "density control sees the new values"),
+        Decision("step_order", "optimize-first", "density control uses the updated values"),
         Decision(
             "position_lr",
             "per-axis" if along else "extent",
-            "short runs step by the size of a Gaussian" if along else "as published",
+            "short runs use the size of a Gaussian as the step size" if along else "as published",
             SCHEDULES,
             "--position-lr extent" if along else "",
         ),
@@ -357,7 +364,7 @@ def steps(choice: Choice) -> list[Decision]:
         Decision(
             "sh_start",
             share,
-            "SH bands gain little before" if late else "degree by degree from the start",
+            "SH bands gain little before this share" if late else "degree by degree from the start",
             SCHEDULES,
             "--set sh_start=0" if late else "",
         ),
@@ -370,7 +377,7 @@ def _sh_start(choice: Choice) -> float:
     if not choice.few_passes or facts.unit != "views" or facts.published:
         return 0.0
     schedule = facts.schedule(facts.unit)
-    # The length of a custom schedule may exceed the length of the run.
+    # A custom schedule may be longer than the run.
     length = min(schedule.length, schedule.counted(schedule.total))
     return int(SH_START * shortness(schedule.length) * length) / length
 
@@ -383,14 +390,16 @@ def ends(choice: Choice) -> list[Decision]:
         Decision(
             "rules.lr-tail",
             fades and {"share": LR_TAIL},
-            "constant rates fade at the end" if fades else "all rates decay already",
+            "constant learning rates decay at the end"
+            if fades
+            else "all learning rates already decay",
             "docs/steady-ends.md",
             "--no-rule lr-tail" if fades else "",
         ),
         Decision(
             "rules.floaters",
             {} if edits else False,
-            "no photo shows them, and they hide the scene" if edits else "the primitives stay",
+            "no photo shows them, and they hide the scene" if edits else "the Gaussians stay",
             "docs/floaters.md",
             "--no-rule floaters" if edits else "",
         ),

@@ -1,4 +1,4 @@
-"""List the recipes, which decide the settings of a run; show one."""
+"""List the recipes, which decide the settings of a run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ import typer
 from crossgrad_core.commands import announce, entries
 
 app = typer.Typer(
-    help="List the recipes, which decide the settings of a run; show one.",
+    help="List the recipes, which decide the settings of a run.",
     rich_markup_mode=None,
     add_completion=False,
     no_args_is_help=False,
@@ -17,7 +17,7 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def recipes(context: typer.Context) -> None:
-    """List the recipes, which decide the settings of a run; show one."""
+    """List the recipes, which decide the settings of a run."""
     if context.invoked_subcommand is None:
         from crossgrad_core.commands import load_component
 

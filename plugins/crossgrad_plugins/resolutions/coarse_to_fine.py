@@ -98,7 +98,7 @@ class CoarseToFine(Resolution):
     """
 
     smallest: int = Field(
-        96, ge=1, description="pixels that the shorter side of a render has at least"
+        96, ge=1, description="minimum number of pixels of the shorter side of a render"
     )
 
     @abstractmethod

@@ -17,7 +17,7 @@ class Octaves(CoarseToFine):
     """
 
     quarter_until: float = Field(
-        0.2, ge=0, lt=1, description="share of the run that has 1/4 of the size; 0: none"
+        0.2, ge=0, lt=1, description="share of the run at 1/4 of the size; 0: none"
     )
     half_until: float = Field(
         0.4, ge=0, le=0.95, description="share of the run after which photos have their full size"
@@ -26,7 +26,7 @@ class Octaves(CoarseToFine):
     @model_validator(mode="after")
     def _in_order(self) -> Self:
         if self.half_until < self.quarter_until:
-            raise ValueError("half_until must not be less than quarter_until")
+            raise ValueError("half_until must be at least quarter_until")
         return self
 
     @override
@@ -42,6 +42,6 @@ class Octaves(CoarseToFine):
     @override
     def messages(self, schedule: Schedule) -> tuple[str, ...]:
         return tuple(
-            f"{text}; no side is below {self.smallest} pixels"
+            f"{text}; no side has fewer than {self.smallest} pixels"
             for text in super().messages(schedule)
         )

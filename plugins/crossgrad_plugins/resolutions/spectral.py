@@ -41,7 +41,7 @@ class Scales(BaseModel):
 
     photos: int = Field(ge=1, description="training photos")
     scales: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(
-        description="in equally long parts of the window, full size after them"
+        description="number of equal stages in the window; after it, full size"
     )
 
 
@@ -57,24 +57,24 @@ class Spectral(CoarseToFine):
     """
 
     ratio: float = Field(
-        4.0, gt=1, description="the first scale keeps 1 / ratio of the spectrum, or more"
+        4.0, gt=1, description="the first scale keeps at least 1 / ratio of the spectrum"
     )
-    coarsest: float = Field(4.0, ge=1, description="the first scale is 1 / coarsest or more")
+    coarsest: float = Field(4.0, ge=1, description="the first scale is at least 1 / coarsest")
     levels: int = Field(
-        32, ge=1, le=GRID, description="levels of the spectrum, and parts of the window"
+        32, ge=1, le=GRID, description="levels of the spectrum, and stages in the window"
     )
     until: float | None = Field(
         None,
         gt=0,
         le=1,
-        description="share of the run after which photos have their full size; none: the end of "
-        "density control, half of the run where there is none",
+        description="share of the run after which photos have their full size; null: the end of "
+        "density control, or half of the run without density control",
     )
     per_regime: Literal["auto", "always", "never"] = Field(
-        "auto", description="whether each regime has scales of its own; auto: where spectra differ"
+        "auto", description="whether each regime has its own scales; auto: if spectra differ"
     )
     courses: Mapping[str, Scales] | None = Field(
-        None, description="the scales by regime; none: measured, and written down"
+        None, description="scales by regime; null: they are measured and saved"
     )
 
     @override
@@ -122,7 +122,8 @@ class Spectral(CoarseToFine):
         levels = np.unique(np.linspace(first, GRID, self.levels + 1).round().astype(int))
         ends, pixels = group.kept[levels], scales[levels] ** 2
         parts = np.arange(self.levels) / self.levels
-        ahead = np.searchsorted(ends, parts, side="right")  # The level that the run leaves next.
+        # This is the level that the run leaves next.
+        ahead = np.searchsorted(ends, parts, side="right")
         behind = np.maximum(ahead - 1, 0)
         # Before the first level is left, there is no level to interpolate from.
         share = (parts - ends[behind]) / np.where(ahead > 0, ends[ahead] - ends[behind], np.inf)
@@ -209,8 +210,8 @@ def amplitudes_within(grey: Floats) -> Floats:
     """
     height, width = grey.shape
     amplitudes = np.abs(np.fft.rfft2(grey))
-    # For a real image, the other half of the columns is the same. Exceptions are the first column
-    # and, if their number is even, the last column.
+    # For a real image, the other half of the columns is equal. Exceptions are the first column and,
+    # if their number is even, the last column.
     amplitudes[:, 1 : (width + 1) // 2] *= 2.0
     cells = np.maximum.outer(_cells(np.fft.fftfreq(height)), _cells(np.fft.rfftfreq(width)))
     return np.cumsum(np.bincount(cells.ravel(), amplitudes.ravel(), GRID + 1))

@@ -29,13 +29,14 @@ class Strided(CoarseToFine):
         None,
         ge=0,
         le=0.95,
-        description="share of the run after which all pixels are drawn; none: by its length",
+        description="share of the run after which all pixels are rendered; null: depends on its "
+        "length",
     )
     least: int = Field(
-        60_000, ge=1, description="pixels that a render has at least where not all are drawn"
+        60_000, ge=1, description="minimum number of pixels of a render with a stride"
     )
     coarsest: Literal[1, 2, 4, 8] | None = Field(
-        None, description="the n of the first steps; none: by the photos' pixels, and written down"
+        None, description="n of the first steps; null: depends on the photos' pixels, and is saved"
     )
 
     @override
@@ -47,7 +48,7 @@ class Strided(CoarseToFine):
 
     @override
     def measured(self, scene: Scene) -> CoarseToFine:
-        # This is called in each step, so do not examine all photos again.
+        # This function is called in each step, so do not examine all photos again.
         return self if self.coarsest is not None else self.fitted_to(scene)
 
     @override
@@ -71,16 +72,20 @@ class Strided(CoarseToFine):
         told = [f"of each {n} x {n} to step {end}" for end, n in ends]
         if not told:
             return (
-                "resolution: all pixels from the start, as resolution.coarsest is 1: the most for "
-                f"photos of fewer than {4 * self.least:,} pixels or with a side of fewer than "
-                f"{2 * self.smallest}",
+                (
+                    "resolution: all pixels from the start, because resolution.coarsest is 1: "
+                    f"this is the maximum for photos with fewer than {4 * self.least:,} pixels or "
+                    f"with a side of fewer than {2 * self.smallest} pixels"
+                ),
             )
         if not window:
-            why = "this share of the run is 0" if self.until == 0 else "the run is a long one"
+            why = "this share of the run is 0" if self.until == 0 else "the run is long"
             return (f"resolution: all pixels from the start: {why} (--set resolution.until=SHARE)",)
         return (
-            f"resolution: one pixel {listed(told)}, in each step another one; then all "
-            "(--resolution full: from the start)",
+            (
+                f"resolution: one pixel {listed(told)}, another one in each step; then all "
+                "pixels (--resolution full: from the start)"
+            ),
         )
 
     @override

@@ -26,8 +26,8 @@ from crossgrad_core.plugin import (
     hookimpl,
 )
 
-#: The percentile of the depths of a camera's SfM points that counts as nearest. Single points are
-#: often wrong.
+#: Percentile of the depths of a camera's SfM points that is used as the nearest depth, because
+#: single points are often wrong.
 NEAREST: Final = 1.0
 #: A camera that observes fewer points than this does not show which space is empty.
 FEWEST_SEEN: Final = 8
@@ -40,10 +40,10 @@ class Floaters(Rule):
         0.3,
         gt=0,
         le=1,
-        # The ground below a level camera is farther away, because the camera sees it only from a
-        # distance.
-        description="share of the distance from a camera to the nearest point it sees that counts "
-        "as empty",
+        # The ground below a level camera is farther away, because the camera sees the ground only
+        # at a distance.
+        description="depth range that counts as empty, as a share of the distance from a camera "
+        "to the nearest point that it observes",
     )
 
     @hookimpl
@@ -59,9 +59,9 @@ class Floaters(Rule):
     @override
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         if not backbone.positions:
-            return "the backbone names no positions"
+            return "the backbone defines no positions"
         if not cameras_that_tell(scene):
-            return "no photo observes enough points to say what around it is empty"
+            return "no photo observes enough points to show which space is empty"
         return ""
 
 
@@ -69,8 +69,8 @@ def removed(count: int) -> str:
     """Return the log line about the removal of `count` primitives."""
     were = "primitive was" if count == 1 else "primitives were"
     return (
-        f"floaters: {count:,} {were} removed that no training photo shows, in the empty space "
-        "around its cameras (--no-rule floaters: they stay)"
+        f"floaters: {count:,} {were} removed from the empty space around training cameras, "
+        "because no training photo shows them (--no-rule floaters keeps them)"
     )
 
 
@@ -97,8 +97,8 @@ def floaters(model: Model, empty: float) -> Tensor:
     for view in model.scene.train_views:
         if len(rows) == 0:
             break
-        # Rendered alone, the candidates take little time, and it does not matter what would hide
-        # them.
+        # Render only the candidates: this takes little time, and Gaussians that hide them do not
+        # matter.
         alone = apply_to_parameters(Edit(rows), backbone.blocks(), parameters)
         with torch.no_grad():
             gaussians = backbone.decode(alone, view.camera, model.phase)
@@ -123,7 +123,7 @@ def in_empty_space(positions: NDArray[np.float64], scene: Scene, empty: float) -
         scene: The scene; its training cameras and the SfM points that they see are used.
         empty: Share of the distance from a camera to the nearest point that the camera sees.
     """
-    from scipy.spatial import cKDTree  # Slow to import.
+    from scipy.spatial import cKDTree  # Import it here, because the import is slow.
 
     views = cameras_that_tell(scene)
     if not views:

@@ -13,9 +13,14 @@ class LrTail(Rule):
     """Decays constant learning rates over the last share of the steps."""
 
     share: float = Field(
-        0.25, gt=0, le=1, description="share of the steps, the last ones, in which rates fade"
+        0.25,
+        gt=0,
+        le=1,
+        description="share of the steps, at the end, in which learning rates decay",
     )
-    factor: float = Field(0.01, gt=0, le=1, description="factor of a rate in the last step")
+    factor: float = Field(
+        0.01, gt=0, le=1, description="factor of a learning rate in the last step"
+    )
 
     @hookimpl
     def crossgrad_rate_factor(
@@ -31,4 +36,4 @@ class LrTail(Rule):
     @override
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         constant = any(not block.lr.decays for block in backbone.trained_blocks())
-        return "" if constant else "the backbone has no constant rates"
+        return "" if constant else "the backbone has no constant learning rates"

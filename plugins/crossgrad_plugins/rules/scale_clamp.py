@@ -30,8 +30,8 @@ from crossgrad_core.plugin import (
 
 #: Steps between two checks of the sizes.
 EVERY: Final = 50
-#: Smaller Gaussians are not checked, in scene extents. Most are smaller, and hardly any of them
-#: exceeds the bound.
+#: Gaussians with a smaller size, in scene extents, are not checked. Most Gaussians are smaller, and
+#: hardly any of them exceeds the bound.
 LEAST: Final = 0.01
 #: Maximum number of distances that are computed at once.
 _AT_ONCE: Final = 2**20
@@ -43,8 +43,8 @@ class ScaleClamp(Rule):
     ratio: float = Field(
         0.5,
         gt=0,
-        description="most that a standard deviation may be of the distance to the nearest training "
-        "camera that has a Gaussian at its side",
+        description="maximum standard deviation of a Gaussian, as a share of its distance to the "
+        "nearest training camera that has it at its side",
     )
 
     @hookimpl
@@ -70,7 +70,7 @@ class ScaleClamp(Rule):
     @override
     def unused(self, backbone: Backbone, scene: Scene) -> str:
         learns = backbone.learns_scales
-        return "" if learns else "the backbone has no Gaussians with axes that learn"
+        return "" if learns else "the backbone trains no Gaussians with axes"
 
 
 def _may_be_near(scene: Scene, positions: Tensor, distances: Tensor) -> Tensor:

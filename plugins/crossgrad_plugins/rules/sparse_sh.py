@@ -10,7 +10,9 @@ from crossgrad_core.plugin import Backbone, Block, Field, Rule, Scene, hookimpl
 class SparseSh(Rule):
     """Updates SH bands above the first only in every n-th step."""
 
-    every: int = Field(2, ge=2, le=100, description="SH bands learn in one of so many steps")
+    every: int = Field(
+        2, ge=2, le=100, description="number of steps per update of the SH bands above the first"
+    )
 
     @hookimpl
     def crossgrad_update_intervals(self, blocks: tuple[Block, ...]) -> Mapping[str, int]:

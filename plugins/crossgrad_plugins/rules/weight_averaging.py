@@ -31,7 +31,10 @@ class WeightAveraging(Rule):
 
     copies: ClassVar[int] = 3
     share: float = Field(
-        0.2, gt=0, le=1, description="share of the steps, the last ones, that are averaged"
+        0.2,
+        gt=0,
+        le=1,
+        description="share of the steps, at the end, over which weights are averaged",
     )
 
     @hookimpl

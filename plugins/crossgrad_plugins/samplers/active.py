@@ -42,7 +42,7 @@ class Active(Sampler):
     groups: ClassVar[int | None] = 2
 
     top: int = Field(
-        8, ge=1, description="how many partners are candidates; all of a smaller group"
+        8, ge=1, description="number of candidate partners; all views of a smaller group"
     )
     decay: float = Field(0.9, ge=0.0, lt=1.0, description="decay of a view's running loss")
 

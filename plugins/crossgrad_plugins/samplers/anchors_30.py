@@ -38,8 +38,10 @@ class Anchors30(Sampler):
         """Return an objection if the grouping has no near or no far group."""
         if selection.labels is not None and not {"near", "far"} <= set(selection.labels):
             return [
-                "sampler anchors-30 needs groups labelled near and far; grouping "
-                f"{selection.names['grouping']} gives {', '.join(selection.labels)}"
+                (
+                    "sampler anchors-30 needs groups labelled near and far, but grouping "
+                    f"{selection.names['grouping']} makes {', '.join(selection.labels)}"
+                )
             ]
         return []
 
@@ -64,7 +66,7 @@ def _anchor_groups(context: SampleContext) -> Mapping[str, Sequence[int]]:
         raise UserError(
             "sampler anchors-30 needs training views labelled near and far",
             where="sampler, grouping",
-            expected="labels near and far, and any label for the views between",
+            expected="labels near and far; other views may have any other label",
             found=", ".join(groups) if groups else "no grouping",
             todo="choose --grouping anchors or --grouping terciles",
         )

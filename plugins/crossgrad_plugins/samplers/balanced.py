@@ -36,11 +36,13 @@ class NearFar(Sampler):
     default_grouping: ClassVar[str | None] = "radial"
     groups: ClassVar[int | None] = 2
 
-    alternating: bool = Field(False, description="one view per step, near and far in turn (K = 1)")
+    alternating: bool = Field(
+        False, description="one view per step, alternately near and far (K = 1)"
+    )
     order: Order = Field(
         "iid",
-        description="draws within a group: iid; distinct: no view twice in a step; "
-        "epoch: every view once before any comes again",
+        description="draws within a group: iid; distinct: no view twice in a step; epoch: each "
+        "view once before any view is repeated",
     )
 
     @property
@@ -82,8 +84,8 @@ class ThreeWay(Sampler):
 
     order: Order = Field(
         "iid",
-        description="draws within a group: iid; distinct: no view twice in a step; "
-        "epoch: every view once before any comes again",
+        description="draws within a group: iid; distinct: no view twice in a step; epoch: each "
+        "view once before any view is repeated",
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
@@ -111,8 +113,8 @@ class RandomSplit(Sampler):
 
     order: Order = Field(
         "iid",
-        description="draws within a half: iid; distinct: no view twice in a step; "
-        "epoch: every view once before any comes again",
+        description="draws within a half: iid; distinct: no view twice in a step; epoch: each "
+        "view once before any view is repeated",
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
@@ -124,7 +126,7 @@ class RandomSplit(Sampler):
         views = training_views(context)
         if len(views) < len(HALVES):
             raise UserError(
-                "sampler random-split needs two training views",
+                "sampler random-split needs at least two training views",
                 where="sampler",
                 found=str(len(views)),
                 todo="choose --sampler epoch",
@@ -168,5 +170,5 @@ def idle_order(order: Order, views: int, groups: int) -> Mapping[str, str]:
     """Return the option `order` with a reason if it has no effect, else an empty mapping."""
     if order != "distinct" or views > groups:
         return {}
-    why = "a step has one view of each group, which distinct leaves as iid draws it"
-    return {"order": f"{why}; leave it out, or choose epoch"}
+    why = "a step has one view of each group, so distinct draws the same views as iid"
+    return {"order": f"{why}; leave the option out, or choose epoch"}

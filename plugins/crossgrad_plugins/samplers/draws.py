@@ -87,10 +87,11 @@ def require_enough(available: int, count: int) -> None:
     """
     if count > available:
         raise UserError(
-            f"a step needs {count} different views of {available} training views",
+            f"a step needs {count} different views, but only {available} training views "
+            "are available",
             where="sampler",
             expected=f"at most {available} views per step from this group of training views",
-            todo="lower --views, or choose sampler random, which may repeat a view",
+            todo="lower --views, or choose sampler random, which can draw a view more than once",
         )
 
 

@@ -28,7 +28,7 @@ class FarthestPoint(Sampler):
     reads_groups: ClassVar[bool] = False
 
     direction_weight: float = Field(
-        1.0, ge=0.0, description="weight of the viewing direction against the position"
+        1.0, ge=0.0, description="weight of the viewing direction relative to the position"
     )
 
     @override

@@ -42,7 +42,7 @@ class Horizon(Sampler):
         (1, 1), description="far : near in the second stage"
     )
     coarse_share: float = Field(
-        0.6, ge=0.0, le=1.0, description="share of the run that the first stage takes"
+        0.6, ge=0.0, le=1.0, description="share of the run in the first stage"
     )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
@@ -50,7 +50,12 @@ class Horizon(Sampler):
         if 0.0 < self.coarse_share < 1.0:
             return {}
         name, stage = ("coarse", "first") if self.coarse_share == 0.0 else ("fine", "second")
-        return {name: f"coarse_share = {self.coarse_share:g} leaves no {stage} stage; leave it out"}
+        return {
+            name: (
+                f"coarse_share = {self.coarse_share:g} leaves no {stage} stage; leave the "
+                "option out"
+            )
+        }
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:

@@ -28,13 +28,19 @@ class Random(Sampler):
     default_views: ClassVar[int] = 2
     reads_groups: ClassVar[bool] = False
 
-    distinct: bool = Field(False, description="draw K different views, not K independent ones")
+    distinct: bool = Field(
+        False, description="draw K different views instead of K independent views"
+    )
 
     def unused_options(self, selection: Selection) -> Mapping[str, str]:
         """Return the options without an effect; see `HasUnusedOptions`."""
         if selection.views_per_step > 1:
             return {}
-        return {"distinct": "a step has one view (K = 1); leave it out, or ask for more --views"}
+        return {
+            "distinct": (
+                "a step has one view (K = 1); leave the option out, or add --views with more views"
+            )
+        }
 
     @override
     def sample(self, context: SampleContext, state: PluginState) -> tuple[ViewSample, PluginState]:

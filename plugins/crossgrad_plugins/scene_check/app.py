@@ -32,7 +32,7 @@ def lines_of(path: Path, assignments: Sequence[str]) -> list[str]:
 def _verdict(found: Mapping[str, object], photos: int, reader: str) -> str:
     measured = {
         "correlation of colours": found.get("correlation"),
-        "share of observed points in frame": found.get("in_frame"),
+        "share of observed points inside the photos": found.get("in_frame"),
     }
     shown = [f"{name} {value:.2f}" for name, value in measured.items() if isinstance(value, float)]
     figures = f" (median {', '.join(shown)})" if shown else ""

@@ -18,15 +18,16 @@ def check(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="One setting of data, repeatable: reader=colmap, data.max_size=800.",
+            help="One setting of the scene, such as reader=colmap or data.max_size=800. "
+            "Repeatable.",
         ),
     ] = None,
 ) -> None:
-    """Check whether points, poses and photos of a scene belong together.
+    """Check whether points, poses and photos of a scene match.
 
-    Compares the colours of the SfM points with the photos where the poses put them, as each run
-    does at its start. Prints the photos that disagree, what was done to the input, and the verdict.
-    A scene that disagrees as a whole is refused with the likely cause (exit code 2).
+    Compares the colours of the SfM points with the photos at the projected positions, as each run
+    does at its start. Prints the photos that do not match, the changes to the input, and the
+    verdict. A scene that does not match as a whole is refused with the likely cause (exit code 2).
     """
     announce(quiet=False)
     from crossgrad_plugins.scene_check import app

@@ -37,7 +37,7 @@ from crossgrad_plugins.sweep.progress import Screen, Watch, estimated
 from crossgrad_plugins.sweep.run_status import Standing, read_records, standings
 from crossgrad_plugins.sweep.summary import listing, table, write_plan
 
-_WORDS = "stopping: the runs under way save a checkpoint first (once more: without an evaluation)"
+_WORDS = "stopping: running runs save a checkpoint first (press again to skip their evaluation)"
 
 
 @contextmanager
@@ -115,7 +115,7 @@ class Sweep:
         self.layout = Layout((request.out or SWEEPS / (grid.name or request.path.stem)).absolute())
         if (
             not read_only
-        ):  # Checked before planning, which takes time; the lock itself is taken later.
+        ):  # Check before planning, which takes time; the lock itself is taken later.
             _refuse_a_second(self.layout.out)
             _refuse_what_is_no_sweep(self.layout)
         self.plan = planned(grid, request.path, request.assignments)
@@ -164,7 +164,9 @@ class Sweep:
         check_file(path)
         if path.exists():
             raise UserError(
-                "the file is there already", where=path, todo="choose another name, or remove it"
+                "the output file already exists",
+                where=path,
+                todo="choose another name, or remove the file",
             )
         found = self.standings(alive=writer_of(self.layout.out) is not None)
         content, notes = best_grid(self.plan.grid, self.plan.cells, found, path.parent)
@@ -187,7 +189,8 @@ class Sweep:
         with locked(self.layout.out, "sweeping") as held:
             if not held:
                 _note(
-                    "the file system has no locks: nothing keeps a second sweep out of the folder"
+                    "the file system does not support locks: nothing prevents a second sweep in "
+                    "the folder"
                 )
             for place in (self.layout.out, self.layout.out / "settings"):
                 clear_half_written(place)
@@ -232,10 +235,11 @@ class Sweep:
         _say(f"failed: {each.job.title} ({each.job.id}): {each.error}" for each in failed)
         if left:
             are, them = ("is", "it") if len(left) == 1 else ("are", "them")
-            _say([f"{count(len(left), 'run')} {are} left; the same command goes on with {them}"])
+            runs = f"{count(len(left), 'run')} {are} left"
+            _say([f"{runs}; run the same command to continue with {them}"])
         if failed:
-            _say([f"what they printed is in {self.layout.output('ID')}; the same command tries "
-                  "them again"])  # fmt: skip
+            _say([(f"their output is in {self.layout.output('ID')}; run the same command to try "
+"them again")])  # fmt: skip
         if signals:
             return exit_code(signals[0])
         return FAILED if failed or left else 0
@@ -257,10 +261,10 @@ def _grid(request: Request) -> Grid:
         grid = with_scenes(grid, request.scenes)
     if len(set(request.seeds)) < len(request.seeds):
         raise UserError(
-            "a seed stands there twice",
+            "a seed is listed twice",
             where="--seed",
             found=listed(map(str, request.seeds)),
-            todo="name each of them once",
+            todo="list each seed once",
         )
     return grid.model_copy(update={"seeds": tuple(request.seeds)}) if request.seeds else grid
 
@@ -268,10 +272,10 @@ def _grid(request: Request) -> Grid:
 def _refuse_a_second(out: Path) -> None:
     if writer := writer_of(out):
         raise UserError(
-            "another sweep is under way in this folder",
+            "another sweep is running in this folder",
             where=out,
             found=writer,
-            todo="wait until it ends, stop it, or choose another --out; --list shows how far it is",
+            todo="wait until it ends, stop it, or choose another --out; --list shows its progress",
         )
 
 
@@ -283,9 +287,9 @@ def _refuse_what_is_no_sweep(layout: Layout) -> None:
     there = {e.name for e in out.iterdir() if e.name != LOCK and not is_leftover(e)}
     if there and not there & {"settings", "output", "workers", layout.plan.name}:
         raise UserError(
-            "the folder holds something else than a sweep",
+            "the folder contains files that do not belong to a sweep",
             where=out,
-            expected="a new or empty folder, or one that a sweep has begun",
+            expected="a new or empty folder, or the folder of a sweep",
             found=listed(sorted(there)[:4]),
             todo="choose another --out",
         )

@@ -22,7 +22,7 @@ _GIB = 2**30
 PAUSE = 0.1
 #: The command that trains a run; core numbers and the arguments of `crossgrad` follow.
 COMMAND = (sys.executable, "-m", "crossgrad_plugins.sweep.child")
-#: Environment variables that limit the threads of a library.
+#: Environment variables that limit the threads of libraries.
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 #: Exit status of a run that was refused.
 _REFUSED = 2
@@ -56,8 +56,9 @@ class Bound:
     def reason(self) -> str:
         """The message for a process that exceeded the limit."""
         return (
-            f"took {self.taken / _GIB:.1f} GiB, more than the {(self.most or 0) / _GIB:.1f} GiB of "
-            "a run; start fewer --workers, or name more --memory"
+            f"used {self.taken / _GIB:.1f} GiB, more than the "
+            f"{(self.most or 0) / _GIB:.1f} GiB of a run; start fewer --workers, or raise "
+            "--memory"
         )
 
     def is_exceeded(self, process: int) -> bool:
@@ -190,7 +191,7 @@ class Attempt:
             stderr=subprocess.STDOUT,
             cwd=worker.folder,
             env={**os.environ, **dict.fromkeys(_THREADS, str(worker.threads))},
-            # Ctrl-C in the terminal is for the sweep, which then stops its runs.
+            # Ctrl-C in the terminal is meant for the sweep, which then stops its runs.
             start_new_session=True,
         )
 
@@ -216,7 +217,7 @@ class Attempt:
     def _reason(self, folder: Path, code: int) -> str:
         """Return why the run failed: the run's own error, or the last output of its process."""
         error = (summary_of(folder) or {}).get("error")
-        # A refused run does not write the summary, which may be from an earlier attempt.
+        # A refused run writes no summary, so an existing summary may be from an earlier attempt.
         if isinstance(error, str) and code != _REFUSED:
             return error
         with self._layout.output(self.job.id).open("rb") as output:
@@ -230,7 +231,7 @@ def _signal(code: int) -> str:
     """Return the name of the signal that ended a process; empty without a signal."""
     number = -code if code < 0 else code - 128
     known = {each.value: each.name for each in signal.Signals}
-    killed = " (by hand, or for want of memory)" if known.get(number) == "SIGKILL" else ""
+    killed = " (by hand, or because memory was full)" if known.get(number) == "SIGKILL" else ""
     return f"{known[number]}{killed}" if number in known else ""
 
 
@@ -260,7 +261,7 @@ class Retries:
         self._deaths[job.id] += 1
         if self._deaths[job.id] < MOST:
             return True
-        error = f"{outcome.error}, {MOST} times without a new checkpoint between"
+        error = f"{outcome.error}, {MOST} times without a new checkpoint"
         record = {"event": "ended", "run": job.id, "worker": worker}
         append(self._layout.records, {**record, "status": "failed", "error": error})
         return False

@@ -42,10 +42,10 @@ def best_grid(
     """
     if len(choices(grid)) == len(grid.arms):
         raise UserError(
-            "nothing varies in any arm of the grid: there is nothing to choose",
+            "no arm of the grid has several values to choose from",
             where=grid.name or "the grid",
-            expected="an arm whose parameters have several values",
-            todo="run the grid as it is",
+            expected="an arm with a parameter that has several values",
+            todo="run the grid without --best",
         )
     ends = _ends(grid, cells, standings)
     first = max(grid.seeds) + 1
@@ -54,10 +54,11 @@ def best_grid(
     for arm in grid.arms:
         own = [choice for choice in choices(grid) if choice.arm.name == arm.name]
         if len(own) == 1:
-            # Nothing varies in this arm, so it is a reference for the rest.
+            # Nothing varies in this arm, so it is the reference for the other arms.
             for scene in map(scene_name, grid.scenes):
                 _check_ended([(own[0], ends[own[0].label, scene])], scene, grid)
-            # Written as parameters, because parameters can override settings and settings cannot.
+            # Write them as parameters, because parameters can override settings and settings
+            # cannot.
             fixed = {name: {"values": [value]} for name, value in own[0].parameters.items()}
             as_it_is = {"name": arm.name, "settings": arm.settings, "by_scene": arm.by_scene}
             arms.append({**as_it_is, **({"parameters": fixed} if fixed else {})})
@@ -154,11 +155,11 @@ def _best(own: Sequence[Choice], scene: str, ends: Ends, grid: Grid) -> tuple[Ch
 
 def _nothing_to_choose(own: Sequence[Choice], scene: str, grid: Grid) -> UserError:
     return UserError(
-        "no parameters can be chosen",
+        "the best parameters cannot be chosen",
         where=f"{scene}, arm {own[0].arm.name}",
-        expected=f"a value with a finished run of each seed that has {grid.metric.name}",
-        found=f"for each of the {len(own)} a run that failed or has no such figure",
-        todo="see why they failed with --list; change the values, or the name of the metric",
+        expected=f"a value whose runs all finished and have {grid.metric.name}",
+        found=f"each of the {len(own)} values has a run that failed or has no such metric",
+        todo="look for the reasons with --list; change the values, or the name of the metric",
     )
 
 
@@ -168,11 +169,11 @@ def _check_ended(
     ended = sum(len(by_seed) == len(set(grid.seeds)) for _, by_seed in found)
     if ended < len(found):
         raise UserError(
-            "the best parameters are not known yet",
+            "the best parameters cannot be chosen before all runs have finished",
             where=f"{scene}, arm {found[0][0].arm.name}",
-            expected="a finished run of each value and seed",
+            expected="a finished run for each value and seed",
             found=f"{ended} of {len(found)} values finished",
-            todo="finish the sweep first: the same command without --best",
+            todo="finish the sweep first: run the same command without --best",
         )
 
 
@@ -181,7 +182,7 @@ def _no_candidate(
 ) -> str:
     seeds = [seed for seed, value in by_seed.items() if value is None]
     return (
-        f"{scene}, {choice.label}: not among the candidates, as the run failed or has no "
+        f"{scene}, {choice.label}: not a candidate, because a run failed or has no "
         f"{grid.metric.name} with seed {listed(map(str, seeds))}"
     )
 
@@ -195,4 +196,7 @@ def _at_the_end(best: Choice, scene: str, own: list[Choice]) -> Iterator[str]:
             and value in {min(numbers), max(numbers)}
             and len(set(numbers)) > 1
         ):
-            yield f"{scene}, {best.arm.name}: the best {name} is {value}, at the end of its values"
+            yield (
+                f"{scene}, {best.arm.name}: the best {name} is {value}, the smallest or "
+                "largest of its values"
+            )

@@ -35,7 +35,7 @@ def main() -> None:
 def _be_as_nice_as_asked() -> None:
     """Give the session of this run the niceness of its process."""
     if (niceness := getattr(os, "nice", lambda _: 0)(0)) > 0:
-        with suppress(OSError):  # Not Linux, or a Linux without session scheduling.
+        with suppress(OSError):  # The system is not Linux, or a Linux without session scheduling.
             _SESSION_NICENESS.write_text(str(niceness), encoding="ascii")
 
 

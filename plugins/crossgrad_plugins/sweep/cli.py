@@ -7,9 +7,9 @@ import typer
 
 from crossgrad_core.commands import UserError, announce, argument, command_of, option
 
-_WHAT = "What is run"
-_WHERE = "Where it is run"
-_SHOW = "Without running anything"
+_WHAT = "Runs"
+_WHERE = "Execution"
+_SHOW = "Options that start no run"
 
 
 @dataclass(frozen=True)
@@ -19,27 +19,27 @@ class Options:
     grid: Path = argument("GRID", "YAML file with the grid.")
     out: Path | None = option(
         None,
-        "Folder of the sweep; what is finished there is not repeated. Default: the grid's name "
-        "below runs/sweeps/.",
+        "Folder of the sweep; finished runs in it are not repeated. Default: the "
+        "grid's name below runs/sweeps/.",
         "DIR",
         heading=_WHAT,
     )
     scene: list[Path] | None = option(
-        None, "A scene instead of those of the grid, repeatable.", "SCENE", heading=_WHAT
+        None, "A scene that replaces the scenes of the grid. Repeatable.", "SCENE", heading=_WHAT
     )
     seed: list[int] | None = option(
-        None, "A seed instead of those of the grid, repeatable.", "N", heading=_WHAT, min=0
+        None, "A seed that replaces the seeds of the grid. Repeatable.", "N", heading=_WHAT, min=0
     )
     assignments: list[str] | None = option(
         None,
-        "A setting of all runs, repeatable; wins over the grid.",
+        "A setting of all runs, which overrides the grid. Repeatable.",
         "KEY=VALUE",
         heading=_WHAT,
         flag="--set",
     )
     workers: int | None = option(
         None,
-        "Runs at a time. Default: as many as there are cores and memory for.",
+        "Number of runs at a time. Default: as many as cores and memory allow.",
         "N",
         heading=_WHERE,
         min=1,
@@ -47,30 +47,32 @@ class Options:
     threads: int = option(1, "Threads and cores of each run.", "N", heading=_WHERE, min=1)
     memory: float | None = option(
         None,
-        "Memory of each run; one that takes more is stopped. Default: an equal share.",
+        "Memory of each run; a run that uses more is stopped. Default: an equal share.",
         "GIB",
         heading=_WHERE,
         min=0.1,
     )
-    engine: str = option("local", "Who carries out the runs.", "local|ray|slurm", heading=_WHERE)
+    engine: str = option(
+        "local", "System that executes the runs.", "local|ray|slurm", heading=_WHERE
+    )
     engine_option: list[str] | None = option(
         None,
-        "An option of the engine, repeatable (docs/sweep.md lists them).",
+        "An option of the engine (docs/sweep.md lists them). Repeatable.",
         "KEY=VALUE",
         heading=_WHERE,
     )
     dry_run: bool = option(
         False,
-        "Checks everything, lists the runs to do and estimates their time.",
+        "Check everything, list the open runs and estimate their time.",
         heading=_SHOW,
         flag="--dry-run",
     )
     list_runs: bool = option(
-        False, "Lists all runs and how far they are.", heading=_SHOW, flag="--list"
+        False, "List all runs and their progress.", heading=_SHOW, flag="--list"
     )
     best: Path | None = option(
         None,
-        "Writes a grid with the best parameters of each arm and scene, for other seeds.",
+        "Write a grid with the best parameters of each arm and scene, for other seeds.",
         "FILE",
         heading=_SHOW,
     )
@@ -78,19 +80,17 @@ class Options:
 
 @command_of(Options)
 def sweep(given: Options) -> None:
-    """Run a grid of configurations, scenes and seeds; resume it after any interruption.
+    """Run a grid of configurations, scenes and seeds, or resume it.
 
-    Every run is one of `crossgrad run` in a folder of its own; its name is a hash of its
-    configuration, scene and seed, so that what is finished is never repeated.
+    Every run is a run of `crossgrad run` in its own folder. The name of the folder is a hash of
+    configuration, scene and seed, so that finished runs are never repeated.
     """
     looks = {
         "--dry-run": given.dry_run, "--list": given.list_runs, "--best": given.best is not None
     }  # fmt: skip
     asked = [name for name, is_given in looks.items() if is_given]
     if len(asked) > 1:
-        raise UserError(
-            f"{' and '.join(asked)} do not go together", todo="leave all but one of them out"
-        )
+        raise UserError(f"{' and '.join(asked)} cannot be combined", todo="use only one of them")
     read_only = bool(asked)
     announce(quiet=read_only)
     from crossgrad_plugins.sweep.app import Request, Sweep
@@ -98,10 +98,10 @@ def sweep(given: Options) -> None:
 
     if given.engine not in ENGINES:
         raise UserError(
-            f"there is no engine named {given.engine!r}",
+            f"the engine {given.engine!r} is unknown",
             where="--engine",
             expected=", ".join(ENGINES),
-            todo="leave it out to run on this machine",
+            todo="leave --engine out to run on this machine",
         )
     found = Sweep(
         Request(

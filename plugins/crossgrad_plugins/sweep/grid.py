@@ -30,8 +30,8 @@ MOST_RUNS = 100_000
 #: Settings that the sweep itself controls -> explanation.
 _RESERVED = {
     "out": "every run has its own folder below --out",
-    "stop_after": "a sweep runs its runs to their ends",
-    "threads": "say --threads, for all runs alike",
+    "stop_after": "a sweep runs every run to its end",
+    "threads": "use --threads, which applies to all runs",
 }
 #: Settings that have an option of the sweep.
 _OPTIONS = {"scene": "--scene SCENE", "seed": "--seed N"}
@@ -64,9 +64,9 @@ class Parameter(_Part):
         if not isinstance(given, Mapping):
             raise ValueError(_SHAPE)  # noqa: TRY004 - pydantic reports ValueError
         if drawn := sorted(_WITH_DISTRIBUTION & given.keys()):
-            raise ValueError(f"nothing is drawn from distributions ({listed(drawn)}): list values")
+            raise ValueError(f"distributions ({listed(drawn)}) are not supported: list values")
         if len({"values", "value", "parameters"} & given.keys()) != 1:
-            raise ValueError("must have exactly one of values, value and parameters")
+            raise ValueError("must have exactly one of `values`, `value` and `parameters`")
         return given
 
     def axes(self, name: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -142,7 +142,7 @@ class Grid(_Part):
     @classmethod
     def _is_a_folder(cls, name: str | None) -> str | None:
         if name is not None and (name in {"", ".", ".."} or set(name) & {"/", "\\", "\0"}):
-            raise ValueError("is the name of a folder below runs/sweeps, without slashes")
+            raise ValueError("must be the name of a folder below runs/sweeps, without slashes")
         return name
 
     @model_validator(mode="before")
@@ -155,7 +155,9 @@ class Grid(_Part):
         parameters = dict(given["parameters"])
         found = {new: parameters.pop(old) for old, new in moved.items() if old in parameters}
         if twice := sorted(found.keys() & given.keys()):
-            raise ValueError(f"{listed(twice)} must be said once, on top or among the parameters")
+            raise ValueError(
+                f"{listed(twice)} may be given only once, at the top level or among the parameters"
+            )
         return {**given, **{n: _values(p) for n, p in found.items()}, "parameters": parameters}
 
 
@@ -168,7 +170,7 @@ def check_assignments(assignments: Iterable[str]) -> None:
     for name in (each.partition("=")[0].strip() for each in assignments):
         instead = f"say {_OPTIONS[name]}" if name in _OPTIONS else _RESERVED.get(name)
         if instead is not None:
-            raise UserError(f"{name} is not for --set", where=f"--set {name}", todo=instead)
+            raise UserError(f"{name} cannot be set with --set", where=f"--set {name}", todo=instead)
 
 
 class Choice(_Part):
@@ -271,7 +273,7 @@ def _problem(error: Mapping[str, Any]) -> Problem:
     if error["type"] == "extra_forbidden":
         hint = did_you_mean(str(path[-1]), Grid.model_fields if len(path) == 1 else ())
         below = "base" if len(path) == 1 else "settings"
-        return Problem(place, f"is no part of a grid; settings go below {below}", hint)
+        return Problem(place, f"is not a key of a grid; put settings below {below}", hint)
     message = error["msg"].removeprefix("Value error, ").removeprefix("Input ")
     message = _IN_YAML.get(error["type"], message)
     found = "" if error["type"] in {"missing", "value_error"} else f", not {error['input']!r}"
@@ -287,37 +289,37 @@ def _of_the_settings(grid: Grid) -> Iterator[Problem]:
     for place, settings in layers:
         for name, why in _RESERVED.items():
             if name in settings:
-                yield Problem(f"{place}.{name}", f"is not for a grid to set: {why}")
+                yield Problem(f"{place}.{name}", f"cannot be set by a grid: {why}")
         for name, axis in (("scene", "scenes"), ("seed", "seeds")):
             if name in settings:
-                yield Problem(f"{place}.{name}", f"is not for a grid to set: list it in {axis}")
+                yield Problem(f"{place}.{name}", f"cannot be set by a grid: list it in {axis}")
     yield from _of_the_names(grid)
     yield from _of_the_configurations(grid)
 
 
 def _of_the_configurations(grid: Grid) -> Iterator[Problem]:
     if (runs := _number_of_runs(grid)) > MOST_RUNS:
-        yield Problem("the grid", f"has {runs:.3g} runs, more than {MOST_RUNS:,}")
+        yield Problem("the grid", f"has {runs:.3g} runs; at most {MOST_RUNS:,} are allowed")
         return
     if _twice(arm.name for arm in grid.arms):
         return
     for label in _twice(choice.label for choice in choices(grid)):
-        hint = "tables tell configurations apart by their names"
-        yield Problem("arms", f"two configurations are called {label!r}", hint)
+        hint = "tables identify configurations by their names"
+        yield Problem("arms", f"two configurations have the name {label!r}", hint)
 
 
 def _of_the_names(grid: Grid) -> Iterator[Problem]:
     for name in _twice(arm.name for arm in grid.arms):
-        yield Problem("arms", f"two are named {name!r}")
+        yield Problem("arms", f"two entries have the name {name!r}")
     for seed in _twice(grid.seeds):
-        yield Problem("seeds", f"{seed} stands there twice")
+        yield Problem("seeds", f"{seed} is listed twice")
     scenes = [scene_name(scene) for scene in grid.scenes]
     for name in _twice(scenes):
-        yield Problem("scenes", f"two are named {name!r}")
+        yield Problem("scenes", f"two entries have the name {name!r}")
     for arm in grid.arms:
         for name in arm.by_scene.keys() - set(scenes):
             hint = did_you_mean(name, scenes)
-            yield Problem(f"arms.{arm.name}.by_scene", f"there is no scene named {name!r}", hint)
+            yield Problem(f"arms.{arm.name}.by_scene", f"no scene has the name {name!r}", hint)
 
 
 def _twice(values: Iterable[T]) -> list[T]:

@@ -69,7 +69,7 @@ def divided(workers: int | None, threads: int, memory: float | None) -> Machine:
 
 def idle_first(cores: Sequence[int]) -> tuple[int, ...]:
     """Return the cores with idle cores first, because another sweep may use some of the cores."""
-    with suppress(OSError, ValueError):  # Not Linux, or another format of the counts.
+    with suppress(OSError, ValueError):  # The system is not Linux, or the file has another format.
         before = _counts()
         time.sleep(_LOOK)
         after = _counts()
@@ -94,10 +94,10 @@ def _busy(before: list[int], after: list[int]) -> float:
 
 def _too_many(where: str, expected: str, found: str) -> UserError:
     return UserError(
-        "this machine has not enough cores or memory for that",
+        "this machine does not have enough cores or memory",
         where=where,
         expected=expected,
         found=found,
-        todo="name less; runs that share a core or swap memory take longer than one after another, "
-        "and their seconds mean nothing",
+        todo="lower the number; runs that share a core or swap memory take longer than "
+        "runs one after another, and their times cannot be compared",
     )

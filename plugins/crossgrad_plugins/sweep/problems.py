@@ -44,11 +44,11 @@ class GridError(UserError):
     def __init__(self, problems: Sequence[Problem], path: Path) -> None:
         self.problems = tuple(problems)
         super().__init__(
-            f"{len(problems)} things are wrong with this grid"
+            f"the grid has {len(problems)} errors"
             if len(problems) > 1
-            else "something is wrong with this grid",
+            else "the grid has an error",
             where=path,
-            todo="repair it and start again; nothing was started",
+            todo="correct the grid and start again; no run was started",
         )
 
     @override

@@ -195,9 +195,13 @@ class Estimate:
     def text(self, at_a_time: int) -> str:
         """Return the estimate as text, for `at_a_time` parallel runs."""
         if not self.seconds:
-            return "their time is known once one has finished" if self.unknown else "nothing to do"
+            return (
+                "the time is known after the first finished run"
+                if self.unknown
+                else "nothing to do"
+            )
         known = f"about {duration(max(self.seconds / at_a_time, self.longest))}"
-        unknown = f" and {count(self.unknown, 'run')} of which nothing is known yet"
+        unknown = f"; the time of {count(self.unknown, 'run')} is not known yet"
         others = unknown if self.unknown else ""
         return known + others
 

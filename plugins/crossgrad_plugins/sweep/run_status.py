@@ -14,8 +14,8 @@ from crossgrad_core.commands import disk_errors, read_rows, summary_of
 from crossgrad_plugins.sweep.job import Job, Layout
 
 State = Literal["finished", "failed", "training", "interrupted", "waiting"]
-#: The end of an attempt at a run: `stopped` by the sweep, or `died` if something else ended it
-#: without an error of its own.
+#: End of an attempt at a run: `stopped` if the sweep stopped it, `died` if it ended in another way
+#: without reporting an error.
 Status = Literal["finished", "failed", "stopped", "died"]
 
 

@@ -53,7 +53,7 @@ def table(cells: Sequence[Job], standings: Iterable[Standing], metric: Metric) -
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
     if not found and any(each.summary for each in known):
         there = listed(sorted({name for each in known for name in figures(each)})) or "no figures"
-        yield f"no finished run has {metric.name}; they have {there} (`metric` of the grid)"
+        yield f"no finished run has {metric.name}; the runs have {there} (`metric` of the grid)"
 
 
 def _best(found: dict[tuple[str, str], list[float]], scene: str, metric: Metric) -> float | None:
@@ -117,10 +117,10 @@ def _read_plan(layout: Layout, *, writes: bool = False) -> list[list[str]]:
     header, *rows = read_rows(layout.plan, "the table of runs", "remove it") or [[]]
     if writes and tuple(header) != _COLUMNS:
         raise UserError(
-            "the table of runs is none that a sweep wrote",
+            "the table of runs was not written by a sweep",
             where=layout.plan,
             expected=f"the columns {listed(_COLUMNS)}",
             found=listed(header),
-            todo="choose another --out, or remove the file",
+            todo="choose another --out, or remove the table",
         )
     return [row for row in rows if len(row) == len(_COLUMNS)] if tuple(header) == _COLUMNS else []

@@ -255,7 +255,7 @@ def test_a_start_without_visible_gaussians_is_reported(backbone):
     started = backbone.adopt(faint, scene, rng)
     assert len(started["anchors"]) > 0
     faint = replace(faint, opacities=torch.full_like(faint.opacities, 1e-3))
-    with pytest.raises(UserError, match="no point to start from"):
+    with pytest.raises(UserError, match="opaque enough to become an anchor"):
         backbone.adopt(faint, scene, rng)
 
 

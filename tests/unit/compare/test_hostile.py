@@ -136,7 +136,7 @@ def test_an_unfinished_run_is_left_out_and_listed(folder):
     RunFolder(seed=7, status="stopped").write(folder / "stopped")
     RunFolder(seed=8, status="failed").write(folder / "failed")
     found = compared(read_runs([folder], skip_broken=False), Options())
-    assert "has not ended" in found.left_out["1-1"]
+    assert "has not finished" in found.left_out["1-1"]
     assert "stopped" in found.left_out["stopped"]
     assert "failed" in found.left_out["failed"]
     assert len(found.ends[0].pairs) == 2
@@ -173,15 +173,15 @@ def test_a_single_seed_gives_an_inconclusive_verdict_with_the_reason(tmp_path):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
     assert "Inconclusive: views=2 is 1.00 dB ahead of views=1" in text
-    assert "one pair says nothing about noise" in text
+    assert "one pair does not show the noise" in text
 
 
 def test_a_single_seed_of_three_arms_gives_no_statement_about_noise(tmp_path):
     for views in (1, 2, 3):
         RunFolder(views_per_step=views, final=20.0 + views).write(tmp_path / str(views))
     text = headlines(tmp_path)
-    assert "not told apart from views=2, views=1" in text
-    assert "one pair says nothing about noise" in text and "1 pairs" not in text
+    assert "not distinguishable from views=2, views=1" in text
+    assert "one pair does not show the noise" in text and "1 pairs" not in text
 
 
 def test_three_seeds_give_the_number_of_pairs_that_would_suffice(tmp_path):
@@ -190,24 +190,24 @@ def test_three_seeds_give_the_number_of_pairs_that_would_suffice(tmp_path):
             RunFolder(seed=seed, views_per_step=views, final=20.0 + offset).write(
                 tmp_path / f"{views}-{seed}"
             )
-    assert "pairs needed to tell 0.1 dB" in headlines(tmp_path)
+    assert "pairs are needed to detect 0.1 dB" in headlines(tmp_path)
 
 
 def test_a_single_arm_still_gets_a_page(tmp_path, capsys):
     RunFolder().write(tmp_path / "runs" / "only")
     app.compare([tmp_path / "runs"], Options(), None, skip_broken=False)
     page = (tmp_path / "runs" / "compare" / "index.html").read_text()
-    assert "One arm: there is nothing to compare it with" in page
-    assert "nothing to compare" in capsys.readouterr().out
+    assert "There is only one arm: so nothing can be compared" in page
+    assert "nothing can be compared" in capsys.readouterr().out
 
 
 def test_arms_on_different_scenes_are_not_paired(tmp_path):
     RunFolder(scene="city").write(tmp_path / "1")
     RunFolder(scene="park", views_per_step=2).write(tmp_path / "2")
     # No setting varies within a scene, so there is one arm.
-    assert "One arm" in headlines(tmp_path)
+    assert "There is only one arm" in headlines(tmp_path)
     RunFolder(scene="city", seed=5, views_per_step=2).write(tmp_path / "3")
-    assert "share no scene with the same seed" in headlines(tmp_path)
+    assert "have no scene with the same seed in common" in headlines(tmp_path)
 
 
 def test_a_metric_that_one_run_did_not_measure_is_not_compared(tmp_path):
@@ -230,7 +230,7 @@ def test_missing_per_view_metrics_are_reported(folder):
 
 def test_results_without_a_configuration_are_reported(folder):
     (folder / "1-1" / "config.yaml").unlink()
-    with pytest.raises(UserError, match="without its"):
+    with pytest.raises(UserError, match="no config"):
         read_runs([folder], skip_broken=False)
     found = read_runs([folder], skip_broken=True)
     assert len(found.runs) == 5
@@ -262,7 +262,7 @@ def test_an_incomplete_comparison_is_replaced(folder, monkeypatch):
     app.compare([folder], Options(), out, skip_broken=False)
     (out / "index.html").unlink()
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match="something else"):
+    with pytest.raises(UserError, match="do not belong to a comparison"):
         app.compare([folder], Options(), out, skip_broken=False)
     assert (out / "notes.txt").read_text() == "mine"
 
@@ -271,7 +271,7 @@ def test_the_reason_for_missing_pairs_is_reported(tmp_path):
     for seed in range(2):
         RunFolder(seed=seed).write(tmp_path / f"good-{seed}")
         RunFolder(seed=seed, views_per_step=2, status="failed").write(tmp_path / f"bad-{seed}")
-    assert "Nothing is paired: every run of views=2 failed" in headlines(tmp_path)
+    assert "No pairs: every run of views=2 failed" in headlines(tmp_path)
 
 
 def test_arms_without_final_metrics_are_reported_as_such(tmp_path):

@@ -223,7 +223,7 @@ def test_costs_are_averaged_over_the_scenes_that_all_arms_have(tmp_path):
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     table = cost_table(found)
     titles = [column.title for column in table.columns]
-    shown = [titles.index(title) for title in ("arm", "primitives at the end", "runs")]
+    shown = [titles.index(title) for title in ("arm", "Gaussians at the end", "runs")]
     assert [[row[index] for index in shown] for row in table.rows] == [
         ["views=1", "1,000", "2"],
         ["views=2", "1,000", "1"],

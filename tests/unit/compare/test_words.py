@@ -23,7 +23,7 @@ def test_an_arm_that_leads_only_by_the_mean_is_not_reported_as_winner(tmp_path):
     assert first.claim == "views=1 has the best mean"
     assert first.support.startswith("better than views=4 by 1.99 dB (+1.9")
     assert second.claim.startswith("It is worse than views=2 by 0.31 dB (-0.3")
-    assert not any("ends best" in each.claim for each in (first, second))
+    assert not any("is best at the end" in each.claim for each in (first, second))
 
 
 def test_different_lengths_of_arms_are_reported(tmp_path):
@@ -33,7 +33,7 @@ def test_different_lengths_of_arms_are_reported(tmp_path):
             run.write(tmp_path / f"{views}-{seed}")
     found = compared(read_runs([tmp_path], skip_broken=False), Options())
     told = {each.claim: each.support for each in headline(found)}
-    assert told["The arms were given different lengths"] == "views=2 900 steps; views=1 300 steps"
+    assert told["The arms had different lengths"] == "views=2 900 steps; views=1 300 steps"
 
 
 def test_lengths_that_differ_only_between_scenes_are_not_reported(tmp_path):

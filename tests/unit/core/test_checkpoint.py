@@ -147,14 +147,14 @@ def test_latest_skips_incomplete_checkpoints(tmp_path: Path):
 def test_a_checkpoint_that_lost_a_file_is_reported_as_damaged(tmp_path: Path, name: str):
     save(tmp_path, make_checkpoint(100))
     (save(tmp_path, make_checkpoint(200)) / name).unlink()
-    with pytest.raises(UserError, match="damaged checkpoint") as told:
+    with pytest.raises(UserError, match="the checkpoint is damaged") as told:
         load_latest(tmp_path)
-    assert told.value.found == f"no {name}" and "goes on from step-000100" in told.value.todo
+    assert told.value.found == f"no {name}" and "continues from step-000100" in told.value.todo
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "checkpoints"])
 def test_a_missing_checkpoint_is_refused_with_a_remedy(tmp_path: Path, name: str):
-    with pytest.raises(UserError, match="no checkpoint to continue from"):
+    with pytest.raises(UserError, match="no checkpoint to resume from"):
         latest(tmp_path / name)
 
 
@@ -326,8 +326,14 @@ DAMAGES = {
     "cut short": (cut, "SHA-256 differs"),
     "no tensors": (lambda folder: (folder / "tensors.safetensors").unlink(), "no tensors"),
     "no state": (lambda folder: (folder / "state.json").unlink(), "no state.json"),
-    "half a state": (lambda folder: (folder / "state.json").write_text('{"format'), "not JSON"),
-    "other JSON": (lambda folder: (folder / "state.json").write_text("[1]"), "not the state"),
+    "half a state": (
+        lambda folder: (folder / "state.json").write_text('{"format'),
+        "not valid JSON",
+    ),
+    "other JSON": (
+        lambda folder: (folder / "state.json").write_text("[1]"),
+        "does not contain the state",
+    ),
     "missing tensor": (change_state(tensors=["parameters/gone"]), "gone"),
     "unknown plugins": (change_state(plugins=3), "valid plugins"),
     "no step": (change_state(step=None), "valid step"),
@@ -337,7 +343,7 @@ DAMAGES = {
     "unknown kind": (change_state(tensors=["plugin/a/b/c"]), "plugin/a/b/c"),
     "endless JSON": (
         lambda folder: (folder / "state.json").write_text("[" * 100_000),
-        "within each other",
+        "nested too deeply",
     ),
     "no digest": (replace_in_state('"state_sha256"', '"sha"'), "SHA-256 differs"),
     "another number": (replace_in_state('"views": 1400', '"views": 1401'), "SHA-256 differs"),
@@ -353,7 +359,7 @@ def test_damage_is_reported_and_the_earlier_checkpoint_is_named(tmp_path: Path, 
     damage(newer)
     with pytest.raises(UserError, match=message) as told:
         load(newer)
-    assert f"remove it; the run then goes on from {older.name}" in str(told.value)
+    assert f"remove it; the run then continues from {older.name}" in str(told.value)
 
 
 def test_another_format_version_is_refused(tmp_path: Path):
@@ -364,7 +370,7 @@ def test_another_format_version_is_refused(tmp_path: Path):
 
 
 def test_loading_a_missing_checkpoint_is_refused(tmp_path: Path):
-    with pytest.raises(UserError, match="no such checkpoint"):
+    with pytest.raises(UserError, match="the checkpoint does not exist"):
         load(tmp_path / "step-000001")
 
 

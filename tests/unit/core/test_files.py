@@ -48,12 +48,12 @@ def test_an_error_inside_the_block_keeps_the_old_file(tmp_path: Path):
     [
         (errno.ENOSPC, "not enough disk space"),
         (errno.EDQUOT, "not enough disk space"),
-        (errno.EACCES, "cannot write here"),
-        (errno.EROFS, "cannot write here"),
-        (errno.EISDIR, "something else is in the way"),
-        (errno.ENOTDIR, "something else is in the way"),
-        (errno.EEXIST, "something else is in the way"),
-        (errno.ELOOP, "something else is in the way"),
+        (errno.EACCES, "cannot write to this path"),
+        (errno.EROFS, "cannot write to this path"),
+        (errno.EISDIR, "already has this name"),
+        (errno.ENOTDIR, "already has this name"),
+        (errno.EEXIST, "already has this name"),
+        (errno.ELOOP, "already has this name"),
     ],
 )
 def test_disk_errors_become_user_errors(tmp_path: Path, number: int, message: str):
@@ -69,7 +69,7 @@ def test_other_system_errors_are_passed_on(tmp_path: Path):
 
 def test_a_folder_with_the_name_of_the_file_is_not_replaced(tmp_path: Path):
     (tmp_path / "a.txt").mkdir()
-    with pytest.raises(UserError, match="something else is in the way"):
+    with pytest.raises(UserError, match="already has this name"):
         write_atomically(tmp_path / "a.txt", b"new")
     assert [item.name for item in tmp_path.iterdir()] == ["a.txt"]
 

@@ -376,9 +376,9 @@ def test_an_accumulated_sum_cannot_be_read_after_it_was_divided():
     gradients = accumulation(make_views(2))
     mean = gradients.total(2)
     assert gradients.total(2) is mean
-    with pytest.raises(RuntimeError, match="overwritten by their mean"):
+    with pytest.raises(RuntimeError, match="their mean has overwritten it"):
         gradients.total()
-    with pytest.raises(RuntimeError, match="one view more than the 2"):
+    with pytest.raises(RuntimeError, match="more views were rendered than the 2"):
         gradients.add(make_views(1)[0])
 
 
@@ -432,7 +432,7 @@ def test_deferred_sums_equal_immediate_sums(count, bad):
 def test_deferred_sums_refuse_more_views_than_announced():
     late = DeferredSums(BLOCKS, 1)
     late.add(make_views(1)[0])
-    with pytest.raises(RuntimeError, match="one view more than the 1"):
+    with pytest.raises(RuntimeError, match="more views were rendered than the 1"):
         late.add(make_views(1)[0])
 
 

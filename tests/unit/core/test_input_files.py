@@ -32,7 +32,7 @@ PARSERS = {
 
 @pytest.fixture(params=["pipe", "device", "socket", "folder", "link to a pipe", "a very long name"])
 def odd(request, tmp_path):
-    """Something in place of a file."""
+    """Something in instead of a file."""
     path = tmp_path / "odd"
     match request.param:
         case "pipe":
@@ -61,7 +61,7 @@ def test_parsers_refuse_paths_that_are_not_regular_files(name, odd):
 
 def test_paths_that_are_not_regular_files_are_not_opened(odd):
     assert not is_file(odd)
-    with pytest.raises(OSError, match=r"place of a file|too long"):
+    with pytest.raises(OSError, match=r"instead of a file|too long"):
         open_file(odd)
 
 
@@ -85,7 +85,7 @@ def test_a_file_above_the_size_limit_is_not_read(name, tmp_path):
     with path.open("wb") as file:
         file.truncate(1 << 42)  # takes no room
     parse, error = PARSERS[name]
-    with pytest.raises(error, match="more than 64"):
+    with pytest.raises(error, match="at most 64"):
         parse(path)
 
 

@@ -159,7 +159,10 @@ def test_an_unknown_name_is_refused_with_a_suggestion(good):
 
 
 def test_the_error_for_a_name_of_another_slot_names_this_slot():
-    assert "radial is a grouping" in refusal("operators", "radial").todo
+    assert (
+        "a component with the name radial exists in the slot grouping"
+        in refusal("operators", "radial").todo
+    )
 
 
 def test_a_name_that_two_packages_offer_is_refused_with_both_packages(good, install):
@@ -299,7 +302,7 @@ def test_a_package_for_another_version_of_crossgrad_is_refused(install, requires
     plugins = {"groupings": {"dated": "made_up_dated:Good"}}
     install("made-up", plugins, {"made_up_dated": GOOD}, "1.4", requires)
     error = refusal("groupings", "dated")
-    assert "grouping dated is written for another version of crossgrad" in error.what
+    assert "grouping dated was written for another version of crossgrad" in error.what
     assert error.expected.startswith("crossgrad") and "made-up 1.4 requires" in error.expected
     assert error.found == f"crossgrad {VERSION}"
     assert "made_up_dated" not in sys.modules
@@ -334,10 +337,7 @@ def test_a_misspelt_entry_point_group_is_named_with_a_suggestion(install, group,
     (stray,) = [each for each in strays() if each.distribution == "made-up"]
     assert (stray.name, stray.group, stray.meant) == ("lost", f"crossgrad.{group}", meant)
     error = refusal("operators", "lost")
-    assert (
-        f"made-up 1.0 offers lost, but there is no entry-point group crossgrad.{group}"
-        in error.todo
-    )
+    assert f"made-up 1.0 offers lost, but the entry-point group crossgrad.{group}" in error.todo
     assert f"write {meant}" in error.todo
 
 

@@ -34,7 +34,7 @@ def test_configure_threads_sets_numba_and_torch(n):
 @pytest.mark.parametrize("n", [-1, 0, 10**6])
 def test_an_impossible_number_of_threads_is_refused(n):
     most = numba.config.NUMBA_NUM_THREADS
-    with pytest.raises(UserError, match="number of threads out of range") as error:
+    with pytest.raises(UserError, match="the number of threads is out of range") as error:
         configure_threads(n)
     # It may be that of a run from a larger machine, which nobody has typed.
     assert f"--threads {most}" in error.value.todo

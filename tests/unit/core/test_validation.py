@@ -46,7 +46,7 @@ def test_an_unknown_nested_key_suggests_the_keys_at_its_position():
 
 
 def test_an_unknown_option_of_a_model_without_options_is_reported_so():
-    assert explained(Empty, {"a": 1}).expected == "no options; it has none"
+    assert explained(Empty, {"a": 1}).expected == "no options: it has none"
 
 
 def test_the_message_of_a_validator_is_kept():

@@ -51,30 +51,30 @@ def test_pyyaml_reads_the_written_values_alike(settings):
 
 
 def test_an_alias_bomb_is_refused_at_once():
-    refused(BOMB, "counting aliases", "line")
+    refused(BOMB, "including aliases", "line")
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a: &a [*a]", "within each other"),
-        ("a: " + "[" * 400, "within each other"),
-        ("- " * 400, "within each other"),
+        ("a: &a [*a]", "levels deep"),
+        ("a: " + "[" * 400, "levels deep"),
+        ("- " * 400, "levels deep"),
         ("a: [" + "1," * (MOST_VALUES + 9) + "]", "values"),
         ("a: 1\n" * 100_000, "KiB"),
         ("a: 1\nb: 2\na: 3", "'a' occurs twice"),
         ("x: {a: 1, 'a': 3}", "'a' occurs twice"),
-        ("? [a]\n: 1", "not a word"),
+        ("? [a]\n: 1", "not a string"),
         ("a: " + "9" * 5000, "digits"),
-        ("a: .nan", "not a number"),
-        ("a: !!python/object/apply:os.system [ls]", "no meaning"),
-        ("a: !!int abc", "not of the type int"),
-        ("a: !!float abc", "not of the type float"),
-        ("a: !!bool abc", "not of the type bool"),
-        ("a: !!int [1]", "no meaning"),
-        ("a: !!set {a}", "no meaning"),
-        ("a: !mine 3", "no meaning"),
-        ('a: "\\U00110000"', "does not exist"),
+        ("a: .nan", "NaN"),
+        ("a: !!python/object/apply:os.system [ls]", "not supported"),
+        ("a: !!int abc", "not a valid int"),
+        ("a: !!float abc", "not a valid float"),
+        ("a: !!bool abc", "not a valid bool"),
+        ("a: !!int [1]", "not supported"),
+        ("a: !!set {a}", "not supported"),
+        ("a: !mine 3", "not supported"),
+        ('a: "\\U00110000"', "is not valid"),
         ('a: "\\uD800"', "character"),
         ('a: "x\\0y"', "character"),
         ("%YAML " + "9" * 5000 + ".1\n---\na: 1", ""),
@@ -111,7 +111,7 @@ def test_a_text_of_the_largest_allowed_size_is_read_quickly():
     ("content", "words"),
     [
         (b"\xff\xfea\0", "cannot be read"),
-        (b"- a\n", "holds no settings"),
+        (b"- a\n", "contains no settings"),
         (b"a: [", "not valid YAML"),
     ],
 )

@@ -282,5 +282,5 @@ def test_rasterizer_output_without_a_pixel_count_is_reported_as_a_fault_of_the_r
     ctx = context()
     record = replace(recorded(ctx, 0), screen=Screen(torch.ones(40, dtype=torch.int32)))
     method = MultiViewDensityControl(count="running", share=1.0)
-    with pytest.raises(RuntimeError, match="gave none"):
+    with pytest.raises(RuntimeError, match="returned no pixel counts"):
         method.counted(replace(ctx, views=(record,)), PluginState())

@@ -122,7 +122,7 @@ def test_a_growth_request_excludes_rows_that_may_not_grow():
 def test_a_densifier_that_cannot_be_nested_is_refused_in_the_gate(name):
     with pytest.raises(UserError) as refused:
         build("densifiers", "multiview-gate", {"of": name})
-    assert "can only stand alone" in str(refused.value)
+    assert "cannot be used inside another densifier" in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -172,5 +172,5 @@ class Heedless(AdaptiveDensityControl):
 def test_a_densifier_that_ignores_the_gate_is_reported():
     run = DensifierRun.of(MultiViewGate(of=Heedless(), importance=1e9))
     run.take_step(599)
-    with pytest.raises(UserError, match="grows what it may not"):
+    with pytest.raises(UserError, match="grew Gaussians that the gate"):
         run.take_step(600)

@@ -88,7 +88,7 @@ def observed(densifier, scale):
 def test_statistics_do_not_depend_on_the_render_scale(name):
     full = observed(name, 1.0)
     if not full:
-        pytest.skip("gathers no statistics of views")
+        pytest.skip("uses no statistics of views")
     for scale in (0.5, 0.25):
         found = observed(name, scale)
         assert found.keys() == full.keys()

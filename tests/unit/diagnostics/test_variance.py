@@ -128,7 +128,7 @@ def test_zero_gradients_have_no_ratio():
 
 @pytest.mark.parametrize("sizes", [(1, 3), (4, 0), (0, 2)])
 def test_a_group_with_one_view_is_a_user_error(sizes):
-    with pytest.raises(UserError, match="two views of each group"):
+    with pytest.raises(UserError, match="each group needs two views"):
         groups(*sizes)
 
 

@@ -194,7 +194,7 @@ def test_a_header_with_line_ends_of_other_systems_is_read(tmp_path: Path):
 
 def test_a_file_without_gaussians_is_refused(tmp_path: Path):
     write_ply(tmp_path / "a.ply", make_cloud(0))
-    with pytest.raises(UserError, match=r"without Gaussians(?s:.*)0 vertices(?s:.*)to do"):
+    with pytest.raises(UserError, match=r"no Gaussians(?s:.*)0 vertices(?s:.*)to do"):
         read_ply(tmp_path / "a.ply")
 
 
@@ -226,20 +226,20 @@ def break_header(raw: bytes) -> bytes:
     [
         (lambda raw: raw[:0], "not a PLY file"),
         (lambda raw: b"\x89PNG\r\n" + raw, "not a PLY file"),
-        (lambda raw: raw[:40], "does not end"),
-        (lambda raw: raw[:-1], "ends too early"),
-        (lambda raw: raw.replace(b"vertex 4", b"vertex 4000000000"), "ends too early"),
-        (lambda raw: raw.replace(b"element vertex", b"element points"), "without vertices"),
+        (lambda raw: raw[:40], "without an end"),
+        (lambda raw: raw[:-1], "is incomplete"),
+        (lambda raw: raw.replace(b"vertex 4", b"vertex 4000000000"), "is incomplete"),
+        (lambda raw: raw.replace(b"element vertex", b"element points"), "has no vertices"),
         (lambda raw: raw.replace(b"binary_little_endian", b"binary_middle"), "format"),
         (break_header, "property"),
         (lambda raw: raw.replace(b"float z", b"float y"), "two properties"),
-        (lambda raw: raw.replace(b"float opacity", b"float density"), "without Gaussians"),
+        (lambda raw: raw.replace(b"float opacity", b"float density"), "no Gaussians"),
         (lambda raw: raw.replace(b"float x", b"float packed_position"), "compressed"),
         (lambda raw: raw.replace(b"f_rest_44", b"unknown"), "spherical harmonics"),
         (lambda raw: raw.replace(b"Mode: default", b"Mode: 2dgs"), "another renderer"),
-        (lambda raw: raw.replace(b"SplatRenderMode:", b"crossgrad_offset:"), "unreadable offset"),
+        (lambda raw: raw.replace(b"SplatRenderMode:", b"crossgrad_offset:"), "coordinate offset"),
         (lambda raw: raw[:-8] + np.array([np.nan, 1], "<f4").tobytes(), "1 of 4 values of rot_2"),
-        (lambda raw: raw[:-16] + bytes(16), "rotation of length zero"),
+        (lambda raw: raw[:-16] + bytes(16), "rotation whose length is zero"),
     ],
 )
 def test_damaged_files_are_refused_with_the_reason(tmp_path: Path, damage, message: str):
@@ -251,7 +251,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path: Path, damage, messa
 
 
 def test_a_missing_file_is_refused_with_the_reason(tmp_path: Path):
-    with pytest.raises(UserError, match="no such PLY file"):
+    with pytest.raises(UserError, match="the PLY file does not exist"):
         read_ply(tmp_path / "none.ply")
 
 
@@ -259,13 +259,13 @@ def test_a_pipe_is_refused_without_waiting(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.ply")
     with pytest.raises(UserError) as told:
         read_ply(tmp_path / "pipe.ply")
-    assert told.value.found == "a pipe or device in place of a file"
+    assert told.value.found == "a pipe or device instead of a file"
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: "\n".join(text.splitlines()[:-1]), "ends too early"),
+        (lambda text: "\n".join(text.splitlines()[:-1]), "is incomplete"),
         (lambda text: text.rstrip() + " 1.0\n", "not"),
         (lambda text: text.rstrip()[:-1] + "z\n", "not"),
     ],

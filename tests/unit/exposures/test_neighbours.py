@@ -103,8 +103,8 @@ def test_photos_without_evidence_start_at_the_exposure_of_their_neighbours(monke
     monkeypatch.setattr(initial_values, "exposure_values", lambda _: told)
     found = initial_values.starts_of(scene, "exif")
     assert found.stops == pytest.approx(kinds - 0.5)
-    (note,) = (each for each in found.messages if "2 photos start" in each)
-    assert "the photos nearest in pose" in note and "00.png, 01.png" in note
+    (note,) = (each for each in found.messages if "initial values of 2 photos" in each)
+    assert "the photos with the nearest poses" in note and "00.png, 01.png" in note
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])

@@ -114,7 +114,7 @@ def test_photos_that_a_file_places_far_from_the_mean_are_named(model, stops):
         assert messages == ()
     else:
         assert len(messages) == 1
-        assert "2 photos are more than 4 stops from the mean (0.png, 31.png)" in messages[0]
+        assert "2 photos differ by more than 4 stops from the mean (0.png, 31.png)" in messages[0]
 
 
 def test_a_photo_with_one_extreme_channel_or_a_black_map_is_named():

@@ -33,7 +33,7 @@ def apart(found, expected, points):
 def test_an_exact_similarity_is_found(seed, count, flat):
     frame, points, measured, _ = case(seed, count, flat=flat)
     fit = fit_similarity(points, measured)
-    if isinstance(fit, str):  # Three points may lie in one line.
+    if isinstance(fit, str):  # Three points may lie on a line.
         assert np.linalg.svd(points - points.mean(axis=0))[1][1] < 0.1
         return
     assert fit.kept.all()
@@ -98,18 +98,18 @@ def test_points_on_one_line_give_no_similarity(count):
     along = np.linspace(0.0, 1.0, count)[:, None]
     points = along * [1.0, 2.0, 3.0]
     measured = along * [300.0, -100.0, 0.0]
-    assert "in one line" in fit_similarity(points, measured)
+    assert "on a line" in fit_similarity(points, measured)
     # A line that is one up to the errors of what was measured.
     rng = np.random.default_rng(0)
     points += rng.normal(size=(count, 3)) * 1e-3
     measured += rng.normal(size=(count, 3)) * 2.0
-    assert "in one line" in fit_similarity(points, measured)
+    assert "on a line" in fit_similarity(points, measured)
 
 
 def test_coinciding_points_give_no_similarity():
     points, here = np.random.default_rng(0).normal(size=(9, 3)), np.full((9, 3), 5.0)
-    assert "at one place" in fit_similarity(points, here)
-    assert "at one place" in fit_similarity(here, points)
+    assert "at the same position" in fit_similarity(points, here)
+    assert "at the same position" in fit_similarity(here, points)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -160,9 +160,9 @@ def test_the_utm_zone_is_one_in_use_at_its_position(latitude, longitude):
 @pytest.mark.parametrize(
     ("code", "found"),
     [
-        ("epsg:3857", "a metre is 1 to 1.20"),
-        ("epsg:4326", "a metre is"),
-        ("epsg:2263", "a metre is 1 to 3.3"),
+        ("epsg:3857", "one metre is 1 to 1.20"),
+        ("epsg:4326", "one metre is"),
+        ("epsg:2263", "one metre is 1 to 3.3"),
         ("epsg:99999", "crs not found"),
     ],
 )
@@ -182,7 +182,7 @@ def test_left_handed_axes_are_refused():
 
 @pytest.mark.parametrize("code", ["+init=/etc/hostname:1", "file.wkt", "epsg:", "epsg:٣٢٦٣٣", ""])
 def test_only_codes_of_coordinate_systems_are_passed_to_proj(code):
-    with pytest.raises(UserError, match="PROJ cannot compute"):
+    with pytest.raises(UserError, match="PROJ cannot convert"):
         Projection.of(code, "here")
 
 

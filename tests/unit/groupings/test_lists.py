@@ -15,8 +15,8 @@ def test_names_with_commas_and_windows_line_ends_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"a.jpg,near,far\n", "not a name and a label"),
-        (b"a.jpg,\n", "not a name and a label"),
+        (b"a.jpg,near,far\n", "does not consist of a name and a label"),
+        (b"a.jpg,\n", "does not consist of a name and a label"),
         (b"a.jpg,near\na.jpg,far\n", "two labels"),
         (b'"a.jpg,near\nb.jpg,far\n', "cannot be read"),
         (b"a.jpg," + b"x" * 200_000, "cannot be read"),

@@ -1,4 +1,4 @@
-"""A run says where its grouping splits what has one mode."""
+"""A run says where its grouping splits values that form only one group."""
 
 import csv
 from dataclasses import replace
@@ -51,7 +51,7 @@ def notes(name, scene):
 )
 def test_a_split_of_one_mode_of_distances_is_noted_with_its_bimodality(name, figure, grouping):
     (note,) = notes(grouping, layout(name))
-    assert f"grouping {grouping} splits what has one mode" in note
+    assert f"grouping {grouping} splits values that form only one group" in note
     assert f"bimodality of the log distance from the mean camera is {figure} training" in note
     assert "below 0.555" in note and "arbitrary" in note
 
@@ -128,6 +128,6 @@ def test_the_note_about_one_mode_is_a_note_of_the_run():
     settings = {"steps": 5, "sampler": {"name": "near-far"}}
     scene = replace(layout("city_unimodal"), points=sample_scene().points)
     near_far = assemble(RunConfig.model_validate(settings), scene, "none")
-    assert sum("splits what has one mode" in note for note in near_far.notes) == 1
+    assert sum("splits values that form only one group" in note for note in near_far.notes) == 1
     plain = assemble(RunConfig.model_validate({"steps": 5}), sample_scene(), "none")
     assert not any("one mode" in note for note in plain.notes)

@@ -38,7 +38,7 @@ def test_a_scene_without_visible_points_is_a_user_error():
     view = posed_view((0, 0, 0))
     scene = posed_scene([view], [(0, -5, 0)])
     assert np.isnan(footprint_of(scene, view))
-    with pytest.raises(UserError, match="no SfM point in any training image"):
+    with pytest.raises(UserError, match="no SfM point is visible in a training photo"):
         Footprint().fit(scene, RNG)
 
 
@@ -49,7 +49,7 @@ def test_a_view_without_points_gets_the_label_of_the_nearest_camera(place, label
     scene = posed_scene([*views, blind], [(0, 0, 0)])
     rule = Footprint().fit(scene, RNG)
     assert rule.labels(scene.views) == ("near", "near", "near", "far", "far", label)
-    assert "views without SfM points go with the nearest other: 1" in rule.notes[0]
+    assert "views without SfM points join the group of the nearest other view: 1" in rule.notes[0]
 
 
 @pytest.mark.parametrize("depths", [(1, 1.1, 1.2, 1.3, 1.4, 1.5, 9, 10), (1, 2, 7, 8, 9, 10, 11)])

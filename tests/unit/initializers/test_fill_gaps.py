@@ -318,8 +318,8 @@ def test_the_margin_contains_only_regions_outside_all_training_photos():
         assert not shown.any()
     told = Filled(margin=0.5).messages(scene)
     assert told == (
-        f"start: {len(inner.positions)} Gaussians fill what photos show without points, "
-        f"{len(beyond)} stand beyond their edges",
+        f"start: {len(inner.positions)} Gaussians added inside photos where there are no points, "
+        f"{len(beyond)} beyond the edges of photos",
     )
 
 
@@ -348,7 +348,7 @@ def test_the_margin_continues_behind_nearer_points_of_another_photo(away, hides)
 def test_photos_without_enough_points_or_pixels_are_left_out():
     scene = ground_scene(LEFT, seen=np.arange(7))
     assert Filled().more_points(scene) is None
-    assert "2 photos with fewer than 8 points were left aside" in Filled().messages(scene)[0]
+    assert "2 photos with fewer than 8 points were skipped" in Filled().messages(scene)[0]
     hidden = ground_scene(LEFT)
     views = tuple(
         replace(view, photo=Picture(view.camera, hidden=True)) for view in hidden.train_views

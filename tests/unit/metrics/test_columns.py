@@ -42,7 +42,7 @@ def test_default_metrics_with_a_duplicate_column_are_left_out(regimes, left_out)
     columns = columns_of(setup)
     assert len(set(columns)) == len(columns)
     assert [n for n in USUAL if n not in left_out] == list(setup.selection.metrics)
-    said = [note for note in setup.notes if "is left out: metrics.csv has" in note]
+    said = [note for note in setup.notes if "is not computed: metrics.csv already has" in note]
     assert [note.split()[1] for note in said] == list(left_out)
     # A run that goes on has the same table, and nothing to say.
     again = assemble(resolved(setup), setup.scene, "none")

@@ -55,7 +55,7 @@ def test_plain_lines_are_printed_at_every_tenth_of_the_run(capsys: pytest.Captur
     assert lines[:3] == [
         "boruszyn: 24 training views, 4 held out; 20 steps on cpu",
         "results in runs/x",
-        "- further notes: 1 (in log.txt, or with -v)",
+        "- more notes: 1 (in log.txt, or with -v)",
     ]
     assert lines[3] == ("step 2/20 (10 %), loss 0.2500, 1,000 primitives, 10.0 steps/s, 2 s left")
     assert len([line for line in lines if line.startswith("step ")]) == 10
@@ -115,7 +115,10 @@ def test_a_stopped_run_is_reported_as_stopped(capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("totals", "said"),
     [
-        ((21, 30, 25, 40, 31, 30), ["the length followed the clock: 30 steps instead of 20"]),
+        (
+            (21, 30, 25, 40, 31, 30),
+            ["the number of steps was adapted to the time budget: 30 steps instead of 20"],
+        ),
         ((40, 30, 20), []),
         ((21,), []),
     ],

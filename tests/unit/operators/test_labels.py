@@ -9,7 +9,7 @@ from crossgrad_core.registry.entries import build
 from crossgrad_core.run.assemble import assemble
 from crossgrad_core.testing.fixtures import sample_scene
 
-LABELLED = "operator {} needs labelled views; sampler random draws from no groups"
+LABELLED = "operator {} needs labelled views, but sampler random draws without groups"
 
 
 def objections(name, sampler, grouping=None, views=2):

@@ -106,7 +106,7 @@ def test_gradnorm_requires_labels(context_of):
     gramians = np.eye(2)[None]
     context = dataclasses.replace(context_of(gramians), labels=None)
     operator = build("operators", "gradnorm", {})
-    with pytest.raises(UserError, match="which group"):
+    with pytest.raises(UserError, match="the group of each view"):
         operator.transform(gramians, context, EMPTY_STATE, np.random.default_rng(0))
 
 

@@ -194,7 +194,7 @@ def test_printed_rows_are_read_back_exactly():
     ],
 )
 def test_rows_that_do_not_form_a_matrix_are_refused(text):
-    with pytest.raises(UserError, match="no matrix"):
+    with pytest.raises(UserError, match="not a matrix"):
         read_rows(text, torch.float32)
 
 
@@ -229,10 +229,10 @@ def test_the_command_checks_thousands_of_matrices(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--search", "1", "--rows", "[[1]]"], "--search and --rows do not go together"),
-        (["--search", "1", "--case", "plain"], "--case does nothing with --search"),
-        (["--rows", "[[1]]", "--seed", "1"], "--seed does nothing with --rows"),
-        (["--type", "float32"], "--type does nothing with the fixed cases"),
+        (["--search", "1", "--rows", "[[1]]"], "--search and --rows cannot be combined"),
+        (["--search", "1", "--case", "plain"], "--case has no effect with --search"),
+        (["--rows", "[[1]]", "--seed", "1"], "--seed has no effect with --rows"),
+        (["--type", "float32"], "--type has no effect with the fixed cases"),
     ],
 )
 def test_options_without_an_effect_are_refused(arguments, message):

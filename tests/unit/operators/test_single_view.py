@@ -54,7 +54,7 @@ def notes_of(operator, sampler=None, views=None):
         sampler=ComponentChoice.model_validate(sampler or {"name": "epoch"}),
     )  # fmt: skip
     notes = assemble(config, sample_scene(), "none").notes
-    return [note for note in notes if "does nothing" in note]
+    return [note for note in notes if "has no effect" in note]
 
 
 def views_of(operator, sampler=None):
@@ -89,7 +89,7 @@ def test_a_named_operator_gets_enough_views_per_step(operator):
 
 def test_an_operator_without_a_second_view_is_noted_once_with_a_remedy():
     (note,) = notes_of({"name": "pcgrad"}, views=1)
-    assert "operator pcgrad does nothing at K = 1" in note
+    assert "operator pcgrad has no effect at K = 1" in note
     assert "--views 2" in note
 
 

@@ -161,8 +161,8 @@ def test_the_adapter_passes_options_and_does_not_use_the_global_generator(ask):
     [
         ({"weighting": "PCGard"}, "no weighting named"),
         ({"weighting": "GradVac"}, "could not be resumed"),
-        ({"weighting": "MGDA", "options": {"speed": 3}}, "cannot be made"),
-        ({"weighting": "ConstantWeighting"}, "cannot be made"),
+        ({"weighting": "MGDA", "options": {"speed": 3}}, "cannot be created"),
+        ({"weighting": "ConstantWeighting"}, "cannot be created"),
     ],
 )
 def test_the_adapter_refuses_unusable_weightings(options, reason, ask):

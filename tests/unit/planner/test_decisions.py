@@ -362,7 +362,7 @@ def test_projection_requires_pairs_and_conflict_beyond_chance(conflict_low, rho_
 
 
 def test_a_failed_probe_decides_nothing():
-    probe = Probe(problem="a probe needs two training views of each group")
+    probe = Probe(problem="a probe needs at least two training views in each group")
     evidence = evidence_of("city_hybrid", probe)
     for part in (grouping.pairs, grouping.operator):
         found = part(evidence)
@@ -374,7 +374,7 @@ def test_a_failed_probe_decides_nothing():
 def test_an_infinite_noise_scale_is_reported_as_beyond_all_views():
     probe = Probe(rho=0.5, rho_low=0.1, rho_high=0.9, noise_scale=inf, conflict=0.5)
     found = grouping.views_per_step(evidence_of("city_unimodal", probe))
-    assert found.evidence.endswith("gradient noise scale beyond all views: no common part")
+    assert found.evidence.endswith("gradient noise scale larger than all views: no common part")
 
 
 def orbit(count=40):
@@ -442,7 +442,7 @@ def test_a_view_without_points_does_not_prevent_pairs():
     assert cut.two
     choice = cut.grouping
     rule = build("groupings", choice.name, choice.options).fit(scene, rng)
-    assert "without SfM points go with the nearest other: 1" in rule.notes[0]
+    assert "without SfM points join the group of the nearest other view: 1" in rule.notes[0]
     assert rule.label(blind) == "near"
     assert rule.labels(views) == ("near", "far") * 10
 
@@ -543,7 +543,7 @@ def test_the_table_fits_the_terminal(width):
     assert max(map(len, lines)) <= width
     text = " ".join(lines)
     assert all(part in text for part in PARTS_OF_THE_TABLE)
-    assert "nothing is changed" in text
+    assert "no settings changed" in text
 
 
 def test_every_decision_states_its_reason_and_how_to_override_it():

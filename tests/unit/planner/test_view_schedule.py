@@ -120,7 +120,7 @@ def test_a_planner_that_fails_is_called_only_if_a_plan_is_requested(name, value,
 def test_long_runs_use_the_epoch_sampler():
     found = decision(scene_of(AROUND), steps=30_000)
     assert (found.choice, found.settings) == ("epoch", {})
-    assert found.evidence == "measured in shorter runs only"
+    assert found.evidence == "measured only in shorter runs"
 
 
 @pytest.mark.parametrize(("photos", "short"), [(100, True), (400, False)])

@@ -156,7 +156,7 @@ def test_a_truncated_finished_scene_is_refused_with_a_remedy(model, layout, tmp_
         file.touch()
     check_ours(layout, tmp_path)
     cut(layout.model)
-    with pytest.raises(UserError, match="cut short") as caught:
+    with pytest.raises(UserError, match="incomplete") as caught:
         check_ours(layout, tmp_path)
     assert f"remove {layout.report}" in str(caught.value)
 

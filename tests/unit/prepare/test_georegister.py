@@ -128,7 +128,7 @@ def test_sideways_photos_on_a_straight_track_do_not_georegister_a_model():
         model.frame(number).rig_from_world = pycolmap.Rigid3d(pose, -pose.matrix() @ center)
     placement, why = placement_of(model, gps, tops_of(model))
     assert placement is None
-    assert "which way is up" in why
+    assert "the upward direction" in why
 
 
 def test_gps_coarser_than_the_scene_does_not_georegister_a_model():
@@ -143,7 +143,8 @@ def test_fewer_than_three_photos_with_gps_do_not_georegister_a_model():
     model = synthetic()
     gps = dict(list(moved(similarity(np.random.default_rng(0)), centers_of(model)).items())[:2])
     assert (
-        placement_of(model, gps, tops_of(model))[1] == "2 of its photos have GPS, and 3 are needed"
+        placement_of(model, gps, tops_of(model))[1]
+        == "2 of its photos have GPS, but at least 3 are needed"
     )
 
 

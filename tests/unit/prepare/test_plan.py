@@ -63,10 +63,10 @@ def test_preparation_continues_with_the_same_photos_in_another_folder(layout):
 )
 def test_differences_from_the_first_plan_are_reported_with_a_remedy(photos, settings, told, layout):
     first = agreed(layout, plan(*BEGUN))
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         agreed(layout, plan(*photos, **settings))
     assert caught.value.found == told
-    assert "use those it was begun with" in caught.value.todo
+    assert "use the original photos and settings" in caught.value.todo
     assert read_plan(layout) == first
 
 
@@ -75,7 +75,7 @@ def test_a_finished_scene_needs_no_photos_and_refuses_new_photos(layout):
     finish(layout)
     assert agreed(layout, plan(BEGUN[0], photo("b"), root="/new")) == first
     for other in (photo("d"), photo("a", "x"), photo("b", mask="n"), photo("c", mask="m")):
-        with pytest.raises(UserError, match="begun otherwise"):
+        with pytest.raises(UserError, match="begun with other photos or settings"):
             agreed(layout, plan(other))
     assert read_plan(layout) == first
 
@@ -87,5 +87,5 @@ def test_plans_without_checksums_of_masks_can_be_continued(layout):
         del each["mask_sha256"], each["transparent"]
     layout.plan.write_text(json.dumps(content))
     assert agreed(layout, plan(*BEGUN)).used == BEGUN
-    with pytest.raises(UserError, match="begun otherwise"):
+    with pytest.raises(UserError, match="begun with other photos or settings"):
         agreed(layout, plan(BEGUN[0], photo("b"), BEGUN[2]))

@@ -154,7 +154,7 @@ def test_unusable_photos_are_listed_with_the_reason(report):
     why = {each.name: each.why for each in report.plan.left_out}
     assert set(why) == {"kite/cut.jpg", "phone.HEIC", "kite/icon.png", "mast/z.jpg"}
     assert "the same file as mast/" in why["mast/z.jpg"]
-    assert "cut short" in why["kite/cut.jpg"]
+    assert "incomplete" in why["kite/cut.jpg"]
     assert "save as JPEG" in why["phone.HEIC"]
     assert "too small" in why["kite/icon.png"]
     (lost,) = report.lost
@@ -229,7 +229,7 @@ def test_repeating_the_last_stages_gives_the_same_scene(report, photos, scene):
 
 def test_other_settings_for_a_begun_scene_are_refused(report, photos, scene):
     before = content(scene)
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         prepared(photos, scene, Settings(max_size=200))
     assert "max_size was None, now 200" in caught.value.found
     assert content(scene) == before
@@ -269,7 +269,7 @@ def test_changed_photos_are_refused_with_a_remedy(copied, photos, tmp_path):
     with changed.open("ab") as file:
         file.write(b"more")
     before = content(copied)
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         prepared(moved, copied, Settings())
     assert f"1 photo gone: kite/{gone.name}; 1 photo changed: " in caught.value.found
     assert content(copied) == before
@@ -298,7 +298,7 @@ def test_a_finished_scene_is_read_without_its_intermediate_files_and_photos(
     before = content(copied)
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
     assert len(read.views) == COUNT
-    as_it_is = any("the scene is taken as it is" in note for note in read.notes)
+    as_it_is = any("the scene is used unchanged" in note for note in read.notes)
     assert as_it_is == (lost not in {"some photos", "most photos"})
     assert content(copied) == before and not (copied / "run.lock").exists()
 
@@ -306,7 +306,7 @@ def test_a_finished_scene_is_read_without_its_intermediate_files_and_photos(
 def test_new_photos_for_a_finished_scene_are_reported(copied, photos, tmp_path):
     place = shutil.copytree(photos, tmp_path / "photos")
     Image.effect_noise((400, 298), 20).save(place / "kite" / "new.png")
-    with pytest.raises(UserError, match="begun otherwise") as caught:
+    with pytest.raises(UserError, match="begun with other photos or settings") as caught:
         read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
     assert caught.value.found == "1 photo new: kite/new.png"
 
@@ -354,7 +354,7 @@ def test_run_with_prepare_prepares_the_photos(report, photos, capsys):
     assert ended("run", photos, "--prepare", "--steps", "1", "--dry-run") == 0
     told = capsys.readouterr().out
     assert f"prepare: {COUNT} of {COUNT + 1} photos have a pose" in told
-    assert "poses of its own" not in told
+    assert "already has poses" not in told
     read, name = read_scene(RunConfig(scene=photos, reader={"name": "photos-alone"}), photos)
     assert (name, len(read.views)) == ("photos-alone", COUNT)
 
@@ -363,7 +363,7 @@ def test_existing_poses_that_are_not_used_are_reported(copied, tmp_path):
     shutil.rmtree(copied / "prepare")
     place = shutil.copytree(bundled_scene(), tmp_path / "photos")
     read, _ = read_scene(RunConfig(scene=place, reader={"name": "photos-alone"}), place)
-    (told,) = (note for note in read.notes if "poses of its own" in note)
+    (told,) = (note for note in read.notes if "already has poses" in note)
     assert "reader colmap" in told and "leave --prepare out" in told
 
 
@@ -376,13 +376,13 @@ def test_a_run_on_unprepared_photos_names_the_command(photos, capsys):
 @pytest.mark.parametrize(
     ("photos_at", "scene_at", "what"),
     [
-        ("gone", "scene", "there is no such folder"),
-        ("file", "scene", "photos are in a folder"),
-        ("empty", "scene", "no photos in the folder"),
+        ("gone", "scene", "the photo folder does not exist"),
+        ("file", "scene", "must be a folder"),
+        ("empty", "scene", "contains no photos"),
         ("one", "scene", "too few photos"),
-        ("one", "other", "something else than a scene"),
-        ("one", "one/scene", "among the photos"),
-        ("one", "file", "cannot make this folder"),
+        ("one", "other", "do not belong to a scene"),
+        ("one", "one/scene", "inside the photo folder"),
+        ("one", "file", "the folder cannot be created"),
     ],
 )
 def test_bad_input_gives_one_error_and_writes_nothing(tmp_path, capsys, photos_at, scene_at, what):
@@ -400,9 +400,9 @@ def test_bad_input_gives_one_error_and_writes_nothing(tmp_path, capsys, photos_a
 @pytest.mark.parametrize(
     ("names", "todo"),
     [
-        ([], "name the folder that the photos are in"),
+        ([], "name the folder that contains the photos"),
         (["a.jpg"], "add photos that overlap"),
-        (["a.jpg", "b.HEIC"], "repair, convert or leave out what is named"),
+        (["a.jpg", "b.HEIC"], "repair, convert or remove these photos"),
     ],
 )
 def test_too_few_photos_are_refused_with_a_remedy(names, todo, tmp_path, capsys):
@@ -443,7 +443,7 @@ def test_photos_at_the_root_folder_need_an_output_folder(capsys):
 def test_prepare_without_photos_is_refused(given, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert ended("run", *given) == 2
-    assert "there are no photos to prepare" in capsys.readouterr().err
+    assert "--prepare needs a folder of photos" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -456,7 +456,7 @@ def test_photos_without_matches_give_one_error(tmp_path, capfd):
         Image.fromarray(noise).save(tmp_path / "my photos" / f"{number}.png")
     assert ended("prepare", tmp_path / "my photos", tmp_path / "scene") == 2
     told = capfd.readouterr().err
-    assert "no photos fit together" in told
+    assert "no photos match well enough" in told
     assert "3 photos; 0 pairs of them match" in told
     assert "sfm.cc" not in told
 
@@ -470,10 +470,10 @@ def test_unknown_choices_are_refused(option, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        (("--lens", "monocle"), "no such camera model"),
+        (("--lens", "monocle"), "camera model is unknown"),
         (("--lens", "equirectangular"), "cut them into perspective photos"),
         (("--matching", "spatial"), "no GPS"),
-        (("--masks", "gone"), "mask folder is not there"),
+        (("--masks", "gone"), "mask folder does not exist"),
         ((), "no features"),
     ],
 )

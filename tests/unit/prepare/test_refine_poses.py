@@ -288,7 +288,7 @@ def test_a_failed_mapping_keeps_the_previous_model(made, caplog):
 
     (found,), _ = looked_again([model], path, path.parent / "scratch", failing)
     assert all(np.array_equal(pose.matrix(), before[n]) for n, pose in poses_of(found).items())
-    assert "doubtful photos stay where they are" in caplog.text
+    assert "doubtful photos keep their poses" in caplog.text
 
 
 def test_a_photo_with_an_impossible_camera_is_left_out(tmp_path):

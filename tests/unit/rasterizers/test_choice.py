@@ -54,7 +54,7 @@ def test_bundled_rasterizers_are_chosen_by_device():
 
 
 def test_a_named_rasterizer_is_used_as_given():
-    assert choose_rasterizer("torch", PLAIN) == ("torch", ("rasterizer torch: asked for",))
+    assert choose_rasterizer("torch", PLAIN) == ("torch", ("rasterizer torch: chosen by the user",))
 
 
 def test_a_faster_third_party_rasterizer_is_chosen(install):

@@ -84,12 +84,12 @@ def test_gsplat_passes_the_self_test_with_its_torch_reference(monkeypatch):
 @pytest.mark.parametrize(
     ("rasterizer", "found"),
     [
-        (Dark(), "pixels are up to"),
-        (Unwritten(), "pixels are up to nan off"),
-        (HalfGradients(), "the gradient of the means is 0.5"),
-        (NoGradients(), "the gradient of the quats is 1 "),
+        (Dark(), "pixels differ by up to"),
+        (Unwritten(), "pixels differ by up to nan off"),
+        (HalfGradients(), "the gradient of the means differs by 0.5"),
+        (NoGradients(), "the gradient of the quats differs by 1 "),
         (Broken(), "RuntimeError: Ninja is required"),
-        (WrongFirst(), "pixels are up to"),
+        (WrongFirst(), "pixels differ by up to"),
     ],
     ids=lambda each: type(each).__name__,
 )

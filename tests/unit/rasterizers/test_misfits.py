@@ -45,7 +45,7 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
         pytest.skip("it is as it was, or not there")
     wrong = replace(some, **{field: change(tensor)})
     if field == "means":  # They count the Gaussians, so that the first other one is named.
-        with pytest.raises(UserError, match="these Gaussians cannot be drawn"):
+        with pytest.raises(UserError, match="cannot be rendered"):
             drawn(wrong)
         return
     with pytest.raises(UserError) as refused:
@@ -56,7 +56,7 @@ def test_a_tensor_of_another_shape_is_refused(field, change, harmonics):
 def test_gaussians_with_both_or_neither_of_colors_and_sh_are_refused():
     some = complete(harmonics=True)
     for wrong in (replace(some, colors=some.means), replace(some, sh_dc=None)):
-        with pytest.raises(UserError, match="colors and sh_dc"):
+        with pytest.raises(UserError, match="colors or sh_dc"):
             drawn(wrong)
 
 

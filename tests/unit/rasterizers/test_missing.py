@@ -63,8 +63,8 @@ def test_gswarp_without_warp_is_not_available(machine):
 @pytest.mark.parametrize(
     ("nvcc", "reason"),
     [
-        (None, "there is no nvcc: install the CUDA toolkit 12.8"),
-        ("13.0", "is of CUDA 13.0, torch"),
+        (None, "nvcc was not found: install the CUDA toolkit 12.8"),
+        ("13.0", "belongs to CUDA 13.0, but torch"),
         ("12.4", None),
     ],
 )
@@ -94,7 +94,7 @@ def test_gsplat_needs_ninja_on_the_path_or_next_to_python(machine, monkeypatch, 
     monkeypatch.setattr(missing.shutil, "which", lambda name: None if name == "ninja" else name)
     monkeypatch.setattr(missing.sys, "executable", str(tmp_path / "env" / "python"))
     monkeypatch.setenv("PATH", "/usr/bin")
-    assert "finds no ninja: pip install ninja" in objections(GsplatRasterizer())[0]
+    assert "ninja was not found: pip install ninja" in objections(GsplatRasterizer())[0]
     (tmp_path / "env").mkdir()
     (tmp_path / "env" / "ninja").touch()
     assert objections(GsplatRasterizer()) == []
@@ -111,7 +111,10 @@ def test_nvcc_is_searched_only_in_cuda_home_if_set(monkeypatch, tmp_path):
     monkeypatch.setenv("CUDA_PATH", str(tmp_path / "gone"))
     assert missing.find_nvcc() is None
     monkeypatch.setattr(missing, "find_spec", lambda _name: None)
-    assert f"no nvcc in {tmp_path / 'gone'}, where CUDA_HOME" in missing.compiler_missing("gsplat")
+    assert (
+        f"nvcc was not found in {tmp_path / 'gone'}, where CUDA_HOME"
+        in missing.compiler_missing("gsplat")
+    )
 
 
 def test_an_nvcc_without_a_readable_version_is_accepted(machine, tmp_path):
@@ -136,8 +139,8 @@ def test_an_unsupported_device_is_the_only_objection_on_a_cpu(machine):
         ("densifier", "dc4gs", "gsplat", "needs the screen statistics directions"),
         ("densifier", "multiview", "gswarp", "needs the screen statistics abs_gradient, count"),
         ("densifier", "absgrad", "gswarp", "needs the screen statistics abs_gradient"),
-        ("backbone", "analytic", "gsplat", "does not draw the pixel response analytic"),
-        ("backbone", "mip", "gswarp", "does not draw the pixel response antialiased"),
+        ("backbone", "analytic", "gsplat", "does not support the pixel response analytic"),
+        ("backbone", "mip", "gswarp", "does not support the pixel response antialiased"),
     ],
 )
 def test_outputs_that_a_rasterizer_lacks_are_refused_before_training(
@@ -154,7 +157,7 @@ def test_gswarp_refuses_a_backbone_that_sets_its_dilation(machine):
     class Own(type(build("backbones", "vanilla", {}))):
         sets_dilation = True
 
-    assert "by its own" in objections(GswarpRasterizer(), backbone=Own())[0]
+    assert "sets its own dilation" in objections(GswarpRasterizer(), backbone=Own())[0]
 
 
 def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(machine):
@@ -163,7 +166,7 @@ def test_the_fastest_installed_rasterizer_with_the_needed_outputs_is_chosen(mach
     assert choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"count"})))[0] == "gsplat"
     chosen, notes = choose_rasterizer("auto", Wanted("cuda", "plain", frozenset({"directions"})))
     assert chosen == "torch"
-    assert "rasterizer gsplat left out: this run needs directions" in notes
+    assert "rasterizer gsplat is not used: this run needs directions" in notes
     inria = Wanted("cuda", "plain", options=frozenset({"footprint"}))
     assert choose_rasterizer("auto", inria)[0] == "gswarp"
     assert choose_rasterizer("auto", Wanted("cuda", "antialiased"))[0] == "gsplat"

@@ -194,7 +194,7 @@ def test_names_that_point_outside_the_scene_are_refused(reader, name, make):
     path = make(reader)
     Image.new("RGB", (24, 16)).save(path.parent.parent / "secret.png")
     name_it(reader, path, name)
-    refuses(path, reader, "leads out of the scene", FILES[reader])
+    refuses(path, reader, "outside the scene folder", FILES[reader])
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 600 + "b", "a\nb", "\0", "\ud800"])
@@ -203,7 +203,7 @@ def test_impossible_file_names_are_refused(key, name, make):
     path = make("nerfstudio")
     where = ("frames", 0, key) if key in {"file_path", "mask_path"} else (key,)
     edit(path, "nerfstudio", put(*where, value=[name] if key.endswith("s") else name))
-    refuses(path, "nerfstudio", "a name that no file can have", key)
+    refuses(path, "nerfstudio", "a file name is not valid", key)
 
 
 @pytest.mark.parametrize("reader", [*FILES, "colmap"])
@@ -277,8 +277,8 @@ def test_only_photos_may_be_links_to_files_outside_the_scene(make):
     shutil.move(path / "cloud.ply", away)
     (path / "far").symlink_to(away, target_is_directory=True)
     edit(path, "nerfstudio", put("ply_file_path", value="far/cloud.ply"))
-    refuses(path, "nerfstudio", "leads out of the scene", "ply_file_path", away)
-    refuses(path, "nerfstudio", "leads out", options={"points": "far/cloud.ply"})
+    refuses(path, "nerfstudio", "outside the scene folder", "ply_file_path", away)
+    refuses(path, "nerfstudio", "outside the scene", options={"points": "far/cloud.ply"})
     # Within the scene folders may be links.
     (path / "far").unlink()
     away.rename(path / "there")
@@ -299,7 +299,7 @@ def test_every_file_name_in_a_file_must_stay_inside_the_scene(key, make):
     name = "../../secret.png"
     where = {"mask_path": ("frames", 0, key)}.get(key, (key,))
     edit(path, "nerfstudio", put(*where, value=[name] if key.endswith("s") else name))
-    refuses(path, "nerfstudio", "leads out of the scene", key)
+    refuses(path, "nerfstudio", "outside the scene folder", key)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ class TestXml:
             (b"<d><a " + b" ".join(b'a%d=""' % i for i in range(1_000)) + b"/></d>", "elements"),
             (b"<d><a " + b" ".join(b'a%d=""' % i for i in range(20_000)) + b"/></d>", "tag or"),
             (b"<d><!--" + b"-x" * 50_000 + b"--></d>", "tag or comment"),
-            (b"<d>" + b"x" * 200_000 + b"</d>", "a file of more"),
+            (b"<d>" + b"x" * 200_000 + b"</d>", "is larger than"),
         ],
         ids=["elements", "attributes", "wide", "comment", "size"],
     )
@@ -435,10 +435,10 @@ class TestCsv:
         [
             (b"#name,x,y\n", "a column alt"),
             (b"", "a column #name"),
-            (b"#name,x,y,alt,heading,pitch,roll,f,f\n", "two columns f"),
+            (b"#name,x,y,alt,heading,pitch,roll,f,f\n", "the column f twice"),
             (b"#name,x,y,alt,heading,pitch,roll,f\na.png,1\n", "8 cells in line 2"),
             (b"\xff\n", "cannot be read"),
-            (b"#name,x,y,alt,heading,pitch,roll,f\n", "no posed image"),
+            (b"#name,x,y,alt,heading,pitch,roll,f\n", "no image with a pose"),
         ],
     )
     def test_invalid_tables_are_refused(self, content, word, make):
@@ -452,7 +452,9 @@ class TestPoints:
         path = make("realitycapture")
         far = np.full((20, 3), 1e6) + np.arange(20)[:, None]
         write_ply(path / "points.ply", far, np.zeros((20, 3), np.uint8))
-        refuses(path, "realitycapture", "lie in no photo", "points.ply", "--init random")
+        refuses(
+            path, "realitycapture", "no photo shows the SfM points", "points.ply", "--init random"
+        )
 
     def test_a_ply_without_positions_is_refused(self, make):
         path = make("realitycapture")
@@ -464,7 +466,7 @@ class TestPoints:
         path = make("nerfstudio")
         content = (path / "cloud.ply").read_bytes()
         (path / "cloud.ply").write_bytes(content.replace(b"vertex 20", b"vertex 2000000000000"))
-        refuses(path, "nerfstudio", "cloud.ply", "ends too early")
+        refuses(path, "nerfstudio", "cloud.ply", "incomplete")
 
     @pytest.mark.parametrize(
         ("kind", "values", "stored"),

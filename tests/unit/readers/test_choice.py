@@ -21,9 +21,9 @@ def forms(tmp_path):
 def test_a_folder_that_two_readers_accept_is_refused_with_the_option(forms):
     path = forms["nerfstudio"]
     shutil.copytree(forms["colmap"] / "sparse", path / "colmap" / "sparse")
-    with pytest.raises(UserError, match="several ways") as caught:
+    with pytest.raises(UserError, match="files of several formats") as caught:
         read_scene(RunConfig(scene=path), path)
-    assert caught.value.found == "files of the readers colmap, nerfstudio"
+    assert caught.value.found == "files for the readers colmap, nerfstudio"
     assert "--reader colmap" in caught.value.todo
     for name in ("colmap", "nerfstudio"):
         assert read_scene(RunConfig(scene=path, reader={"name": name}), path)[1] == name

@@ -176,8 +176,8 @@ class TestReading:
             "local frame: 1 unit = 2.64818 input units, the extent of the training cameras "
             "(1.1 x largest distance from their mean)",
             "regimes by footprint: far 4 views (3 train, 1 test), near 4 views (4 train, 0 test)",
-            "split: no photo of near is held out, so no figure tells how good it gets; --split "
-            "stratified holds photos of every regime out",
+            "split: no photo of near is held out, so no metric shows its quality; --split "
+            "stratified holds out photos of every regime",
         )
 
     @pytest.mark.parametrize("scale", [1.0, 1000.0])
@@ -233,7 +233,7 @@ class TestPhotos:
         (path / "images" / "0003.png").unlink()
         scene = read(path)
         assert len(scene.views) == 7
-        assert "1 posed image left out, the photo is missing: 0003.png" in notes(scene)
+        assert "1 posed image left out, because the photo is missing: 0003.png" in notes(scene)
 
     def test_a_photo_without_pose_is_left_out(self, make):
         path = make()
@@ -242,7 +242,7 @@ class TestPhotos:
             shutil.copy(path / "images" / "0001.png", path / "images" / name)
         (path / "images" / "Thumbs.db").write_bytes(b"x")
         scene = read(path)
-        assert "2 photos without a pose left out: aaa.png, extra/0001.png" in notes(scene)
+        assert "2 photos left out (no pose): aaa.png, extra/0001.png" in notes(scene)
         assert color_error(scene.views[1], scene) < 8
 
     def test_photos_with_other_names_than_the_poses_are_refused(self, make):
@@ -251,7 +251,7 @@ class TestPhotos:
         (path / "images").mkdir()
         shutil.copytree(path / "moved", path / "images" / "cam1")
         (path / "moved").rename(path / "images" / "cam0")
-        refuses(path, "no posed image has a photo", "0000.png", "cam0/0000.png")
+        refuses(path, "no photo was found for any image of the model", "0000.png", "cam0/0000.png")
 
     def test_a_scene_without_a_photo_folder_is_refused(self, make):
         path = make()
@@ -264,14 +264,14 @@ class TestPhotos:
         (path / "images" / "0001.png").rename(path / "images" / "0001.PNG")
         scene = read(path)
         assert len(scene.views) == 8
-        assert "1 photo paired by a name that differs in suffix or case: 0001.png" in notes(scene)
+        assert "1 photo matched with a photo whose suffix or case differs: 0001.png" in notes(scene)
 
     @pytest.mark.parametrize("share", [0.5, 0.95])
     def test_a_truncated_photo_is_refused_before_training(self, make, share):
         path = make("jpeg")
         photo = path / "images" / "0005.jpg"
         photo.write_bytes(photo.read_bytes()[: int(photo.stat().st_size * share)])
-        refuses(path, "cut short", photo)
+        refuses(path, "incomplete", photo)
 
     def test_a_photo_damaged_inside_is_named_when_it_is_decoded(self, make):
         path = make()
@@ -306,7 +306,7 @@ class TestPhotos:
         for k in range(7):
             Image.new("RGB", (24, 16)).save(path / "images_2" / f"{k:04d}.png")
         scene = read(path, max_size=24)
-        assert "images_2/ is not used, 1 photo of it missing: 0007.png" in notes(scene)
+        assert "images_2/ is not used, because it lacks 1 photo: 0007.png" in notes(scene)
         assert "24 x 16 px (8) from images/, 8 resized (scikit-image" in notes(scene)
 
     def test_reduced_photos_without_the_originals_are_sufficient(self, make):
@@ -314,14 +314,14 @@ class TestPhotos:
         (path / "images").rename(path / "images_4")
         rewrite_camera(path, 192, 128, (230.4, 230.4, 102.0, 60.0))
         scene = read(path)
-        assert "8 of another size than their camera, which was scaled" in notes(scene)
+        assert "8 with another size than their camera, which was scaled" in notes(scene)
         assert scene.views[0].camera.fx == pytest.approx(57.6)
         assert color_error(scene.views[1], scene) < 8
 
     def test_a_photo_of_another_shape_is_refused(self, make):
         path = make()
         Image.new("RGB", (40, 32)).save(path / "images" / "0002.png")
-        refuses(path, "does not have the shape of its camera", "0002.png", "48 x 32", "40 x 32")
+        refuses(path, "aspect ratio of its camera", "0002.png", "48 x 32", "40 x 32")
 
     def test_exif_rotation_is_applied_only_if_the_camera_size_requires_it(self, make):
         path = make("jpeg")
@@ -340,7 +340,7 @@ class TestPhotos:
                 lying = image.rotate(90, expand=True)
             lying.save(photo, exif=exif, quality=95, subsampling=0)
         turned = read(path)
-        assert "8 of 8 turned by EXIF orientation" in notes(turned)
+        assert "8 of 8 rotated as their EXIF orientation says" in notes(turned)
         assert tuple(turned.views[1].photo.image().shape) == (32, 48, 3)
         assert color_error(turned.views[1], turned) < 8
 
@@ -355,8 +355,8 @@ class TestPhotos:
                 converted.putalpha(alpha)
             converted.save(path / "images" / f"{name}.png")
         scene = read(path)
-        assert "1 of 8 with transparency: alpha < 0.5 does not count" in notes(scene)
-        assert "1 of 8 grey: three equal channels" in notes(scene)
+        assert "1 of 8 with transparency: pixels with alpha < 0.5 are ignored" in notes(scene)
+        assert "1 of 8 grey: copied into three equal channels" in notes(scene)
         assert scene.views[1].photo.image().shape == (32, 48, 3)
         keep = scene.views[2].photo.mask()
         assert not keep[:, :24].any() and keep[:, 24:].all()
@@ -375,18 +375,18 @@ class TestPhotos:
         assert not keep[:, :24].any()
         assert keep[:, 24:].all()
         assert scene.views[1].photo.mask() is None
-        assert "masks: 1 of 8 have one: white counts" in notes(scene)
+        assert "masks: 1 of 8 have one: white pixels are used" in notes(scene)
         (path / "masks").rename(path / "mine")
         assert read(path).views[2].photo.mask() is None
         assert read(path, masks=Path("mine")).views[2].photo.mask() is not None
 
     def test_masks_without_a_matching_photo_are_refused(self, make):
         path = make()
-        refuses(path, "mask folder is not there", "mine", masks=Path("mine"))
+        refuses(path, "mask folder does not exist", "mine", masks=Path("mine"))
         (path / "mine").mkdir()
-        refuses(path, "no photo has a mask", "0000.png.png", masks=path / "mine")
+        refuses(path, "no mask for any photo", "0000.png.png", masks=path / "mine")
         Image.new("L", (48, 48)).save(path / "mine" / "0002.png")
-        refuses(path, "a mask does not have the shape", "48 x 48", masks=path / "mine")
+        refuses(path, "the aspect ratio of a mask", "48 x 48", masks=path / "mine")
 
     def test_photos_larger_than_the_photo_cache_give_a_note(self, tmp_path):
         path = write_tiny_scene(tmp_path, views=2)
@@ -404,7 +404,10 @@ class TestModels:
         shutil.copytree(model(small), path / "sparse" / "2")
         scene = read(path)
         assert len(scene.views) == 8
-        assert "sparse/10 is taken, it has most images (8); left out: sparse/2 3" in notes(scene)
+        assert (
+            "sparse/10 is used, because it has the most images (8); left out: sparse/2 3"
+            in notes(scene)
+        )
         assert len(read(path, ColmapReader(model="sparse/2")).views) == 3
         with pytest.raises(UserError, match=r"sparse/2, sparse/10"):
             read(path, ColmapReader(model="sparse/7"))
@@ -430,14 +433,14 @@ class TestModels:
 
     def test_a_path_into_a_scene_is_refused(self, make):
         path = make()
-        refuses(model(path), "leads into a scene", f"try {path}")
-        refuses(path / "sparse", "leads into a scene", f"try {path}")
+        refuses(model(path), "a folder inside a scene", f"try {path}")
+        refuses(path / "sparse", "a folder inside a scene", f"try {path}")
 
     def test_paths_without_a_scene_are_refused_with_a_suggestion(self, make):
         path = make()
-        refuses(path.parent / "plane", "not there", f"did you mean {path}?")
-        refuses(path.parent / "zzz" / "q", "not there", "check the path")
-        refuses(path / "images" / "0000.png", "a scene is a folder, not a file")
+        refuses(path.parent / "plane", "does not exist", f"did you mean {path}?")
+        refuses(path.parent / "zzz" / "q", "does not exist", "check the path")
+        refuses(path / "images" / "0000.png", "the scene must be a folder, not a file")
 
     def test_a_folder_without_list_permission_is_refused(self, make, monkeypatch):
         path = make()
@@ -466,20 +469,20 @@ class TestModels:
         path = make()
         content = (model(path) / file).read_bytes()
         (model(path) / file).write_bytes(content[:size])
-        refuses(path, "cut short", file)
+        refuses(path, "incomplete", file)
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
     def test_files_of_random_bytes_are_refused(self, make, file):
         path = make()
         (model(path) / file).write_bytes(np.random.default_rng(0).bytes(3000))
-        refuses(path, "cut short", file)
+        refuses(path, "incomplete", file)
 
     @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
     def test_files_with_data_after_the_last_record_are_refused(self, make, file):
         path = make()
         with (model(path) / file).open("ab") as end:
             end.write(b"\0" * 9)
-        refuses(path, "goes on behind its last record", file)
+        refuses(path, "continues after its last record", file)
 
     @pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
     @pytest.mark.parametrize("text", ["hello world\nfoo bar\n", "1 PINHOLE 48"])
@@ -491,25 +494,27 @@ class TestModels:
     def test_an_unknown_camera_model_is_refused(self, make):
         path = make()
         patch(model(path) / "cameras.bin", 12, struct.pack("<i", 99))
-        refuses(path, "unknown camera model number 99", "1 PINHOLE")
+        refuses(path, "the camera model number 99 is unknown", "1 PINHOLE")
 
     def test_an_image_without_camera_is_refused(self, make):
         path = make()
         patch(model(path) / "cameras.bin", 8, struct.pack("<I", 7))
-        refuses(path, "has no camera", "[7]", "camera id 1")
+        refuses(path, "is missing in the model", "[7]", "camera id 1")
 
     def test_a_spherical_camera_is_refused(self, make):
         path = make()
         record = struct.pack("<QIiQQ2d", 1, 1, 17, 48, 32, 48.0, 32.0)
         (model(path) / "cameras.bin").write_bytes(record)
-        refuses(path, "EQUIRECTANGULAR have no pinhole camera", "0000.png")
+        refuses(
+            path, "camera model EQUIRECTANGULAR cannot be converted to a pinhole camera", "0000.png"
+        )
 
     @pytest.mark.parametrize(
         ("params", "words"),
         [
             ((np.nan, 57.0, 24.0, 16.0), "not a finite number"),
-            ((-3.0, 57.0, 24.0, 16.0), "focal length is not positive"),
-            ((57.0, 0.0, 24.0, 16.0), "focal length is not positive"),
+            ((-3.0, 57.0, 24.0, 16.0), "focal length of a camera is not positive"),
+            ((57.0, 0.0, 24.0, 16.0), "focal length of a camera is not positive"),
         ],
     )
     def test_impossible_cameras_are_refused(self, make, params, words):
@@ -521,13 +526,13 @@ class TestModels:
     def test_non_finite_poses_are_refused(self, make, pose):
         path = make()
         patch(model(path) / "images.bin", 12, struct.pack(f"<{len(pose)}d", *pose))
-        refuses(path, "a pose is not finite", "0000.png")
+        refuses(path, "a pose contains numbers that are not finite", "0000.png")
 
     def test_two_poses_with_the_same_name_are_refused(self, make):
         path = make()
         content = (model(path) / "images.bin").read_bytes()
         (model(path) / "images.bin").write_bytes(content.replace(b"0001.png", b"0002.png"))
-        refuses(path, "several poses belong to one image name", "0002.png")
+        refuses(path, "several images of the model have the same name", "0002.png")
 
     @pytest.mark.parametrize("name", [b"../a.png", b"/etc/a.p"])
     def test_names_outside_the_image_folder_are_refused(self, make, name):
@@ -545,7 +550,7 @@ class TestModels:
     def test_a_model_without_images_is_refused(self, make):
         path = make()
         (model(path) / "images.bin").write_bytes(struct.pack("<Q", 0))
-        refuses(path, "no posed image", "registered")
+        refuses(path, "no image with a pose", "registered")
 
     @pytest.mark.parametrize("missing", [False, True])
     def test_a_scene_may_have_no_points(self, make, missing):
@@ -563,7 +568,7 @@ class TestModels:
         patch(model(path) / "points3D.bin", 16, struct.pack("<d", np.nan))
         scene = read(path)
         assert len(scene.points) == 199
-        assert "1 point left out: not finite" in notes(scene)
+        assert "1 point left out (not finite)" in notes(scene)
         assert all(view.seen.max() < 199 for view in scene.views)
         assert color_error(scene.views[1], scene) < 8
 
@@ -581,7 +586,7 @@ class TestModels:
         scene = read(write_tiny_scene(tmp_path, views=1))
         assert (scene.train, scene.test) == ((0,), ())
         assert "none held out: too few views" in notes(scene)
-        assert "the training cameras stand in one place" in notes(scene)
+        assert "all training cameras have the same position" in notes(scene)
         assert np.median(np.linalg.norm(scene.points, axis=1)) == pytest.approx(1, rel=1e-6)
 
 

@@ -68,7 +68,7 @@ def test_the_coordinates_of_the_chunk_can_be_selected(path):
 
 def test_points_of_the_other_frame_are_refused_with_the_option(path):
     edit(path, r"<translation>.*?<", "<translation>9e3 0.0 0.0<")
-    with pytest.raises(metashape.UserError, match="lie in no photo") as caught:
+    with pytest.raises(metashape.UserError, match="no photo shows the SfM points") as caught:
         read(path)
     assert "--set reader.frame=chunk" in caught.value.todo
 
@@ -109,7 +109,7 @@ def test_cameras_without_a_pose_or_of_other_components_are_left_out(path):
     assert [view.name for view in scene.views] == ["0000.png", "0001.png"]
     notes = "\n".join(scene.notes)
     assert "1 camera without a pose" in notes
-    assert "component 0 is taken, 1 camera of others left out" in notes
+    assert "component 0 is used, 1 camera of other components left out" in notes
 
 
 @pytest.mark.parametrize(("old", "new"), [(r'(\d{4})\.png"', r'\1"'), (r'"(\d{4})', r'"gone/\1')])

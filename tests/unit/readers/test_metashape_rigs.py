@@ -106,7 +106,7 @@ def test_slave_cameras_are_placed_by_their_master_and_the_offset(order, path):
         np.testing.assert_allclose(
             view.camera.world_to_camera[:3, :3].numpy(), pose[:3, :3].T, atol=1e-9
         )
-    assert any("2 slave cameras posed by their masters" in note for note in scene.notes)
+    assert any("2 slave cameras with poses from their masters" in note for note in scene.notes)
 
 
 def test_offsets_may_refer_to_another_sensor_than_that_of_the_master(path):
@@ -197,7 +197,7 @@ def test_equal_labels_are_resolved_by_order_as_a_last_resort_with_a_note(of, siz
     found, notes = pairs(cameras, names)
     assert found == names
     assert notes == [
-        f"photos of equal labels are paired by the order of {of}s and folders: "
+        f"photos with equal labels are paired by the order of {of}s and folders: "
         "first left, second right"
     ]
 

@@ -192,7 +192,7 @@ def test_split_lists_may_omit_suffixes(tmp_path):
         ),
         (
             {"train": ["images/a.png"], "test": ["images/a"]},
-            "for training and for testing",
+            "for both training and testing",
             "transforms.json: train_filenames and test_filenames",
         ),
     ],
@@ -212,10 +212,10 @@ def test_missing_photos_of_all_training_views_are_not_blamed_on_the_user_list(tm
     names = {"train_filenames": ["images/a.png"], "test_filenames": ["images/b.png"]}
     path = write(tmp_path, **LENS, **names)
     (path / "images" / "a.png").unlink()
-    with pytest.raises(UserError, match="no listed view can be trained on") as caught:
+    with pytest.raises(UserError, match="no listed view can be used for training") as caught:
         read(path, split="auto")
     assert caught.value.where == str(path)
-    assert "add the photos" in caught.value.todo
+    assert "add the missing photos" in caught.value.todo
 
 
 def test_an_applied_transform_is_inverted(tmp_path):
@@ -230,7 +230,7 @@ def test_an_applied_transform_is_inverted(tmp_path):
 
 def test_an_ignored_crop_is_reported(tmp_path):
     path = write(tmp_path, camera_model="OPENCV_FISHEYE", fisheye_crop_radius=10, **LENS)
-    assert "fisheye_crop_radius is left out" in "\n".join(read(path).notes)
+    assert "fisheye_crop_radius is not supported" in "\n".join(read(path).notes)
 
 
 @pytest.mark.parametrize(("named", "stored"), [("a", "a.png"), ("a.b", "a.b.png"), ("a", "a")])

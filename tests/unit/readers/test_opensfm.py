@@ -108,7 +108,7 @@ def test_unsupported_cameras_are_refused_with_a_remedy(kind, tmp_path):
     write(tmp_path, CAMERA | {"projection_type": kind})
     with pytest.raises(UserError, match=f"projection type {kind}") as caught:
         OpenSfmReader().read(tmp_path, SceneOptions())
-    assert "export them as pinhole" in caught.value.todo
+    assert "export them with pinhole cameras" in caught.value.todo
 
 
 def test_a_project_of_opendronemap_is_read(tmp_path):
@@ -124,7 +124,7 @@ def test_the_reconstruction_with_most_photos_is_used(tmp_path):
     (path / "reconstruction.json").write_text(json.dumps([few, models[0]]))
     scene = OpenSfmReader().read(path, SceneOptions())
     assert len(scene.views) == 2
-    assert "left out are those with 1" in "\n".join(scene.notes)
+    assert "reconstructions left out have 1" in "\n".join(scene.notes)
 
 
 @pytest.mark.parametrize("vector", [[0, 0, 0], [1e-13, 0, 0], [0, np.pi, 0], [0.3, -2.0, 7.0]])

@@ -134,7 +134,9 @@ def test_an_absolute_name_that_fits_two_photos_is_an_error(make):
     path = make("colmap")
     _two_folders(path)
     rename(path, "colmap", FORMS["elsewhere"])
-    with pytest.raises(UserError, match="an image name fits several photos") as caught:
+    with pytest.raises(
+        UserError, match="an image name of the model matches several photos"
+    ) as caught:
         read(path, "colmap")
     assert caught.value.found == "/home/alice/old/0001.png, which can be a/0001.png, b/0001.png"
 

@@ -137,7 +137,7 @@ def without(*keys):
         (lambda tags: {**tags, 2: (IFDRational(1, 0), 0.0, 0.0)}, ""),
         (lambda tags: {**tags, 2: (95.0, 0.0, 0.0)}, ""),
         (lambda tags: {**tags, 4: (13.75,)}, ""),
-        (lambda tags: tags_of(ORIGIN), "all at one place"),
+        (lambda tags: tags_of(ORIGIN), "all at the same position"),
     ],
 )
 def test_a_scene_with_incomplete_gps_is_not_georeferenced(scene, change, why):
@@ -167,7 +167,7 @@ def test_a_straight_flight_line_does_not_determine_the_roll(tmp_path):
         frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, -(pose.rotation.matrix() @ center))
     model.write_binary(str(scene / "sparse/0"))
     found = read(located(scene, noise=0.5))
-    assert "they stand in one line" in found.georeference.why
+    assert "they are on a line" in found.georeference.why
     assert any("not georeferenced" in note for note in found.notes)
 
 
@@ -182,11 +182,11 @@ def test_positions_below_sea_level_and_in_west_and_south_are_read(tmp_path, plai
 def test_gps_can_be_read_from_the_original_photos(with_gps, plain):
     scene = read(plain, gps=str(with_gps / "images"))
     assert_in_place(scene, 1e-4)
-    with pytest.raises(UserError, match="is not there"):
+    with pytest.raises(UserError, match="does not exist"):
         read(plain, gps=str(plain / "nowhere"))
     for path in (plain / "images", plain / "sparse"):
         found = read(plain, gps=str(path))
-        assert f"{path}: no photo of the scene is there" in found.georeference.why
+        assert f"{path}: it contains no position for a photo of the scene" in found.georeference.why
         assert found.notes[-1] == found.georeference.note
 
 
@@ -241,7 +241,8 @@ def test_a_position_list_has_priority_and_an_invalid_list_gives_a_note(scene):
     found = read(scene)
     assert "GPS of the photos" in found.georeference.note
     assert any(
-        "geo.txt tells no places: the list of places cannot be read" in n for n in found.notes
+        "geo.txt contains no positions: the list of photo positions cannot be read" in n
+        for n in found.notes
     )
     with pytest.raises(UserError, match="line 2") as caught:
         read(scene, gps=str(scene / "geo.txt"))
@@ -255,7 +256,7 @@ def test_a_position_list_has_priority_and_an_invalid_list_gives_a_note(scene):
 )
 def test_a_named_list_in_an_unknown_coordinate_system_is_refused(scene, system):
     (scene / "mine.txt").write_text(geo_list(scene, system, in_degrees))
-    with pytest.raises(UserError, match="PROJ cannot compute"):
+    with pytest.raises(UserError, match="PROJ cannot convert"):
         read(scene, gps=str(scene / "mine.txt"))
 
 
@@ -297,7 +298,7 @@ def test_priors_without_gps_coordinates_are_ignored(scene):
 def test_a_file_that_is_not_a_database_is_named(scene, tmp_path):
     (scene / "database.db").write_bytes(b"no database" * 100)
     found = read(scene)
-    assert "database.db tells no places" in found.georeference.why
+    assert "database.db contains no positions" in found.georeference.why
     (tmp_path / "empty.db").write_bytes(b"")
     assert not of_priors(tmp_path / "empty.db", ["0001.jpg"]).places
 
@@ -333,7 +334,7 @@ def test_a_database_that_expands_to_long_texts_is_refused(tmp_path):
         "CREATE TABLE pose_priors (image_id, position, coordinate_system)",
         "INSERT INTO images VALUES (1)",
     )
-    with pytest.raises(UserError, match="database of COLMAP cannot be read") as caught:
+    with pytest.raises(UserError, match="COLMAP database cannot be read") as caught:
         of_priors(path, ["a.jpg"])
     assert "too big" in caught.value.found
 
@@ -410,9 +411,9 @@ def test_poses_in_a_coordinate_system_are_georeferenced_by_its_code(scene, code,
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"crs": "epsg:4978"}, "is not where its coordinate system is"),
-        ({"crs": "epsg:1"}, "PROJ cannot compute"),
-        ({"crs": "epsg:4978", "gps": "."}, "leaves nothing for GPS to tell"),
+        ({"crs": "epsg:4978"}, "outside the area of their coordinate system"),
+        ({"crs": "epsg:1"}, "PROJ cannot convert"),
+        ({"crs": "epsg:4978", "gps": "."}, "cannot be combined"),
     ],
 )
 def test_an_impossible_coordinate_system_is_refused(plain, options, what):
@@ -485,7 +486,7 @@ def test_a_position_list_may_differ_in_suffix_and_case(scene):
 def test_a_position_list_for_other_photos_is_reported(scene):
     (scene / "geo.txt").write_text("EPSG:4326\nDJI_1.jpg 16.9 52.7 100\n")
     found = read(scene)
-    assert "geo.txt: 1 name, such as DJI_1.jpg, and none of a photo" in found.georeference.note
+    assert "geo.txt: 1 name without a photo, such as DJI_1.jpg" in found.georeference.note
 
 
 def test_an_exact_name_in_a_position_list_has_priority_over_a_similar_name(scene):

@@ -90,7 +90,7 @@ def test_the_file_suffix_may_be_in_capitals(scene):
 def test_a_table_without_a_required_column_is_reported(old, new, missing, scene):
     (file,) = scene.glob("*.csv")
     file.write_text(file.read_text().replace(old, new))
-    with pytest.raises(UserError, match="CSV of RealityCapture") as caught:
+    with pytest.raises(UserError, match="CSV file of RealityCapture") as caught:
         read(scene)
     assert caught.value.where == str(file) and caught.value.expected == missing
 
@@ -98,7 +98,7 @@ def test_a_table_without_a_required_column_is_reported(old, new, missing, scene)
 def test_a_table_in_utf_16_is_reported(scene):
     (file,) = scene.glob("*.csv")
     file.write_bytes(file.read_text().encode("utf-16"))
-    with pytest.raises(UserError, match="CSV of RealityCapture") as caught:
+    with pytest.raises(UserError, match="CSV file of RealityCapture") as caught:
         read(scene)
     assert caught.value.where == str(file)
 
@@ -106,7 +106,7 @@ def test_a_table_in_utf_16_is_reported(scene):
 def test_a_quote_in_a_comment_gives_an_error(scene):
     (file,) = scene.glob("*.csv")
     file.write_text('"a comment\n' + file.read_text())
-    with pytest.raises(UserError, match="CSV of RealityCapture"):
+    with pytest.raises(UserError, match="CSV file of RealityCapture"):
         read(scene)
 
 

@@ -288,7 +288,7 @@ def test_octaves_use_a_quarter_then_a_half_then_the_full_size():
     assert scales == [0.25] * 20 + [0.5] * 30 + [1.0] * 50
     assert resolution.messages(schedule) == (
         "resolution: 1/4 to step 20, 1/2 from step 21, full size from step 51; "
-        "no side is below 96 pixels",
+        "no side has fewer than 96 pixels",
     )
 
 
@@ -302,11 +302,11 @@ def test_octaves_use_a_quarter_then_a_half_then_the_full_size():
 )
 def test_a_size_of_octaves_may_be_omitted(options, text):
     (told,) = Octaves(**options).messages(Schedule.for_run(100))
-    assert told == f"resolution: {text}; no side is below 96 pixels"
+    assert told == f"resolution: {text}; no side has fewer than 96 pixels"
 
 
 def test_sizes_out_of_order_are_refused():
-    with pytest.raises(UserError, match="half_until must not be less"):
+    with pytest.raises(UserError, match="half_until must be at least"):
         build("resolutions", "octaves", {"quarter_until": 0.5, "half_until": 0.3})
 
 

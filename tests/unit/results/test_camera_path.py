@@ -81,7 +81,7 @@ def test_views_at_one_distance_also_give_a_zoom_path():
 
 def test_photos_without_observations_give_no_zoom_path():
     views, points = views_above([1.0, 2.0], seen=range(3))
-    with pytest.raises(UserError, match="give no zoom path"):
+    with pytest.raises(UserError, match="no zoom path can be computed"):
         zoom_path(views, points, FRAMES)
 
 
@@ -128,7 +128,7 @@ def test_a_camera_path_is_read_in_input_coordinates(tmp_path):
         ({"camera_type": "equirectangular"}, "camera_type"),
         ({"camera_path": [{"camera_to_world": TURNED, "fov": 50}]}, "row by row"),
         ({"camera_path": [{"camera_to_world": [1.0] * 15, "fov": 50}]}, "camera_to_world"),
-        ({"camera_path": [{"camera_to_world": [0.0] * 15 + [1], "fov": 50}]}, "no rotation"),
+        ({"camera_path": [{"camera_to_world": [0.0] * 15 + [1], "fov": 50}]}, "no valid rotation"),
         ({"camera_path": [{"camera_to_world": [float("nan")] * 16, "fov": 50}]}, "camera_to_world"),
         ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 180}]}, "fov"),
         ({"camera_path": [{"camera_to_world": IDENTITY, "fov": 1e-9}]}, "fov"),
@@ -159,7 +159,7 @@ def test_a_whole_number_of_pixels_may_be_written_with_a_decimal_point(tmp_path, 
 
 def test_a_file_with_the_name_of_the_frames_folder_is_refused(tmp_path):
     (tmp_path / "renders").touch()
-    with pytest.raises(UserError, match="something else is in the way"):
+    with pytest.raises(UserError, match="already has this name"):
         video.write_frames([torch.zeros(6, 8, 3)], tmp_path / "renders" / "000006")
 
 

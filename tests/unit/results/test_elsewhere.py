@@ -57,5 +57,5 @@ def test_an_outlier_camera_does_not_admit_a_capture_of_another_place():
     points = rng.normal(size=(300, 3))
     scene = posed_scene([posed_view(c, f"{i:03}.png") for i, c in enumerate(centers)], points)
     _check_place(scene, points, points[:5], Path("same"))
-    with pytest.raises(UserError, match="lies elsewhere"):
+    with pytest.raises(UserError, match="does not overlap"):
         _check_place(scene, points + 50.0, points[:5] + 50.0, Path("other"))

@@ -92,7 +92,7 @@ def test_a_folder_without_write_permission_is_refused(
         raise PermissionError(13, "Permission denied", str(dir))
 
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    with pytest.raises(UserError, match="cannot write here"):
+    with pytest.raises(UserError, match="cannot write to this path"):
         create_run_folder(NAME, out=tmp_path / "out")
 
 

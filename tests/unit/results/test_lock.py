@@ -40,7 +40,7 @@ def test_a_second_process_is_refused_with_the_holder_and_its_start_time(tmp_path
         pass
     message = str(told.value)
     assert f"process {holder.pid}, training since 20" in message
-    assert str(tmp_path) in message and "wait until it ends" in message
+    assert str(tmp_path) in message and "wait until the process ends" in message
     assert writer_of(tmp_path) in message
 
 
@@ -107,5 +107,5 @@ def test_a_folder_without_write_permission_is_refused(tmp_path: Path, monkeypatc
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(os, "open", refuse)
-    with pytest.raises(UserError, match="cannot write here"), locked(tmp_path, "training"):
+    with pytest.raises(UserError, match="cannot write to this path"), locked(tmp_path, "training"):
         pass

@@ -112,7 +112,7 @@ def test_the_log_contains_all_messages_of_a_run(tmp_path: Path):
         "",
         "third",
         "evaluated at step 4: PSNR 20.00 dB, SSIM 0.5000, - s training",
-        "the length followed the clock: 60 steps instead of 40",
+        "the number of steps was adapted to the time budget: 60 steps instead of 40",
         "run stopped",
     ]
 

@@ -134,7 +134,7 @@ def test_a_damaged_table_is_refused_on_resume(
     table = MetricsCsv.create(tmp_path, columns(["near", "far"]))
     table.append({**metrics_row(replace(totals, step=100), result), column: cell})
     before = table.path.read_bytes()
-    with pytest.raises(UserError, match=r"unreadable metrics\.csv"):
+    with pytest.raises(UserError, match=r"metrics\.csv cannot be read"):
         MetricsCsv.resume(tmp_path, columns(["near", "far"]), step=200)
     assert table.path.read_bytes() == before
 

@@ -121,7 +121,7 @@ def test_a_file_with_the_name_of_the_panel_folder_is_refused(tmp_path: Path, mak
     place = tmp_path / "renders"
     place.symlink_to(tmp_path / "nowhere") if link else place.touch()
     view = make_view("a/1.jpg", "a")
-    with pytest.raises(UserError, match="something else is in the way"):
+    with pytest.raises(UserError, match="already has this name"):
         PanelWriter.of(tmp_path, 7, [view], count=1).write(
             make_evaluated(view, torch.zeros(16, 24, 3, dtype=torch.uint8))
         )
@@ -151,5 +151,5 @@ def test_another_image_file_is_not_a_panel(tmp_path: Path, content: bytes | None
     Image.new("RGB", (200, 10)).save(path)
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(UserError, match="unreadable panel"):
+    with pytest.raises(UserError, match="a panel image cannot be read"):
         read_panel(path)

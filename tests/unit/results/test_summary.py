@@ -101,7 +101,7 @@ def test_a_failed_run_records_the_error(tmp_path: Path, summary: Summary):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [(None, "no summary.json"), ("{", "unreadable summary.json")]
+    ("text", "message"), [(None, "no summary.json"), ("{", "summary.json cannot be read")]
 )
 def test_missing_and_damaged_summaries_are_reported(tmp_path: Path, text: str | None, message: str):
     if text is not None:
@@ -171,5 +171,5 @@ def test_the_final_table_of_a_run_without_held_out_views_shows_costs_only(empty,
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"[1]", b"null", b"\xff", b"", b"9" * 9999])
 def test_an_unreadable_summary_is_reported(tmp_path: Path, content: bytes):
     (tmp_path / "summary.json").write_bytes(content)
-    with pytest.raises(UserError, match=r"unreadable summary\.json(?s:.*)to do"):
+    with pytest.raises(UserError, match=r"summary\.json cannot be read(?s:.*)to do"):
         read_summary(tmp_path)

@@ -168,7 +168,7 @@ def test_a_failed_removal_does_not_change_the_state():
     take_step(setup, state)
     state.commit({"wrong": PluginState(per_primitive={"rows": torch.zeros(3)})})
     tensors, moments, before = state.tensors, state.moments, state.primitives(setup)
-    with pytest.raises(UserError, match="state of plugin wrong does not fit"):
+    with pytest.raises(UserError, match="state of plugin wrong does not match"):
         cleaned(setup, state)
     assert state.tensors is tensors and state.moments is moments
     assert {len(t) for t in moments.exp_avg.values()} == {before}

@@ -199,5 +199,5 @@ def test_the_scale_clamp_rule_is_selected_by_default(settings, bound):
 def test_the_scale_clamp_rule_is_refused_for_a_backbone_without_trained_scales(settings):
     setup = setup_of(**settings)
     config = setup.config.model_copy(update={"rules": using(0.5)})
-    with pytest.raises(UserError, match="no Gaussians with axes that learn"):
+    with pytest.raises(UserError, match="trains no Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)

@@ -225,7 +225,7 @@ def test_a_final_edit_that_does_not_fit_does_not_change_the_state():
     setup = setup_of(answering("crossgrad_final_edit", FinalEdit(values, "gone")))
     state = first_state(setup)
     tensors = dict(state.tensors)
-    with pytest.raises(UserError, match="does not fit the primitives"):
+    with pytest.raises(UserError, match="does not match the Gaussians"):
         list(final_edits(setup, state))
     assert all(state.tensors[name] is tensor for name, tensor in tensors.items())
 
@@ -246,6 +246,6 @@ def test_a_resumed_run_with_all_bundled_rules_has_the_same_bits():
 
 
 def test_a_rule_that_is_both_added_and_removed_is_refused():
-    with pytest.raises(UserError, match="added and left out") as caught:
+    with pytest.raises(UserError, match="added and removed") as caught:
         merged(None, {"rule": ["dropout"], "no_rule": ["floaters", "dropout"]}, ())
     assert caught.value.found == "dropout"

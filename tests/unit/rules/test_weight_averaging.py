@@ -311,7 +311,7 @@ def test_an_average_with_another_number_of_primitives_is_refused():
     setup = setup_of(**using(NAME, share=0.5))
     state, _ = trained(setup, steps=2)
     state.commit({NAME: PluginState({"count": 2}, {}, {"means": torch.zeros(1, 3)})})
-    with pytest.raises(UserError, match="does not fit the run"):
+    with pytest.raises(UserError, match="does not match the run"):
         from_checkpoint(setup, to_checkpoint(state))
 
 

@@ -1,4 +1,4 @@
-"""Photos that are masked as a whole are left out of training; the others stay."""
+"""Photos whose pixels are all masked are left out of training; the other photos stay."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_a_fully_masked_training_photo_is_left_out_and_named(scene):
     after = read(scene)
     assert names(after, after.train) == [n for n in names(before, before.train) if n != "0001.png"]
     assert names(after, after.test) == names(before, before.test)
-    (note,) = [note for note in after.notes if "masked as a whole" in note]
+    (note,) = [note for note in after.notes if "all pixels are masked" in note]
     assert "1 training photo left out" in note and "0001.png" in note
     assert all(view.photo.mask() is None or view.photo.mask().any() for view in after.train_views)
 

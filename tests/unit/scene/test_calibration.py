@@ -13,12 +13,18 @@ RADIAL = Calibration("SIMPLE_RADIAL", 96, 64, (110.0, 49.0, 31.0, -0.08))
 @pytest.mark.parametrize(
     ("calibration", "message"),
     [
-        (Calibration("FOO", 96, 64, (1.0,)), "unknown camera model"),
+        (Calibration("FOO", 96, 64, (1.0,)), "camera model is unknown"),
         (Calibration("PINHOLE", 96, 64, (1.0, 1.0)), "wrong number of parameters"),
-        (Calibration("PINHOLE", 0, 64, (1.0, 1.0, 1.0, 1.0)), "the size of a camera is zero"),
-        (Calibration("PINHOLE", 96, 64, (0.0, 1.0, 1.0, 1.0)), "focal length is not positive"),
-        (Calibration("EQUIRECTANGULAR", 96, 48, (96.0, 48.0)), "have no pinhole camera"),
-        (Calibration("PINHOLE", 96, 64, (1.0, -5.0, 1.0, 1.0)), "focal length is not positive"),
+        (Calibration("PINHOLE", 0, 64, (1.0, 1.0, 1.0, 1.0)), "the image size of a camera is zero"),
+        (
+            Calibration("PINHOLE", 96, 64, (0.0, 1.0, 1.0, 1.0)),
+            "focal length of a camera is not positive",
+        ),
+        (Calibration("EQUIRECTANGULAR", 96, 48, (96.0, 48.0)), "converted to a pinhole camera"),
+        (
+            Calibration("PINHOLE", 96, 64, (1.0, -5.0, 1.0, 1.0)),
+            "focal length of a camera is not positive",
+        ),
         (Calibration("PINHOLE", 96, 64, (math.nan, 1.0, 1.0, 1.0)), "not a finite number"),
         (Calibration("PINHOLE", 96, 64, (1.0, 1.0, math.inf, 1.0)), "not a finite number"),
     ],

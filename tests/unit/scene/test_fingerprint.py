@@ -63,8 +63,8 @@ def test_a_missing_photo_that_shifts_the_split_is_reported(scene):
     assert {weight for weight, _ in found} == {Weight.PLACE}
     assert [text for _, text in found] == [
         "training photos missing: 1 (0002.png)",
-        "photos held out that were trained on: 1 (0009.png)",
-        "photos trained on that were held out: 1 (0008.png)",
+        "photos that were training photos and are now held out: 1 (0009.png)",
+        "photos that were held out and are now training photos: 1 (0008.png)",
     ]
 
 
@@ -105,17 +105,17 @@ def test_changed_new_and_missing_masks_are_reported(scene, change):
         name = "0003.png" if change == "changed" else "0004.png"
         Image.new("L", (48, 32), 254).save(scene / "masks" / name)
     name = "0004.png" if change == "new" else "0003.png"
-    text = f"masks changed, new or missing: 1 ({name})"
+    text = f"masks that were changed, added or removed: 1 ({name})"
     assert told(scene, was) == [(Weight.CONTENT, text)]
 
 
 @pytest.mark.parametrize(
     ("other", "text"),
     [
-        ({"scale": 2.0}, "its unit is 5.46405 input units instead of 2.73202"),
+        ({"scale": 2.0}, "its unit is 5.46405 input units (before: 2.73202)"),
         ({"offset": (1.0, 0.0, 0.0)}, "its origin moved by 1"),
-        ({"width": 24, "height": 16}, "photos of another size, camera or pose: 10 (0000.png"),
-        ({"points": 150}, "other SfM points (150; there were 200)"),
+        ({"width": 24, "height": 16}, "photos with another size, camera or pose: 10 (0000.png"),
+        ({"points": 150}, "other SfM points (150; before: 200)"),
     ],
 )
 def test_another_reconstruction_is_reported(pristine, tmp_path, other, text):
@@ -131,7 +131,8 @@ def test_another_scene_in_the_same_folder_is_reported(pristine, tmp_path):
     write_tiny_scene(tmp_path / "other", views=10, seed=1)
     found = told(tmp_path / "other", taken(pristine))
     assert [text.partition(":")[0] for _, text in found] == [
-        "other SfM points (200; there were 200)", "photos changed", "masks changed, new or missing",
+        "other SfM points (200; before: 200)", "photos changed",
+        "masks that were changed, added or removed",
     ]  # fmt: skip
 
 
@@ -192,7 +193,7 @@ def test_a_run_without_a_readable_fingerprint_is_resumed_with_a_note(tmp_path, c
         (tmp_path / FILE).write_text(content, errors="surrogateescape")
     now = fingerprint_of(sample_scene(), Path())
     assert check_scene(tmp_path, now, Weight.CONTENT, accept=False) == ()
-    assert "cannot be told" in caplog.text and str(tmp_path) in caplog.text
+    assert "it is not known" in caplog.text and str(tmp_path) in caplog.text
 
 
 VIEW = next(iter(fingerprint_of(sample_scene(), Path()).views.values()))

@@ -106,7 +106,7 @@ def test_a_mask_may_be_smaller_than_its_photo(jpegs, tmp_path, small_limit):
     shutil.copytree(jpegs, scene)
     (scene / "masks").mkdir()
     Image.new("L", (192, 128), 255).save(scene / "masks/0000.jpg.png")
-    with pytest.raises(UserError, match=r"mask is too large(?s:.*)save it smaller"):
+    with pytest.raises(UserError, match=r"mask is too large(?s:.*)save the mask at a smaller size"):
         read(scene, max_size=90)
 
 

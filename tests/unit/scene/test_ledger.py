@@ -44,8 +44,8 @@ def test_a_plain_scene_has_no_unused_files(scene):
 @pytest.mark.parametrize(
     ("folder", "reason"),
     [
-        ("mask", "named like masks; use them with --set data.masks=FOLDER"),
-        ("alpha_masks", "named like masks"),
+        ("mask", "files whose names look like masks; use them with --set data.masks=FOLDER"),
+        ("alpha_masks", "look like masks"),
         ("depth", "depth and normal maps are not used"),
         ("images_2", "smaller copies of the photos"),
         ("input", "outside the photo folder images/"),
@@ -63,8 +63,8 @@ def test_folders_of_images_are_listed_as_unused_with_the_reason(folder, reason, 
     [
         ("sparse/0/points3D.ply", "the scene has its own points; start from such a file with"),
         ("cloud.LAZ", "--points FILE"),
-        ("gps.csv", "not a table that the reader takes"),
-        ("raw/0001.CR2", "a camera's own format; save the photos as JPEG or PNG"),
+        ("gps.csv", "the reader does not read this table"),
+        ("raw/0001.CR2", "raw files of a camera; save the photos as JPEG or PNG"),
         ("depth/0001.npy", "depth and normal maps"),
         ("maps/0001.exr", "depth and normal maps"),
     ],
@@ -80,8 +80,8 @@ def test_masks_without_a_photo_and_photos_without_a_mask_are_named(scene):
     copy(scene, "masks")
     (scene / "masks" / "0001.png").rename(scene / "masks" / "other.png")
     notes = read(scene).notes
-    assert "masks: 1 of 3 have none, all of their pixels count: 0001.png" in notes
-    assert "unused: 1 file in masks/ (other.png), masks of no photo that is used" in notes
+    assert "masks: 1 of 3 have none, and all their pixels are used: 0001.png" in notes
+    assert "unused: 1 file in masks/ (other.png), masks without a used photo" in notes
 
 
 def test_used_files_are_not_listed_as_unused(scene):

@@ -135,7 +135,8 @@ def test_the_loss_of_undistortion_is_reported_for_a_fisheye_of_190_degrees() -> 
     assert cost.lost == pytest.approx(1.0 - shown.mean(), abs=0.01)
     notes = note_undistortion({"a.png": source(Path("a.png"), calibration)})
     assert any(
-        "1 photo sees 191 degrees across; undistortion keeps 118 of these and loses 62 %" in note
+        "1 photo has a field of view of 191 degrees; undistortion keeps 118 degrees and loses 62 %"
+        in note
         for note in notes
     )
 
@@ -166,7 +167,7 @@ def test_a_decoded_photo_is_masked_beyond_the_fold_and_a_note_counts_the_pixels(
     assert mask is not None
     assert (image[mask] == 40).all()
     share = 100.0 * (1.0 - mask.numpy().mean())
-    note = next(n for n in note_undistortion({"a.png": photo}) if "folds over" in n)
+    note = next(n for n in note_undistortion({"a.png": photo}) if "not invertible" in n)
     assert "SIMPLE_RADIAL" in note
     assert f"{share:.0f} % of the undistorted pixels" in note
 

@@ -59,9 +59,9 @@ def test_the_default_folder_may_be_written_in_capitals(tmp_path):
 
 def test_a_mask_folder_without_matches_is_refused_unless_it_is_the_empty_default(tmp_path):
     check_masks(tmp_path, None, 0, ["p0.png"])
-    with pytest.raises(UserError, match="no photo has a mask"):
+    with pytest.raises(UserError, match="no mask for any photo"):
         check_masks(tmp_path, Path("masks"), 0, ["p0.png"])
     (tmp_path / "other.png").touch()
-    with pytest.raises(UserError, match="no photo has a mask") as caught:
+    with pytest.raises(UserError, match="no mask for any photo") as caught:
         check_masks(tmp_path, None, 0, ["p0.jpg"])
     assert "p0_mask.png" in caught.value.expected and caught.value.found == "other.png"

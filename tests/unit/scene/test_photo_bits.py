@@ -88,6 +88,6 @@ def test_a_scene_of_12_bit_photos_is_read_at_the_right_brightness(tmp_path):
         grey[0, 0] = 255
         Image.fromarray(grey * 16).save(photo)
     scene = read(path)
-    assert "hold 12-bit values (up to 4080)" in " ".join(scene.notes)
+    assert "contain 12-bit values (up to 4080)" in " ".join(scene.notes)
     after = [float(view.photo.image().float().mean()) for view in scene.views]
     assert after == pytest.approx(before, abs=25)

@@ -135,7 +135,7 @@ def test_a_cloud_in_another_frame_is_refused_whether_named_or_found(scene):
 
 
 def test_a_missing_file_is_named(scene):
-    with pytest.raises(UserError, match=r"the file of points is not there(?s:.*)gone\.ply"):
+    with pytest.raises(UserError, match=r"the point file does not exist(?s:.*)gone\.ply"):
         read(scene, points=Path("gone.ply"))
 
 

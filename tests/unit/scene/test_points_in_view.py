@@ -49,12 +49,12 @@ def test_points_visible_in_photos_are_accepted(points):
     ],
 )
 def test_a_known_mistake_in_the_poses_is_named(points, change, cause):
-    with pytest.raises(UserError, match="the points lie in no photo") as caught:
+    with pytest.raises(UserError, match="no photo shows the SfM points") as caught:
         check_seen(points, views(change), "poses.json")
     assert cause in caught.value.what and "correct the poses" in caught.value.todo
 
 
 def test_points_in_another_frame_are_distinguished_from_mistakes_in_the_poses(points):
     far = PointCloud(points.positions + 1000.0, points.colors, points.source)
-    with pytest.raises(UserError, match="another frame than the cameras"):
+    with pytest.raises(UserError, match="another coordinate system than the cameras"):
         check_seen(far, views(lambda pose: pose), "poses.json")

@@ -194,7 +194,7 @@ def test_photos_that_disagree_are_named_in_a_note_and_in_the_results(tmp_path, c
     (note,) = (note for note in scene.notes if note.startswith("check:"))
     assert "0003.png, 0007.png" in note
     assert note in caplog.text
-    assert scene.check["verdict"] == "some photos disagree"
+    assert scene.check["verdict"] == "some photos do not match"
     assert scene.check["disagreeing"] == ["0003.png", "0007.png"]
 
 
@@ -215,13 +215,13 @@ def test_photos_that_cannot_be_decoded_are_named_and_left_out(tmp_path, damaged)
 
 def test_a_contradictory_scene_is_refused_unless_the_user_accepts_it(contradictions, model):
     wrong = contradictions.KINDS["OpenGL axes"](model, np.random.default_rng(0)).model.scene()
-    with pytest.raises(UserError, match="the scene contradicts itself") as error:
+    with pytest.raises(UserError, match="do not match its poses and points") as error:
         checked(wrong, Path("scene"), cache_mib=1280)
     assert "OpenGL axes" in error.value.found
     assert "--accept-scene" in error.value.todo
     accepted = checked(wrong, Path("scene"), cache_mib=1280, accept=True)
     assert any("OpenGL axes" in note for note in accepted.notes)
-    assert accepted.check["verdict"] == "the scene disagrees"
+    assert accepted.check["verdict"] == "points, poses and photos do not match"
 
 
 def test_evenly_spread_photos_of_a_very_large_scene_are_checked(model):
@@ -245,9 +245,9 @@ def test_equal_poses_equal_photos_and_points_at_infinity_are_noted(model):
     odd = replace(model, photos=photos, seen=seen, points=points, colors=colors)
     scene = checked(odd.posed(rotations, centers).scene(), Path("scene"), cache_mib=1280)
     notes = " | ".join(note for note in scene.notes if note.startswith("check:"))
-    assert "1 photo with the pose of another one: 0002.png" in notes
+    assert "1 photo with the same pose as another photo: 0002.png" in notes
     assert "almost equal: 0001.png and 0002.png" in notes
-    assert "1 point practically at infinity" in notes
+    assert "1 point extremely far away" in notes
 
 
 def test_dark_and_blurred_photos_are_noted(model):

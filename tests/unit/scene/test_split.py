@@ -121,8 +121,8 @@ def test_view_lists_define_the_split_unless_a_method_is_given(tmp_path):
     result = split(NAMES, tmp_path)
     assert (result.train, result.test) == (("03.jpg", "04.jpg"), ("05.jpg",))
     notes = "\n".join(result.notes)
-    assert "1 listed names have no posed photo: 99.jpg" in notes
-    assert "25 views in no list left out: 00.jpg, 01.jpg, 02.jpg and 22 more" in notes
+    assert "1 listed names have no photo with a pose: 99.jpg" in notes
+    assert "25 views left out (in no list): 00.jpg, 01.jpg, 02.jpg and 22 more" in notes
     assert len(split(NAMES, tmp_path, split="every").test) == 4
 
 
@@ -146,12 +146,12 @@ def test_a_split_given_by_the_input_is_kept(tmp_path):
 def test_names_in_both_lists_are_refused(tmp_path):
     for name in ("train_list.txt", "test_list.txt"):
         (tmp_path / name).write_text("05.jpg\n")
-    with pytest.raises(UserError, match=r"for training and for testing(?s:.*)05\.jpg"):
+    with pytest.raises(UserError, match=r"for both training and testing(?s:.*)05\.jpg"):
         split(NAMES, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "5.jpg\n"])
 def test_lists_without_a_training_view_are_refused(text, tmp_path):
     (tmp_path / "train_list.txt").write_text(text)
-    with pytest.raises(UserError, match="no listed view can be trained on"):
+    with pytest.raises(UserError, match="no listed view can be used for training"):
         split(NAMES, tmp_path)

@@ -40,5 +40,5 @@ def test_plan_also_names_a_regime_without_held_out_photos(scene, capsys, monkeyp
     monkeypatch.setenv("COLUMNS", "200")
     assert ended("plan", scene) == 0
     (row,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("held out")]
-    assert "how good aerial gets" in row
+    assert "the quality of aerial" in row
     assert "--split stratified" in row

@@ -66,8 +66,8 @@ def test_the_best_grid_contains_each_arm_as_given_and_at_its_best_value(swept, t
     }
     assert yaml.safe_load(path.read_text())["base"] == {"steps": 9}
     assert notes == [
-        "beach, one: the best rate_factor is 2, at the end of its values",
-        "town, two: the best rate_factor is 0.5, at the end of its values",
+        "beach, one: the best rate_factor is 2, the smallest or largest of its values",
+        "town, two: the best rate_factor is 0.5, the smallest or largest of its values",
     ]
 
 
@@ -109,14 +109,14 @@ def test_values_are_compared_on_the_same_seeds(swept, tmp_path):
         gone = with_ends(swept, {("one, rate_factor=0.5", "town", 2): end})
         content, notes = best_grid(*gone, tmp_path)
         assert content["arms"][1]["by_scene"]["town"] == {"rate_factor": 1}
-        assert notes[0].startswith("town, one, rate_factor=0.5: not among the candidates")
+        assert notes[0].startswith("town, one, rate_factor=0.5: not a candidate")
         assert notes[0].endswith("with seed 2")
 
 
 def test_choosing_the_best_value_fails_if_all_runs_failed(swept, tmp_path):
     labels = [f"two, rate_factor={factor}" for factor in (0.5, 1, 2)]
     gone = with_ends(swept, {(label, "beach", 4): "failed" for label in labels})
-    with pytest.raises(UserError, match="no parameters can be chosen") as error:
+    with pytest.raises(UserError, match="best parameters cannot be chosen") as error:
         best_grid(*gone, tmp_path)
     assert error.value.where == "beach, arm two"
 
@@ -126,7 +126,7 @@ def test_an_existing_best_grid_file_is_not_overwritten(tmp_path):
     path, best = tmp_path / "grid.yaml", tmp_path / "best.yaml"
     path.write_text(f"scenes: [{scene}]\nbase: {{steps: 9}}\n")
     best.write_text("mine")
-    with pytest.raises(UserError, match="the file is there already"):
+    with pytest.raises(UserError, match="the output file already exists"):
         Sweep(Request(path, out=tmp_path / "out"), read_only=True).write_best(best)
     assert best.read_text() == "mine"
 
@@ -205,7 +205,7 @@ def test_a_grid_without_varied_parameters_has_no_best_grid(tmp_path):
     grid = read_grid(path)
     jobs = [Job(each.label, each.label, "town", 0, {}) for each in choices(grid)]
     standings = [Standing(j, "finished", summary={"overall": {"psnr": 20.0}}) for j in jobs]
-    with pytest.raises(UserError, match="nothing varies"):
+    with pytest.raises(UserError, match="several values to choose from"):
         best_grid(grid, jobs, standings, tmp_path)
 
 
@@ -217,5 +217,5 @@ def test_an_arm_without_varied_parameters_must_also_be_finished(swept, tmp_path)
         Job(f"p{n}", "plain, rate_factor=1", n, s, {}) for n in ("town", "beach") for s in (4, 2)
     ]
     left = [Standing(job, "left") for job in jobs]
-    with pytest.raises(UserError, match="not known yet"):
+    with pytest.raises(UserError, match="before all runs have finished"):
         best_grid(grid, [*cells, *jobs], [*standings, *left], tmp_path)

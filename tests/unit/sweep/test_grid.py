@@ -86,28 +86,28 @@ def test_replaced_scenes_keep_the_settings_for_scenes_with_their_name(tmp_path):
 #: Grid, what the error says of it.
 WRONG = {
     "sceens: [a]": "did you mean 'scenes'?",
-    "steps: 30": "settings go below base",
+    "steps: 30": "put settings below base",
     "method: bayes": "method: ",
-    "parameters: {rate: {min: 0, max: 1}}": "nothing is drawn from distributions (max, min)",
+    "parameters: {rate: {min: 0, max: 1}}": "distributions (max, min) are not supported",
     "parameters: {rate: [1, 2]}": "must be `values: [...]`",
     "parameters: {rate: {values: []}}": "parameters.rate.values: should not be empty, not []",
     "parameters: {rate: {values: sum}}": "parameters.rate.values: should be a list, not 'sum'",
-    "name: ../esc": "name: is the name of a folder below runs/sweeps",
-    "name: ..": "name: is the name of a folder",
-    "name: ''": "name: is the name of a folder",
+    "name: ../esc": "name: must be the name of a folder below runs/sweeps",
+    "name: ..": "name: must be the name of a folder",
+    "name: ''": "name: must be the name of a folder",
     "parameters: {rate: {values: [1], value: 2}}": "exactly one of",
-    "base: {out: x}": "base.out: is not for a grid to set",
-    "base: {threads: 2}": "say --threads",
+    "base: {out: x}": "base.out: cannot be set by a grid",
+    "base: {threads: 2}": "use --threads",
     "parameters: {stop_after: {value: 3}}": "parameters.stop_after",
     "arms: [{name: a, settings: {seed: 1}}]": "list it in seeds",
     "base: {scene: x}": "list it in scenes",
     "arms: [{settings: {}}]": "arms.0.name",
-    "arms: [{name: a}, {name: a}]": "two are named 'a'",
+    "arms: [{name: a}, {name: a}]": "two entries have the name 'a'",
     "seeds: [1, 1]": "twice",
     "seeds: [-1]": "seeds.0",
-    "scenes: [x/a, y/a]": "two are named 'a'",
+    "scenes: [x/a, y/a]": "two entries have the name 'a'",
     "scenes: [town]\narms: [{name: a, by_scene: {towm: {}}}]": "did you mean 'town'?",
-    "seeds: [1]\nparameters: {seed: {values: [1]}}": "must be said once",
+    "seeds: [1]\nparameters: {seed: {values: [1]}}": "may be given only once",
 }
 
 
@@ -127,7 +127,7 @@ def test_a_list_with_only_invalid_entries_gives_one_error(tmp_path):
 
 def test_all_errors_of_a_grid_are_reported_at_once(tmp_path):
     text = "base: {out: x, threads: 1}\nseeds: [1, 1]\narms: [{name: a}, {name: a}]"
-    with pytest.raises(UserError, match="4 things are wrong"):
+    with pytest.raises(UserError, match="the grid has 4 errors"):
         read_grid(written(tmp_path, text))
 
 
@@ -149,12 +149,12 @@ def test_lpips_is_minimized_by_default(tmp_path, metric, goal):
     [
         (("--set", "seed=7"), "say --seed"),
         (("--set", "scene=there"), "say --scene"),
-        (("--set", "stop_after=2"), "to their ends"),
-        (("--set", " threads =2"), "say --threads"),
+        (("--set", "stop_after=2"), "to its end"),
+        (("--set", " threads =2"), "use --threads"),
         (("--set", "out=there"), "--set out"),
-        (("--seed", "3", "--seed", "3"), "a seed stands there twice"),
-        (("--list", "--best", "best.yaml"), "--list and --best do not go together"),
-        (("--dry-run", "--list"), "--dry-run and --list do not go together"),
+        (("--seed", "3", "--seed", "3"), "a seed is listed twice"),
+        (("--list", "--best", "best.yaml"), "--list and --best cannot be combined"),
+        (("--dry-run", "--list"), "--dry-run and --list cannot be combined"),
     ],
     ids=lambda case: " ".join(case) if isinstance(case, tuple) else "",
 )
@@ -192,5 +192,5 @@ def test_a_small_grid_file_with_too_many_runs_is_refused(tmp_path):
 def test_two_configurations_with_the_same_name_are_refused(tmp_path, text):
     path = tmp_path / "grid.yaml"
     path.write_text(text)
-    with pytest.raises(UserError, match="two configurations are called"):
+    with pytest.raises(UserError, match="two configurations have the name"):
         read_grid(path)

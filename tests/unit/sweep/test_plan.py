@@ -116,11 +116,11 @@ def test_all_errors_are_reported_at_once(scene, tmp_path):
     assert "opertor" in text and "'epoc'" in text and "cagrad" in text and "'vanila'" in text
     assert "tiny, pair: " in text and "tiny, nothing: " in text and "nowhere" in text
     assert "name; two: there is no sampler" in text
-    assert "8 things are wrong" in text and "99 different views" in text
+    assert "the grid has 8 errors" in text and "99 different views" in text
 
 
 def test_an_error_of_all_configurations_is_reported_once(scene, tmp_path):
-    with pytest.raises(UserError, match="something is wrong") as caught:
+    with pytest.raises(UserError, match="has an error") as caught:
         plan(
             tmp_path,
             scenes=[str(scene)],

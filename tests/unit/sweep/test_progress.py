@@ -84,7 +84,7 @@ def test_run_times_are_estimated_from_similar_runs(sweep):
     assert [each.seconds for each in found] == [20.0, 20.0, 50.0, 0.0, 72.0]
     assert [each.unknown for each in found] == [0, 0, 0, 1, 0]
     total = estimated(jobs, of, records)
-    assert total.text(2) == "about 81 s and 1 run of which nothing is known yet"
+    assert total.text(2) == "about 81 s; the time of 1 run is not known yet"
 
 
 def test_the_estimate_of_a_sweep_is_at_least_its_longest_run(sweep):
@@ -120,7 +120,7 @@ def test_a_metric_that_no_run_has_is_reported_with_the_available_metrics():
     jobs, overall = JOBS[:2], {"psnr": 20.0, "lpips": None, "ssim": 0.5}
     found = [Standing(job, "finished", summary={"overall": overall}) for job in jobs]
     told = list(table(jobs, found, Metric(name="psnr_street")))[-1]
-    assert told.startswith("no finished run has psnr_street; they have psnr, ssim")
+    assert told.startswith("no finished run has psnr_street; the runs have psnr, ssim")
     waiting = [Standing(job, "waiting") for job in jobs]
     assert "no finished run" not in "".join(table(jobs, waiting, Metric(name="psnr_street")))
 
@@ -141,7 +141,7 @@ def test_the_plan_keeps_earlier_runs_of_the_folder(tmp_path):
 def test_a_foreign_table_with_the_name_of_the_plan_is_not_overwritten(tmp_path):
     layout = Layout(tmp_path)
     layout.plan.write_text("arm,scene\nmine,city\n")
-    with pytest.raises(UserError, match="none that a sweep wrote"):
+    with pytest.raises(UserError, match="not written by a sweep"):
         write_plan(layout, JOBS[:2])
     assert layout.plan.read_text() == "arm,scene\nmine,city\n"
 

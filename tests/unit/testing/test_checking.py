@@ -61,9 +61,12 @@ def failures(slot, name, distribution="made-up-check"):
 def test_a_component_name_of_another_package_fails_the_check(installed):
     installed(SAMPLER, samplers={"epoch": "made_up_check:Fixed", "made-up": "made_up_check:Fixed"})
     found = failures("samplers", "epoch")
-    assert "2 installed packages offer a sampler named 'epoch'" in found["its name is free"]
-    assert "crossgrad " in found["its name is free"]
-    rest = {check for check in found if check != "its name is free"}
+    assert (
+        "2 installed packages offer a sampler named 'epoch'"
+        in found["its name is not used by another plugin"]
+    )
+    assert "crossgrad " in found["its name is not used by another plugin"]
+    rest = {check for check in found if check != "its name is not used by another plugin"}
     assert rest == failures("samplers", "made-up").keys()
 
 
@@ -71,7 +74,8 @@ def test_a_command_name_of_the_core_fails_the_check(installed):
     source = 'def run():\n    """Runs."""\n'
     installed(source, commands={"run": "made_up_check:run"})
     assert failures("commands", "run") == {
-        "its name is free": "the core has a command run, which is called instead"
+        "its name is not used by another plugin": "the core has a command run, "
+        "which is called instead"
     }
 
 
@@ -85,7 +89,7 @@ def test_a_plugin_that_calls_exit_fails_its_checks(installed):
 def test_a_plugin_that_calls_exit_on_creation_fails_the_first_check(installed):
     installed(SAMPLER, samplers={"ends": "made_up_check:EndsWhenMade"})
     found = failures("samplers", "ends")
-    assert found == {"it can be made with default options": "SystemExit: 0"}
+    assert found == {"it can be created with default options": "SystemExit: 0"}
 
 
 @pytest.mark.parametrize("kind", ["Misspelt", "Ends"])

@@ -71,7 +71,7 @@ class OneBand(Fainter):
         (exporters.writes_the_input_frame, LocalFrame, "another offset"),
         (exporters.writes_the_input_frame, OffsetAlone, "another scale"),
         (exporters.appears_at_once, InPlace, "in place"),
-        (exporters.what_it_writes_is_read_again, ReadsTheInputFrame, "gives means"),
+        (exporters.what_it_writes_is_read_again, ReadsTheInputFrame, "returns means"),
         (backbones.plain_ones_bake_what_they_draw, Fainter, "plain is True"),
         (backbones.plain_ones_bake_what_they_draw, OneBand, "plain is True"),
     ],

@@ -90,13 +90,17 @@ class RepeatsOne(NoDensification):
     ("check", "make", "words"),
     [
         (samplers.draws_hand_on_the_groups, Unlabelled, "a ViewSample without labels"),
-        (samplers.states_stay_bounded, Hoards, "that sample returns grows for ever"),
-        (resolutions.states_stay_bounded, HoardsScales, "that scales returns grows for ever"),
-        (densifiers.states_stay_bounded, HoardsEdits, "that densify returns grows for ever"),
-        (aggregation.states_stay_bounded, HoardsWeights, "that aggregate returns grows for ever"),
+        (samplers.states_stay_bounded, Hoards, "that sample returns grows without limit"),
+        (resolutions.states_stay_bounded, HoardsScales, "that scales returns grows without limit"),
+        (densifiers.states_stay_bounded, HoardsEdits, "that densify returns grows without limit"),
+        (
+            aggregation.states_stay_bounded,
+            HoardsWeights,
+            "that aggregate returns grows without limit",
+        ),
         (operators.views_that_are_alike_count_alike, FirstCountsTwice, r"weights \[2.0, 1.0\]"),
-        (densifiers.most_primitives_survive, LeavesOne, "keeps 1 of 40 primitives"),
-        (densifiers.most_primitives_survive, RepeatsOne, "keeps 1 of 40 primitives"),
+        (densifiers.most_primitives_survive, LeavesOne, "keeps 1 of 40 Gaussians"),
+        (densifiers.most_primitives_survive, RepeatsOne, "keeps 1 of 40 Gaussians"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )

@@ -182,7 +182,7 @@ def test_a_derived_backbone_has_no_axes_unless_it_declares_them():
     assert axes_of(with_backbone(Vanilla())) == ("means", "scales", "quats")
     assert axes_of(with_backbone(Round())) is None
     first_state(with_backbone(Round()))
-    with pytest.raises(UserError, match="are none of Gaussians") as caught:
+    with pytest.raises(UserError, match="do not have the shapes of Gaussians") as caught:
         first_state(with_backbone(RoundWithAxes()))
     assert "(40, 1)" in caught.value.found
 
@@ -242,7 +242,7 @@ def test_a_step_moves_positions_along_the_axes(backbone):
 def test_per_axis_steps_are_refused_for_a_backbone_without_axes(backbone):
     setup = setup_of(backbone)
     config = setup.config.model_copy(update={"position_lr": "per-axis"})
-    with pytest.raises(UserError, match="no Gaussians with axes"):
+    with pytest.raises(UserError, match="does not train Gaussians with axes"):
         refuse_settings_for_nothing(config, setup)
 
 
@@ -259,5 +259,5 @@ def test_a_setting_missing_in_a_checkpoint_counts_as_unchanged():
     with pytest.raises(UserError, match=r"grouping\.name"):
         check_settings(given, checkpoint)
     stored["seed"] = 5
-    with pytest.raises(UserError, match=r"config\.yaml was changed"):
+    with pytest.raises(UserError, match=r"settings in config\.yaml have changed"):
         check_settings(config, checkpoint)

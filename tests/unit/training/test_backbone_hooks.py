@@ -127,4 +127,4 @@ def test_a_rasterizer_without_the_pixel_response_is_refused(assembled):
     assembled(backbone="an", rasterizer="torch")
     with pytest.raises(IncompatibleSelectionError) as caught:
         assembled(backbone="an", rasterizer="plain")
-    assert "does not draw the pixel response analytic" in caught.value.found
+    assert "does not support the pixel response analytic" in caught.value.found

@@ -234,7 +234,8 @@ def test_a_time_budget_is_met_even_if_the_probe_was_wrong(planned, cost):
     assert run.schedule.total == run.schedule.lr_until
     assert run.notes == (
         "a note on the scene",
-        f"the length followed the clock: {run.schedule.total} steps instead of {planned}",
+        "the number of steps was adapted to the time budget: "
+        f"{run.schedule.total} steps instead of {planned}",
     )
 
 
@@ -288,10 +289,16 @@ def test_notes_that_a_new_length_makes_wrong_are_withdrawn():
     assert len(growth_notes(run)) == 1
     longer = with_length(run, 100, 3000)
     assert growth_notes(longer) == []
-    assert longer.notes[-1] == "the length followed the clock: 3000 steps instead of 935"
+    assert (
+        longer.notes[-1]
+        == "the number of steps was adapted to the time budget: 3000 steps instead of 935"
+    )
     shorter = with_length(longer, 200, 900)
     assert growth_notes(shorter) == list(growth_note(shorter)) != []
-    assert shorter.notes[-1] == "the length followed the clock: 900 steps instead of 935"
+    assert (
+        shorter.notes[-1]
+        == "the number of steps was adapted to the time budget: 900 steps instead of 935"
+    )
     back = with_length(shorter, 300, 935)
     assert back.notes == run.notes
 
@@ -306,7 +313,10 @@ def test_a_note_reports_once_that_density_control_becomes_active(length):
             run = length.revised(run, state)
     assert growth_notes(run) == []
     (text,) = run.hook.texts
-    assert text.startswith("density control after all: in ") and "from step 500 to step" in text
+    assert (
+        text.startswith("density control is used after all: in ")
+        and "from step 500 to step" in text
+    )
 
 
 def test_a_note_reports_that_a_shorter_length_disables_density_control():
@@ -318,7 +328,7 @@ def test_a_note_reports_that_a_shorter_length_disables_density_control():
 def test_the_note_on_density_control_names_no_step_after_the_end():
     run = noted(setup(steps=550, mode="absolute"))
     Planned(((20, 700),)).revised(run, reached(20))
-    assert run.hook.texts[0].endswith("in 700 steps it lasts from step 500 to step 700")
+    assert run.hook.texts[0].endswith("in a run of 700 steps it acts from step 500 to step 700")
 
 
 #: Scales that grow, as far as a budget sees them: photos large enough for all of them.
@@ -414,4 +424,4 @@ def test_the_note_on_scales_follows_the_current_length():
 
 def octaves_note(quarter, half):
     scales = f"1/4 to step {quarter}, 1/2 from step {quarter + 1}, full size from step {half + 1}"
-    return f"resolution: {scales}; no side is below 96 pixels"
+    return f"resolution: {scales}; no side has fewer than 96 pixels"

@@ -65,7 +65,9 @@ def test_a_gpu_is_selected_if_a_rasterizer_works_and_the_trial_runs_once(on_a_gp
     with caplog.at_level(logging.INFO, "crossgrad_core"):
         device, notes = device_of()
     assert device == "cuda"
-    assert notes == (f"device cuda: rasterizer gswarp works on {GPU} (or --device cpu)",)
+    assert notes == (
+        f"device cuda: rasterizer gswarp works on {GPU} (use --device cpu to avoid it)",
+    )
     assert tried.devices == ["cuda"]
     assert "trying rasterizer gswarp on the GPU" in caplog.text
 
@@ -100,9 +102,12 @@ def test_the_cpu_is_used_if_the_gpu_rasterizer_does_not_work(on_a_gpu, error, wh
     [
         ({"rasterizer": {"name": "numba"}}, "because rasterizer numba does not run on it"),
         ({"rasterizer": {"name": "gsplat"}}, "pip install 'crossgrad[gsplat]'"),
-        ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count what a GPU does"),
-        ({"backbone": {"name": "analytic"}}, "rasterizer gswarp left out: this run needs analytic"),
-        ({"densifier": {"name": "absgrad"}}, "gswarp left out: this run needs abs_gradient"),
+        ({"seconds": 9.0, "clock": "cpu"}, "because --clock cpu does not count the time of a GPU"),
+        (
+            {"backbone": {"name": "analytic"}},
+            "rasterizer gswarp is not used: this run needs analytic",
+        ),
+        ({"densifier": {"name": "absgrad"}}, "gswarp is not used: this run needs abs_gradient"),
     ],
     ids=str,
 )

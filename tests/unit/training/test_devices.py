@@ -23,10 +23,10 @@ def build(monkeypatch):
 @pytest.mark.parametrize(
     ("cuda", "devices", "name", "found", "todo"),
     [
-        (None, 0, "cuda", "a build for CPUs only", "install a CUDA build of torch"),
-        ("12.4", 0, "cuda", "a build for CUDA 12.4, but no GPU", "nvidia-smi"),
-        ("12.4", 0, "cuda:1", "a build for CUDA 12.4, but no GPU", "nvidia-smi"),
-        ("12.4", 2, "cuda:2", "devices cuda:0 to cuda:1", "choose one of them"),
+        (None, 0, "cuda", "a build without CUDA", "install a CUDA build of torch"),
+        ("12.4", 0, "cuda", "a build for CUDA 12.4, but no usable GPU", "nvidia-smi"),
+        ("12.4", 0, "cuda:1", "a build for CUDA 12.4, but no usable GPU", "nvidia-smi"),
+        ("12.4", 2, "cuda:2", "devices cuda:0 to cuda:1", "choose one of these devices"),
     ],
 )
 def test_a_missing_device_is_reported_with_a_remedy(build, cuda, devices, name, found, todo):

@@ -77,19 +77,19 @@ def test_the_expected_duration_of_a_default_run_is_reported_once_with_a_remedy()
     ((step, text),) = texts(0.1, 30_000, wait=60.0)  # a slow first step is not taken for the rest
     hours = (30_000 - step) * 0.1 * (1.0 + COST_PER_EDIT * COUNTED_EDITS) / 3600
     assert 1.6 < hours < 1.7
-    assert f"{30_000 - step:,} more steps take about 100 min" in text
-    assert "one takes 100 ms now, growth included" in text and "--seconds S" in text
+    assert f"{30_000 - step:,} steps take about 100 min" in text
+    assert "one step takes 100 ms now, including growth" in text and "--seconds S" in text
 
 
 def test_the_expected_duration_without_density_control_includes_no_growth():
     ((step, text),) = texts(1.0, 30_000, "none")
     assert step == 1 + LOOK_STEPS
-    assert "29,996 more steps take about 8 h 20 min (one takes 1000 ms now)" in text
+    assert "the remaining 29,996 steps take about 8 h 20 min (one step takes 1000 ms now)" in text
 
 
 def test_a_resumed_run_reports_the_remaining_time():
     ((_, text),) = texts(1.0, 30_000, "none", first=29_000)
-    assert "996 more steps take about 17 min" in text
+    assert "the remaining 996 steps take about 17 min" in text
 
 
 def test_a_short_run_reports_no_expected_duration():

@@ -186,7 +186,7 @@ def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name,
     assert found[0] == pytest.approx(2 * bound / 3, abs=0.5 + about)
     assert found[-1] == bound == max(found)
     (told,) = start_notes(setup, first_state(setup))
-    assert f"{found[0]:,} primitives instead of {whole:,}" in told
+    assert f"{found[0]:,} Gaussians instead of {whole:,}" in told
     for enough in (whole, whole + 1, "auto", None):
         state = first_state(setup := setup_of(name, max_gaussians=enough))
         assert state.primitives(setup) == whole and start_notes(setup, state) == ()
@@ -195,7 +195,7 @@ def test_a_max_gaussians_below_the_number_of_points_leaves_room_for_growth(name,
 def test_a_ply_start_above_max_gaussians_is_reported():
     state = first_state(setup_of("adc"))
     (told,) = start_notes(setup_of("adc", max_gaussians=30), state)
-    assert "more than --max-gaussians 30: a PLY is taken as it is" in told
+    assert "more than --max-gaussians 30: a PLY is used unchanged" in told
 
 
 @pytest.mark.parametrize(

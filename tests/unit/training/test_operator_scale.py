@@ -162,7 +162,7 @@ def test_measuring_the_scale_does_not_change_the_step():
 
 
 def test_non_finite_weights_are_refused_with_the_operator():
-    with pytest.raises(UserError, match="Broken gave weights that are not finite"):
+    with pytest.raises(UserError, match="Broken returned weights that are not finite"):
         scale_of(Broken(), 2)
 
 

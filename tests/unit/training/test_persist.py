@@ -54,7 +54,7 @@ def test_frozen_integer_tensors_are_restored():
     ],
 )
 def test_a_checkpoint_of_another_run_gives_one_error(changes, found):
-    with pytest.raises(UserError, match="does not fit the run") as caught:
+    with pytest.raises(UserError, match="does not match the run") as caught:
         from_checkpoint(SETUP, replace(checkpoint(), **changes))
     assert found in caught.value.found
     assert caught.value.where

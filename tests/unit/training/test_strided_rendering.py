@@ -162,10 +162,10 @@ def test_stages_follow_the_size_of_the_photos(width, height, coarsest, scales, n
     assert found == [scale for count, scale in scales for _ in range(count)]
     (remark,) = resolution.messages(schedule)
     if note is None:
-        assert "all pixels from the start, as resolution.coarsest is 1" in remark
+        assert "all pixels from the start, because resolution.coarsest is 1" in remark
         assert "fewer than 240,000 pixels or with a side of fewer than 192" in remark
     else:
-        assert f"one pixel of each {note}, in each step another one; then all" in remark
+        assert f"one pixel of each {note}, another one in each step; then all pixels" in remark
     pixels = sum(count * scale**2 for count, scale in scales)
     assert resolution.pixels(schedule, 200) == pytest.approx(pixels)
 
@@ -180,7 +180,7 @@ def test_longer_runs_reach_all_pixels_earlier(steps, share):
     assert resolution.window(schedule) == pytest.approx(share * steps, abs=2e-4 * steps)
     assert resolution.pixels(schedule, steps) == pytest.approx((1 - 0.75 * share) * steps, rel=1e-3)
     (remark,) = resolution.messages(schedule)
-    assert ("all pixels from the start: the run is a long one" in remark) == (steps >= 30_000)
+    assert ("all pixels from the start: the run is long" in remark) == (steps >= 30_000)
     assert build("resolutions", "strided", {"until": 0.5}).window(schedule) == 0.5 * steps
 
 
@@ -237,7 +237,7 @@ def test_a_rasterizer_with_a_fixed_dilation_is_refused():
     gswarp, setup = build("rasterizers", "gswarp", {}), assembled()
     selection = replace(setup.selection, device="cuda", rasterizer=gswarp)
     told = gswarp.crossgrad_validate_selection(selection)
-    assert any("resolution strided by less" in each for each in told)
+    assert any("resolution strided needs less" in each for each in told)
 
 
 def assembled(**settings):
@@ -275,7 +275,7 @@ def test_rendered_pixels_are_photo_pixels_and_change_between_steps():
 
 
 def test_a_response_that_averages_over_pixels_is_refused():
-    with pytest.raises(UserError, match="is a mean over all of them"):
+    with pytest.raises(UserError, match="is a mean over all pixels"):
         assembled(backbone={"name": "analytic"})
 
 

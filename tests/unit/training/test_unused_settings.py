@@ -208,7 +208,7 @@ def test_max_gaussians_does_not_limit_a_ply_start(tmp_path):
     with pytest.raises(UserError) as caught:
         refusal({**settings, "densifier": {"name": "none"}})
     assert caught.value.where == "max_gaussians"
-    assert "a PLY is taken as it is" in caught.value.found
+    assert "a PLY is used unchanged" in caught.value.found
 
 
 @pytest.mark.parametrize("slot", ["backbones", "samplers", "operators", "rasterizers"])
@@ -230,13 +230,13 @@ def test_split_lists_make_test_every_unused(tmp_path):
 
 LABELS = [
     ({"operator": {"name": "anchors"}, "sampler": {"name": "near-far"}}, "near (operator.near)"),
-    ({"operator": {"name": "anchors"}, "sampler": {"name": "random"}}, "gives aerial, street"),
+    ({"operator": {"name": "anchors"}, "sampler": {"name": "random"}}, "makes aerial, street"),
     (
         {
             "operator": {"name": "dispatch", "rules": {"geometry": "anchors"}},
             "sampler": {"name": "near-far"},
         },
-        "operator anchors looks for",
+        "operator anchors needs views",
     ),
     ({"sampler": {"name": "three-way"}}, "3 groups"),
     ({"sampler": {"name": "anchors-30"}}, "near and far"),

@@ -73,7 +73,7 @@ def of_slot(slot, name, method, answer):
 )
 def test_a_result_without_its_state_is_reported_with_the_method(word, slot, name, method, answer):
     error = refused(setup_of({word: of_slot(slot, name, method, answer)}))
-    assert f"Wrong.{method} gave a wrong answer" in error.what
+    assert f"Wrong.{method} returned a value of a wrong type" in error.what
     assert __name__ in error.where
     assert error.expected.startswith("a pair: ")
 
@@ -81,20 +81,20 @@ def test_a_result_without_its_state_is_reported_with_the_method(word, slot, name
 @pytest.mark.parametrize("answer", [None, (1, 2)])
 def test_decode_must_return_gaussians(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "decode", answer)}))
-    assert "Wrong.decode gave a wrong answer" in error.what
+    assert "Wrong.decode returned a value of a wrong type" in error.what
     assert error.expected == "Gaussians"
 
 
 @pytest.mark.parametrize("answer", [None, 3, (1, 2)])
 def test_backbones_must_create_tensors(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
-    assert "Wrong.create gave a wrong answer" in error.what
+    assert "Wrong.create returned a value of a wrong type" in error.what
 
 
 @pytest.mark.parametrize("answer", [{}, {"moans": torch.zeros(3, 3)}, {"means": None}])
 def test_backbones_must_create_exactly_the_tensors_of_their_blocks(answer):
     error = refused(setup_of({"backbone": of_slot("backbones", "vanilla", "create", answer)}))
-    assert "Wrong.create makes other tensors than its blocks name" in error.what
+    assert "Wrong.create returned tensors with other names than its blocks use" in error.what
     assert error.expected == "means"
     assert error.found == (", ".join(n for n, t in answer.items() if t is not None) or "none")
 
@@ -102,7 +102,7 @@ def test_backbones_must_create_exactly_the_tensors_of_their_blocks(answer):
 def test_prepare_must_return_all_tensors_of_the_blocks():
     backbone = of_slot("backbones", "vanilla", "prepare", {"means": torch.zeros(3, 3)})
     error = refused(setup_of({"backbone": backbone}))
-    assert "Wrong.prepare makes other tensors" in error.what
+    assert "Wrong.prepare returned tensors with other names" in error.what
     assert error.expected.startswith("means, scales, quats")
 
 
@@ -125,7 +125,7 @@ def test_more_points_must_return_points(answer):
     error = refused(
         setup_of({"initializer": of_slot("initializers", "points", "more_points", answer)})
     )
-    assert "Wrong.more_points gave a wrong answer" in error.what
+    assert "Wrong.more_points returned a value of a wrong type" in error.what
     assert error.expected == "MorePoints"
 
 
@@ -146,14 +146,16 @@ def test_fitted_to_must_return_a_component_of_its_slot(monkeypatch, base, slot, 
         return wrong if kind is base else original(kind, choice)
 
     monkeypatch.setattr(selecting, "chosen", built)
-    with pytest.raises(UserError, match=r"Wrong\.fitted_to gave a wrong answer"):
+    with pytest.raises(UserError, match=r"Wrong\.fitted_to returned a value of a wrong type"):
         assemble(RunConfig(steps=10), sample_scene(), "none")
 
 
 @pytest.mark.parametrize("scales", ["a", (None,), ()])
 def test_scales_must_be_numbers(scales):
     wrong = of_slot("resolutions", "full", "scales", (scales, PluginState()))
-    assert refused(setup_of({"resolution": wrong})).what.startswith("the resolution does not give")
+    assert refused(setup_of({"resolution": wrong})).what.startswith(
+        "the resolution returned a wrong scale"
+    )
 
 
 @pytest.mark.parametrize("shape", [(2,), (6, 3), (5, 2), ()])
@@ -165,7 +167,7 @@ def test_weights_of_a_wrong_shape_are_reported_with_both_shapes(shape):
     setup = setup_of({"operator": Own()})
     assert len(setup.trained_blocks) == 6
     error = refused(setup)
-    assert error.what == "operator Own gave an array of a wrong shape"
+    assert error.what == "operator Own returned an array of a wrong shape"
     assert error.expected.startswith("[6, 1] weights")
     assert error.found == str(list(shape))
 
@@ -207,7 +209,7 @@ class Answers:
 )
 def test_a_wrong_hook_result_names_the_plugin(plugin):
     error = refused(setup_of(stranger=plugin))
-    assert "answers crossgrad_" in error.what
+    assert "for the hook crossgrad_" in error.what
     assert "stranger" in error.where
 
 
@@ -259,8 +261,8 @@ def test_the_reserved_names_are_the_state_names_of_the_core():
 @pytest.mark.parametrize(
     ("edit", "found"),
     [
-        (Edit(source=torch.arange(41)), "source leaves 0 to 39"),
-        (Edit(source=torch.tensor([-1])), "source leaves 0 to 39"),
+        (Edit(source=torch.arange(41)), "source contains indices outside 0 to 39"),
+        (Edit(source=torch.tensor([-1])), "source contains indices outside 0 to 39"),
         (Edit(source=torch.arange(40).int()), "not [M] of torch.int64"),
         (Edit(source=torch.tensor(3)), "[] of torch.int64, not [M]"),
         (Edit(source=[0, 1]), "builtins.list, not a tensor"),
@@ -268,10 +270,19 @@ def test_the_reserved_names_are_the_state_names_of_the_core():
         (Edit(source=torch.arange(3), fresh=torch.ones(3)), "fresh is [3] of torch.float32"),
         (Edit(values={"means": torch.zeros(40, 3)}), "Tensor, not Rows"),
         (Edit(values={"means": Rows(np.zeros((40, 3)))}), "not Rows of a tensor"),
-        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([40]))}), "rows leave 0 to 39"),
-        (Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([-1]))}), "rows leave 0 to 39"),
+        (
+            Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([40]))}),
+            "rows contain indices outside 0 to 39",
+        ),
+        (
+            Edit(values={"means": Rows(torch.zeros(1, 3), torch.tensor([-1]))}),
+            "rows contain indices outside 0 to 39",
+        ),
         (Edit(values={"means": Rows(torch.zeros(3), torch.ones(40).bool())}), "rows are [40] of"),
-        (Edit(source=torch.arange(3), fresh=torch.ones(4).bool()), "fresh has 4 rows of 3"),
+        (
+            Edit(source=torch.arange(3), fresh=torch.ones(4).bool()),
+            "fresh has 4 rows, but there are 3",
+        ),
         (Edit(values={"mean": Rows(torch.zeros(40, 3))}), "no tensor 'mean'"),
         (Edit(values={"means": Rows(torch.zeros(40, 2))}), "[40, 2], not [40, 3]"),
         (Edit(values={"means": Rows(torch.zeros(39, 3))}), "[39, 3], not [40, 3]"),
@@ -285,7 +296,7 @@ def test_an_edit_that_does_not_fit_is_reported_with_the_reason(edit, found):
     setup = setup_of(stranger=Answers(DensifyResult(edit)))
     state = first_state(setup)
     assert state.primitives(setup) == 40
-    with pytest.raises(UserError, match="does not fit the primitives") as caught:
+    with pytest.raises(UserError, match="does not match the Gaussians") as caught:
         take_step(setup, state)
     assert found in caught.value.found
 
@@ -331,7 +342,7 @@ def with_means(means):
 )
 def test_aggregated_gradients_must_fit_the_parameters(plugin, found):
     error = refused(setup_of(wrapping=plugin))
-    assert error.what == "the aggregated gradients do not fit the parameters"
+    assert error.what == "the aggregated gradients do not match the parameters"
     assert "operator sum" in error.where
     assert found in error.found
 
@@ -355,7 +366,7 @@ def labelled(labels):
 @pytest.mark.parametrize("labels", [(), ("a", "b"), "a", 3, (3,), (None,), {"a": 1}])
 def test_labels_must_be_one_text_for_each_view(labels):
     error = refused(setup_of({"sampler": labelled(labels)}))
-    assert error.what == "the sampler does not label each view that it draws"
+    assert error.what == "the sampler returned a wrong number of labels"
     assert "sampler epoch" in error.where
 
 
@@ -378,7 +389,7 @@ def test_scales_given_as_numpy_numbers_become_numbers_in_the_record():
         (PluginState({"range": (0.0, 1.0)}), "values, range: (0.0, 1.0) of type tuple"),
         (PluginState({"a": [{"b": {1: 2}}]}), "values, a: the key 1"),
         (PluginState({"n": np.int64(3)}), "values, n: "),
-        (PluginState({1: 2}), "values, 1: the key is no text"),
+        (PluginState({1: 2}), "values, 1: the key is not a string"),
         (PluginState(tensors={"t": np.zeros(3)}), "tensors, t: of type ndarray"),
         (PluginState(tensors={"t": torch.eye(3).to_sparse()}), "tensors, t: torch.sparse_coo"),
         (PluginState(tensors={"t": torch.zeros(3, device="meta")}), "meta"),
@@ -422,7 +433,7 @@ def test_a_state_without_a_row_for_each_primitive_names_its_plugin(rows):
     edit = Edit(source=torch.arange(40))
     plugin = Answers(DensifyResult(edit, states={"stranger": held}))
     error = refused(setup_of(stranger=plugin))
-    assert error.what == "the state of plugin stranger does not fit the primitives"
+    assert error.what == "the state of plugin stranger does not match the Gaussians"
     assert error.found == f"shape {list(rows.shape)}"
 
 
@@ -443,15 +454,15 @@ def more_points(**changed):
         ({"colors": np.zeros((3, 3), np.uint8)}, "2 positions, 3 colors"),
         ({"positions": np.zeros((2, 2))}, "ValueError"),
         ({"positions": np.full((2, 3), np.nan)}, "position that is not finite"),
-        ({"sizes": np.array([1.0, 0.0])}, "a size that is no number above 0"),
-        ({"sizes": np.array([1.0, np.inf])}, "a size that is no number above 0"),
+        ({"sizes": np.array([1.0, 0.0])}, "a size that is not a number above 0"),
+        ({"sizes": np.array([1.0, np.inf])}, "a size that is not a number above 0"),
         ({"opacities": np.array([0.5, 1.0])}, "an opacity that is not between 0 and 1"),
     ],
 )
 def test_points_added_by_an_initializer_must_be_valid(changed, found):
     start = of_slot("initializers", "points", "more_points", more_points(**changed))
     error = refused(setup_of({"initializer": start}))
-    assert error.what == "initializer points adds what cannot be points"
+    assert error.what == "initializer points returned invalid points"
     assert "Wrong.more_points" in error.where
     assert found in error.found
 
@@ -474,7 +485,7 @@ def test_valid_points_of_an_initializer_are_used_and_its_errors_are_passed_on():
 def test_an_invalid_number_format_of_a_metric_is_refused_before_the_run(monkeypatch, form):
     psnr = type(build("metrics", "psnr", {}))
     monkeypatch.setattr(psnr, "figure", replace(psnr.figure, form=form))
-    with pytest.raises(UserError, match="metric psnr has a figure that cannot be shown") as caught:
+    with pytest.raises(UserError, match="a value of metric psnr cannot be formatted") as caught:
         assemble(RunConfig(steps=10), sample_scene(), "none")
     assert caught.value.found == repr(form)
 
@@ -483,7 +494,7 @@ def test_any_number_of_group_labels_is_listed_in_the_objection():
     setup = setup_of({"sampler": build("samplers", "near-far", {})})
     names = {**setup.selection.names, "grouping": "odd"}
     selection = replace(setup.selection, names=names, labels=(0, 1, 2))
-    assert "gives 3: 0, 1, 2" in " ".join(objections_to(selection))
+    assert "makes 3: 0, 1, 2" in " ".join(objections_to(selection))
 
 
 def test_groups_are_named_by_kind_for_any_block_names():

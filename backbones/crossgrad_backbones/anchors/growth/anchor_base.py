@@ -55,7 +55,9 @@ def _add(record: ViewRecord, totals: Mapping[str, Tensor]) -> None:
     gaussians = record.gaussians
     origin, slot = gaussians.origin, gaussians.slot
     if origin is None or slot is None:
-        raise RuntimeError("the backbone does not say which offset a Gaussian comes from")
+        raise RuntimeError(
+            "the backbone returned Gaussians without the offsets that they come from"
+        )
     views = totals[VIEWS]
     views += 1.0 if gaussians.decoded is None else gaussians.decoded
     totals[OPACITY].index_add_(0, origin, gaussians.opacities.clamp(min=0.0))
@@ -150,15 +152,24 @@ class AnchorDensifier(Densifier):
     tensors: ClassVar[frozenset[str]] = frozenset({"anchors", "offsets", "features", "scales"})
     resets: ClassVar[bool] = False
 
-    grad_threshold: float = Field(2e-4, gt=0, description="mean NDC gradient norm to grow at")
+    grad_threshold: float = Field(
+        2e-4, gt=0, description="mean NDC gradient norm above which anchors grow"
+    )
     success_threshold: float = Field(
         0.8,
         ge=0,
-        description="an anchor is judged after more views than this share of the interval, "
-        "an offset after more renders than half of it",
+        description="an anchor is judged if it was rendered in more than this share of the "
+        "interval's views, an offset if it was rendered in more than half of this "
+        "share",
     )
-    prune_opacity: float = Field(0.005, ge=0, description="prune below; sum over the offsets")
-    largest_log_scale: float = Field(0.05, description="cap of the Gaussians' log size, extents")
+    prune_opacity: float = Field(
+        0.005,
+        ge=0,
+        description="anchors with a lower sum of opacities over their offsets are pruned",
+    )
+    largest_log_scale: float = Field(
+        0.05, description="upper limit of the log size of Gaussians, extents"
+    )
 
     @abstractmethod
     def grown(
@@ -182,7 +193,7 @@ class AnchorDensifier(Densifier):
     def densify(self, context: DensifyContext, state: PluginState) -> tuple[Edit, PluginState]:
         if not context.schedule.collects(context.step):
             return NO_EDIT, PluginState()
-        # Published: statistics from step 500, edits from step 1500 on.
+        # The published schedule collects statistics from step 500 on and edits from step 1500 on.
         if context.schedule.counted(context.step) > context.schedule.densify_from // 3:
             state = observed(context, state)
         if not (state.per_primitive and context.schedule.densifies(context.step)):

@@ -97,8 +97,10 @@ class AnchorControl(AnchorDensifier):
 
     tensors: ClassVar[frozenset[str]] = AnchorDensifier.tensors | {"voxel_size"}
 
-    threshold_factor: float = Field(2.0, ge=1, description="factor of the threshold per level")
-    levels: int = Field(3, ge=1, description="sizes of cells, from coarse to fine")
+    threshold_factor: float = Field(
+        2.0, ge=1, description="factor of the gradient threshold per level"
+    )
+    levels: int = Field(3, ge=1, description="number of cell sizes, from coarse to fine")
     coarsest: int = Field(16, ge=1, description="edge of the coarsest cell, voxels")
     refinement: int = Field(4, ge=2, description="ratio of the edges of successive levels")
 
@@ -106,7 +108,7 @@ class AnchorControl(AnchorDensifier):
         """Return the options without an effect; see `HasUnusedOptions`."""
         if self.levels > 1:
             return {}
-        why = "there is one size of cells (levels = 1); leave it out"
+        why = "there is only one cell size (levels = 1); leave the option out"
         return {"threshold_factor": why, "refinement": why}
 
     @override

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crossgrad_core.numerics.jit import kernel
 from crossgrad_core.numerics.jobs import Jobs, next_job
 
-#: Anchors that one thread processes at a time.
+#: Number of anchors that one thread processes at a time.
 SHARE = 4096
 
 

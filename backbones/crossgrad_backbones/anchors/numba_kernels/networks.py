@@ -17,7 +17,7 @@ from crossgrad_core.numerics.jobs import Jobs, next_job
 
 _Floats: TypeAlias = NDArray[np.float32]
 _Ints: TypeAlias = NDArray[np.int64]
-#: Rows that one thread processes at a time.
+#: Number of rows that one thread processes at a time.
 SHARE = 256
 
 

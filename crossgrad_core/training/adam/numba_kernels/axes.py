@@ -20,7 +20,7 @@ from crossgrad_core.numerics.simd import (
 #: Rows of one job; fixed, so that results do not depend on the number of threads.
 _ROWS = 1 << 13
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
-#: Squares below this have lost precision.
+#: Squares below this value have lost precision.
 _SMALLEST = np.float32(1e-30)
 
 _Floats = NDArray[np.float32]

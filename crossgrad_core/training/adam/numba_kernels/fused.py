@@ -33,7 +33,7 @@ def update(
     beta1, new1, beta2, new2, step_size, root_scale, eps, square_floor, scale = numbers
     for i in range(len(param)):
         g = scale * grad[i]
-        g = min(max(g, -_LARGEST), _LARGEST)  # in this order NaN passes through
+        g = min(max(g, -_LARGEST), _LARGEST)  # In this order NaN is preserved.
         g = _ZERO if abs(g) < _TINY else g
         m = beta1 * exp_avg[i] + new1 * g
         m = _ZERO if abs(m) < _TINY else m
@@ -102,7 +102,7 @@ def _update_chunks(
 
 def numbers_of(step: Coefficients) -> Numbers:
     """Return the coefficients of a step as float32; rates beyond float32 are infinite."""
-    with np.errstate(over="ignore"):  # The check of parameters reports the effect.
+    with np.errstate(over="ignore"):  # The check of the parameters reports the effect.
         return (
             np.float32(step.beta1),
             np.float32(1 - step.beta1),
@@ -128,7 +128,7 @@ def update_at(
         steps: [T] coefficients.
     """
     numbers = np.array([numbers_of(step) for step in steps], np.float32).reshape(-1, 9)
-    # For at most one chunk of elements, other threads are not worth their overhead.
+    # For one chunk of elements, starting other threads costs more than it saves.
     run = serial if sum(sizes) <= _CHUNK else parallel
     where = np.array(addresses, np.int64).reshape(-1, 4)
     from_zero = np.array([step.from_zero for step in steps], np.bool_)

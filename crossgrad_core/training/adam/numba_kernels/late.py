@@ -58,7 +58,7 @@ _LOOK = 32
 #: A step of less than half a unit in the last place (2^-25 or more) does not change a parameter.
 #: Half of this is reserved for the rounding of the estimate.
 _STILL = np.float32(2.0**-26)
-# Second moments above it stay normal numbers for `_LOOK` steps of beta2 >= 1/2.
+# Second moments above this value stay normal numbers for `_LOOK` steps with beta2 >= 1/2.
 _STEADY = np.float32(2.0**-90)
 _ALL = np.uint64(2**LANES - 1)
 _ZERO = np.float32(0.0)
@@ -193,7 +193,7 @@ def _stepped(
     zero, tiny, most = splat_wide(_ZERO), splat_wide(_TINY), splat_wide(_LARGEST)
     least = splat_wide(-_LARGEST)
     g = splat_wide(scale) * g
-    # Comparisons with NaN are false, so NaN passes through.
+    # Comparisons with NaN are false, so NaN is preserved.
     g = where(most < g, most, where(g < least, least, g))
     g = where(magnitude(g) < tiny, zero, g)
     m = fma(splat_wide(beta1), m, splat_wide(new1) * g)

@@ -59,7 +59,8 @@ def _from_laws(subject: Subject, batch: Batch, found: Floats) -> list[float] | l
     views = search_views(batch.views)
     scaled = results(subject.operator, replace(batch, rows=batch.rows * _SCALE), views) / _SCALE
     apart = np.linalg.norm(scaled - found, axis=1)
-    # At nearly singular Gramians the order may matter. Usual gradients are far from singular.
+    # At nearly singular Gramians the order may matter; the Gramians of usual gradients are far from
+    # singular.
     if batch.family == USUAL and batch.views == 2:  # noqa: PLR2004
         turned = Views(views.labels[::-1], views.ratios[::-1], views.seed)
         other = results(subject.operator, replace(batch, rows=batch.rows[:, ::-1]), turned)

@@ -13,13 +13,14 @@ from crossgrad_operators.stress.reference import Views
 from crossgrad_operators.stress.runner import context_of
 
 Rows = NDArray[np.float64]
-#: (generator, B, K, P) -> [B, K, P] gradients.
+#: Function (generator, B, K, P) -> [B, K, P] gradients.
 Family = Callable[[np.random.Generator, int, int, int], Rows]
-#: Greatest number of views and of elements.
+#: Maximum number of views and of elements.
 VIEWS, ELEMENTS = 20, 50
-#: The distribution for which the share of gradients outside a set is stated.
+#: Distribution for which the share of gradients outside a set is stated.
 USUAL: Final = "random"
-#: Numbers of views, and their probabilities. 50 digits take 1 ms for two views, 1 s for 20.
+#: Numbers of views, and their probabilities. An exact answer takes 1 ms for two views and 1 s for
+#: 20 views.
 _VIEWS: Final = np.arange(2, VIEWS + 1)
 _SHARES: Final = _VIEWS**-2.0 / (_VIEWS**-2.0).sum()
 #: Number of cases in a batch, times K^2.

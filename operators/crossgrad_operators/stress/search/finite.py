@@ -64,7 +64,7 @@ def run_finite(
 
 def _batch(subject: Subject, dtype: torch.dtype, count: int, seed: tuple[int, int]) -> Batch:
     rng = np.random.default_rng(seed)
-    # Two successive batches have the same family, one batch of each type.
+    # Two successive batches belong to the same family, one batch of each type.
     family = list(FAMILIES)[seed[1] // 2 % len(FAMILIES)]
     views = int(rng.integers(2, VIEWS + 1))
     if not subject.operator.views.admits(views):
@@ -94,7 +94,7 @@ def as_text(found: Sequence[Finite]) -> str:
         for each in found
         if each.example is not None
     ]
-    legend = "longest |u|: over the longest gradient of its case"
+    legend = "longest |u|: relative to the longest gradient of its case"
     return "\n".join([head, *lines, legend, *bad])
 
 

@@ -25,9 +25,9 @@ from crossgrad_operators.stress.search.samples import Sample, mutants
 from crossgrad_operators.stress.search.worst_cases import WorstCases, severity, specimen
 from crossgrad_operators.stress.suite import Subject
 
-#: Number of cases in a round that are changed slightly, which needs no exact arithmetic.
+#: Number of cases in a round that are changed slightly. These cases need no exact arithmetic.
 JUMPS = 64
-#: Share of the value that a smaller case must keep.
+#: A smaller case must keep at least this share of the value.
 KEPT = 0.7
 #: Numbers of significant digits to which elements are rounded.
 FEW_DIGITS = (1, 2, 4)

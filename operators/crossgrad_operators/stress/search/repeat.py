@@ -30,7 +30,7 @@ def read_rows(text: str, dtype: torch.dtype) -> Case:
     with np.errstate(over="ignore"):
         case = short(str(dtype).removeprefix("torch."), rows, dtype)
         finite = np.isfinite(case.exact_head).all()
-    if not finite:  # after rounding to the type
+    if not finite:  # This is the value after rounding to the type.
         raise _no_matrix(text)
     return case
 
@@ -52,9 +52,9 @@ def _cell(subject: Subject, exact: ExactCase) -> Cell:
 
 def _no_matrix(text: str) -> UserError:
     return UserError(
-        "the gradients are no matrix of finite numbers",
+        "the gradients are not a matrix of finite numbers",
         where="--rows",
-        expected="a row of equal length for each view, such as [[1,2],[3,4]]",
+        expected="one row of equal length for each view, such as [[1,2],[3,4]]",
         found=text if len(text) <= 80 else f"{text[:80]} ...",  # noqa: PLR2004
-        todo="copy what a search printed after --rows, quotes included",
+        todo="copy the text that the search printed after --rows, including the quotes",
     )

@@ -56,7 +56,7 @@ def _shortest(value: np.floating) -> str:
 #: Suffix of the family names of mutants.
 MUTATED = ", mutated"
 
-#: (generator, [B, K, P]) -> [B, K, P].
+#: Function (generator, [B, K, P]) -> [B, K, P].
 Mutation = Callable[[np.random.Generator, Rows], Rows]
 
 
@@ -116,7 +116,7 @@ def _turn_rows(rng: np.random.Generator, rows: Rows) -> Rows:
     return np.asarray(np.take_along_axis(rows * signs, order[:, :, None], axis=1))
 
 
-#: (generator, [K, P]) -> rows with one row or column more or less.
+#: Function (generator, [K, P]) -> rows with one row or column more or fewer.
 Reshaping = Callable[[np.random.Generator, Rows], Rows]
 
 

@@ -13,11 +13,11 @@ from crossgrad_operators.stress.verdict import NOT_FINITE, Finding
 
 #: Number of stored cases, of either kind, from which mutants are made.
 POOL = 8
-#: Greatest number of views of these cases, because 50 digits take long for more views.
+#: Maximum number of views of these cases, because exact answers take long for more views.
 MUTATED_VIEWS = 8
-#: Greatest change of a continuous method's result, as a share of the longest gradient.
+#: Maximum change of a continuous method's result, as a share of the longest gradient.
 JUMP = 1e-3
-#: Number of cases with a broken promise that are stored for the report.
+#: Number of cases with a broken guarantee that are stored for the report.
 KEPT = 5
 
 
@@ -101,9 +101,9 @@ class WorstCases:
             self.jump = found
         if found.value > JUMP:
             self.broken += 1
-            moved = f"moves by {found.value:.3g} of the longest gradient"
+            moved = f"the result moves by {found.value:.3g} of the longest gradient"
             # Insert at the front, because other failures are numerous and would fill the list.
-            jump = (found, f"{moved} where the gradients do by 1e-12")
+            jump = (found, f"{moved} if the gradients move by 1e-12")
             self.failures = [jump, *self.failures][:KEPT]
 
 

@@ -24,14 +24,14 @@ from crossgrad_core.plugin import Backbone, Operator, Rasterizer, Sampler
 
 SLOTS: Final = ("sampler", "operator", "backbone", "densifier", "rasterizer")
 FURTHER: Final = ("loss", "exposure", "initializer", "resolution", "grouping", "observer")
-#: Options without which a component has no effect in so few steps.
+#: Options that components need to have an effect within these few steps.
 NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
     ("operator", "chain"): {"links": [{"name": "symmetric"}, {"name": "mean"}]},
-    # Anchors are evaluated at once, and find free cells nearby.
+    # Anchors are judged at the first edit, and small cells leave free cells nearby.
     ("backbone", "scaffold"): {"voxel_size": 1e-5},
     ("densifier", "anchor"): {"success_threshold": 0, "coarsest": 1},
     ("densifier", "octree"): {"success_threshold": 0},
-    # In so small a scene, each primitive is blended in few pixels only.
+    # In this small scene, each Gaussian is blended in only a few pixels.
     ("densifier", "multiview"): {"importance": 0},
     ("densifier", "multiview-gate"): {"importance": 0},
 }
@@ -40,7 +40,7 @@ NEEDED: Final[Mapping[tuple[str, str], Mapping[str, Any]]] = {
 STEPS: Final = 5
 _WINDOW: Final = {"densify_from": 1, "densify_every": 2, "densify_until": 100}
 _TIMES: Final = {"schedule_unit": "steps", "reset_every": 4, **_WINDOW}
-#: One value per factor.
+#: One value for each factor.
 Row: TypeAlias = tuple[str, ...]
 #: Row -> reasons for its refusal; rows that work are absent.
 Refused: TypeAlias = Mapping[Row, Collection[str]]

@@ -16,7 +16,7 @@ from crossgrad_plugins.authoring.matrix.combinations import (
     meetings,
 )
 
-#: Returns True if a combination of these slots can work.
+#: Return True if a combination of these slots can work.
 Admits = Callable[[Row, tuple[str, ...]], bool]
 
 
@@ -49,8 +49,8 @@ def members_of(package: str) -> Members:
     taking_part = [entry for entry in own if entry.slot in slots.values()]
     if not taking_part:
         raise UserError(
-            f"package {package!r} has no component that takes part in training",
-            expected=f"one of the slots {listed(slots.values())}",
+            f"package {package!r} contains no component that is used in training",
+            expected=f"a component for one of the slots {listed(slots.values())}",
             found=listed(f"{singular(entry.slot)} {entry.name}" for entry in own),
             todo="`crossgrad plugins check` checks the components of the other slots",
         )
@@ -62,10 +62,10 @@ def members_of(package: str) -> Members:
             reason = _cannot_be_combined(entry)
             if reason and entry in taking_part:
                 raise UserError(
-                    f"{slot} {entry.name} cannot be combined with others",
+                    f"{slot} {entry.name} cannot be tested in combinations",
                     where=entry.origin,
                     found=reason,
-                    todo=f"`crossgrad plugins check {package}` says more",
+                    todo=f"`crossgrad plugins check {package}` shows the reason",
                 )
             if reason:
                 left_out.append(f"{slot} {entry.name}: {reason}")
@@ -80,13 +80,13 @@ def members_of(package: str) -> Members:
 def _cannot_be_combined(entry: Entry) -> str:
     """Return the reason why a component is left out; empty if it is not left out."""
     if [each.name for each in offers(entry.slot)].count(entry.name) > 1:
-        return "two packages offer that name"
+        return "two packages offer this name"
     try:
         loaded = load_entry(entry)
     except UserError as error:
         return error.found or error.what
     if issubclass(loaded, Rasterizer) and not _runs_here(loaded):
-        return f"it runs on {listed(sorted(loaded.devices))}, not on this machine"
+        return f"it runs only on {listed(sorted(loaded.devices))}, which this machine does not have"
     return ""
 
 

@@ -119,11 +119,11 @@ def train_one(package: str, combination: str) -> None:
     known = all(len(pair) == 2 and pair[1] in members.names.get(pair[0], ()) for pair in pairs)  # noqa: PLR2004
     if not known or slots[: len(SLOTS)] != SLOTS or not set(slots[len(SLOTS) :]) <= {*FURTHER}:
         raise UserError(
-            "this is no combination",
+            "the text does not name a combination of components",
             where="--only",
             expected=f"{' '.join(f'{slot}=NAME' for slot in SLOTS)}, as the report shows it",
             found=combination,
-            todo="copy one from the report of the matrix",
+            todo="copy a combination from the report of the matrix",
         )
     try_out(config_of(tuple(pair[1] for pair in pairs), slots), STEPS)
 
@@ -136,11 +136,11 @@ def report(tally: Tally, package: str) -> str:
     lines = [_filled(heading, ""), f"{numbers} trained for {STEPS} steps, twice with the same bits"]
     lines += [_filled(f"left out: {reason}", "  ") for reason in members.left_out]
     refused = sum(map(len, tally.refused.values()))
-    lines.append(f"{count(refused, 'combination')} refused before training, with the reason")
+    lines.append(f"{count(refused, 'combination')} refused before training, with a reason")
     for slots, rows in tally.refused.items():
         lines += [_filled(line, "  ") for line in _refusals(rows, slots, tally)]
     lines += [
-        f"FAIL  {name} was trained in no combination: each one was refused"
+        f"FAIL  {name} was not trained in any combination: all were refused"
         for name in tally.never_trained
     ]
     lines.append(f"{count(len(tally.failed), 'combination')} failed")

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Quantile of the figures at which the axis begins; the first, much lower evaluations are cut off.
+#: Quantile of the values at which the axis begins, so that the first, much lower evaluations are
+#: cut off.
 _KEPT: Final = 0.22
 _COUNT: Final = Quantity("primitives", "primitives", "", 0, 0.0)
 #: Width of the markers of all arms together, relative to the distance between two groups.
@@ -35,8 +36,8 @@ def draw_curves(c: Comparison, cost: Cost) -> Drawn:
     return Grid(
         f"curves_{cost.name}",
         f"{c.quantity.label} over {cost.title}",
-        "Held-out views; lines are means over seeds, bands reach from the lowest to the "
-        "highest seed. Seconds leave out compiling, loading and evaluating.",
+        "Held-out views. Lines are means over seeds, bands show the lowest and the "
+        "highest seed. Seconds do not include compiling, loading and evaluating.",
         y=c.quantity.with_unit,
         x=cost.axis,
     ).by_scene(c, panel)
@@ -51,8 +52,8 @@ def draw_primitives(c: Comparison, cost: Cost) -> Drawn:
 
     return Grid(
         "primitives",
-        "Primitives over the run",
-        "At each evaluation; bands reach from the lowest to the highest seed.",
+        "Gaussians during the run",
+        "At each evaluation; bands show the lowest and the highest seed.",
         y="thousand primitives",
         x=cost.axis,
         height=1.6,
@@ -89,9 +90,9 @@ def draw_frontier(c: Comparison, cost: Cost) -> Drawn | None:
 
     return Grid(
         "frontier",
-        "The frontier: final quality over the length of the run",
-        "Each point is the end of runs of one length, their schedules stretched to it; error "
-        "bars are standard deviations over seeds.",
+        "Final quality by the length of the run",
+        "Each point is the end of the runs of one length, whose schedules are scaled "
+        "to this length; error bars are standard deviations over seeds.",
         y=f"final {c.quantity.with_unit}",
         x=f"{cost.axis}, whole run",
     ).by_scene(c, panel)
@@ -126,8 +127,8 @@ def draw_regimes(c: Comparison) -> Drawn:
 
     return Grid(
         "regimes",
-        "Each regime beside all views",
-        "At the ends of the runs. A small sign is a run, the bar the mean over its seeds.",
+        "Each regime and all views",
+        "At the end of the runs. A small marker is a run, the bar is the mean over its seeds.",
         y=c.quantity.with_unit,
         height=1.75,
     ).by_scene(c, panel)
@@ -154,11 +155,11 @@ def draw_profile(c: Comparison) -> Drawn | None:
     return Grid(
         "profile",
         "Performance profile",
-        f"Share of the {problems} problems (a scene with a seed) that an arm solves within this "
-        "multiple of what the best arm needed. A run that never gets there stays in the "
-        "denominator.",
+        f"Share of the {problems} problems (a scene with a seed) that an arm solves "
+        "within this multiple of the cost of the best arm. A run that never reaches "
+        "the quality counts as unsolved.",
         y="share of problems",
-        x=[f"{title} to the quality,\nover the least of all arms" for title in shown],
+        x=[f"{title} until the quality,\nrelative to the best arm" for title in shown],
         height=1.85,
         has_titles=False,
     ).draw(list(shown), panel, list(look))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of rows that fit on a page.
 _MOST_ROWS: Final = 24
-#: Intervals are this far above the middle of their row; the markers of pairs are below it.
+#: Intervals are drawn this far above the middle of their row, and the markers of pairs below it.
 _ABOVE: Final = 0.12
 #: Letters per line of a heading, and the height of each further line in rows.
 _LETTERS, _LINE = 70, 0.6
@@ -71,10 +71,11 @@ def draw_differences(c: Comparison) -> Drawn | None:
             figure,
             "differences",
             "Paired differences",
-            "Each small sign is a pair of runs on one scene with one seed. The bar is the 95 % "
-            "interval, its thick part the 90 % interval, the large sign the estimate; an "
-            "arrowhead says that the interval goes on beyond the axis; the grey "
-            f"band is the margin of {f'{margin:g} {c.quantity.unit}'.strip()}.",
+            "Each small marker is a pair of runs on one scene with one seed. The thin "
+            "bar is the 95 % interval, its thick part the 90 % interval, the large "
+            "marker the estimate. An arrowhead means that the interval continues beyond "
+            "the axis. The grey band is the margin of "
+            f"{f'{margin:g} {c.quantity.unit}'.strip()}.",
         )
 
 

@@ -75,6 +75,6 @@ def draw_phases(comparison: Comparison) -> Drawn | None:
         return drawn(
             figure,
             "phases",
-            "Where the seconds went",
-            "Seconds of the clock by phase of a step, in the mean over runs.",
+            "Training time by phase",
+            "Wall-clock seconds by phase of a step, mean over runs.",
         )

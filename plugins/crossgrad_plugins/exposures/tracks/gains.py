@@ -26,34 +26,36 @@ if TYPE_CHECKING:
 
 #: Minimum number of usable observations for the gain of a photo.
 LEAST = 8
-#: The rule by which photos differ in exposure: minimum standard deviation of the gains in stops,
-#: minimum ratio of that deviation to its own standard error, and minimum share of the deviation of
-#: observations from their points that the gains remove. Results: docs/exposure.md.
+#: Photos count as differing in exposure if three conditions hold. The standard deviation of the
+#: gains is at least the first value, in stops. It is at least this many times its own standard
+#: error. The gains reduce the deviation of observations by at least this share (docs/exposure.md).
 LEAST_SPREAD, LEAST_RATIO, LEAST_REDUCTION = 0.2, 4.0, 0.15
-#: From this number of photos on, the photo farthest from the mean is ignored, because all its
-#: points may be on an object that the other photos hide.
+#: If there are at least this many photos, the photo farthest from the mean is ignored, because all
+#: its points may be on an object that the other photos hide.
 _ENOUGH = 5
-#: Maximum number of photos for the decision. Of more photos, runs of consecutive ones are used,
-#: because consecutive photos show the same points.
+#: Maximum number of photos for the decision. If there are more, groups of consecutive photos are
+#: used, because consecutive photos show the same points.
 MOST_DECIDING, _CONSECUTIVE = 128, 8
 # Cached, because a run requests the gains several times and a scene does not change.
 _OF_TRAINING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 _DECIDING: "WeakKeyDictionary[Scene, TrackGains]" = WeakKeyDictionary()
 #: Huber's constant, in standard deviations: 95 % efficient for normal errors.
 _HUBER = 1.345
-#: Standard deviations of a normal distribution in one median absolute deviation.
+#: Number of standard deviations of a normal distribution in one median absolute deviation.
 _NORMAL = 1.4826
 _ROUNDS = 12
-#: The direct solution is used up to this mean number of photos that share points with a photo, and
-#: above this total number of photos; with fewer photos, iterations converge quickly.
+#: The direct solution is used if the mean number of photos that share points with a photo is at
+#: most the first value, and the total number of photos is above the second value. With fewer
+#: photos, iterations converge quickly.
 _FEW, _SHORT = 64, 64
-#: Maximum error of the gains after iterations, in stops; rounding allows less.
+#: Maximum error of the gains after the iterations, in stops; the rounding error is smaller.
 _TOLERANCE = 1e-5
 #: Maximum number of photos for standard errors, because their matrix is dense.
 _DENSE = 512
-#: Eigenvalues below this share of the largest one belong to the free mean of a part.
+#: Eigenvalues below this share of the largest one belong to the undetermined mean of a connected
+#: part.
 _RANK = 1e-9
-#: Residuals below this value, in stops, are rounding of 8-bit values.
+#: Residuals below this value, in stops, are rounding errors of 8-bit values.
 _SMALLEST = 1e-3
 _Floats = NDArray[np.float64]
 
@@ -131,14 +133,15 @@ class TrackGains:
         """The values that the rule compares, as text."""
         known = self.gains[self.known]
         if not len(known):
-            return "no SfM tracks tell how bright the photos are beside each other"
+            return "no SfM tracks connect the photos, so their brightness cannot be compared"
         error = f", standard error {self.error:.2f}" if isfinite(self.error) else ""
         return (
-            f"brightness of {len(known)} photos at {int(self.counts.sum()):,} observations of SfM "
-            f"points: gains of {self.spread:.2f} stops standard deviation ({known.min():+.2f} to "
-            f"{known.max():+.2f}{error}); where points join photos "
-            f"of different gains, they take {100.0 * self.fit.reduction:.0f} % off the deviation "
-            f"({self.fit.before:.2f} to {self.fit.after:.2f} stops)"
+            f"brightness of {len(known)} photos at {int(self.counts.sum()):,} "
+            "observations of SfM points: gains with a standard deviation of "
+            f"{self.spread:.2f} stops ({known.min():+.2f} to {known.max():+.2f}{error}); "
+            "where points connect photos of different gains, the gains reduce the "
+            f"deviation by {100.0 * self.fit.reduction:.0f} % ({self.fit.before:.2f} to "
+            f"{self.fit.after:.2f} stops)"
         )
 
 

@@ -13,11 +13,11 @@ from torch import Tensor
 from crossgrad_core.plugin import Camera, Scene, UserError, View
 from crossgrad_plugins.exposures.srgb import decoded
 
-#: Maximum number of observations; with more, only every n-th point is used.
+#: Maximum number of observations; if there are more, only every n-th point is used.
 _MOST = 400_000
 #: Number of photos decoded in parallel; more would need too much memory.
 _AT_ONCE = 2
-#: Usable range of linear light in [0, 1]: below it is noise, above it values are clipped.
+#: Usable range of linear light in [0, 1]: values below it are noise, values above it are clipped.
 DARKEST, BRIGHTEST = 0.02, 0.98
 _NEIGHBOURS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 
@@ -57,7 +57,7 @@ def observations_of(scene: Scene, views: Sequence[View]) -> Observations:
     photos = np.repeat(np.arange(len(views)), [len(rows) for rows, _ in found])
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(rows for rows, _ in found)])
     stops = np.concatenate([np.zeros(0), *(stops for _, stops in found)])
-    # A point that is usable in one photo only gives no information about that photo.
+    # A point that is usable in only one photo gives no information about that photo.
     _, numbers, times = np.unique(rows, return_inverse=True, return_counts=True)
     kept = times[numbers] > 1
     known, numbers = np.unique(rows[kept], return_inverse=True)

@@ -72,7 +72,7 @@ def _weighted(values: Tensor, mask: Tensor | None, weights: Tensor) -> Tensor:
     """Return the weighted mean of [H, W, C] over the kept pixels; 0 if the total weight is 0."""
     share = masked(weights.to(values.dtype).unsqueeze(-1), mask)  # [H, W, 1]
     total = share.sum() * values.shape[-1]
-    # If nothing counts, the sum is 0 already, but the divisor must not be 0.
+    # If no pixel counts, the sum is already 0, but the divisor must not be 0.
     return (masked(values, mask) * share).sum() / torch.where(total > 0, total, 1.0)
 
 

@@ -32,8 +32,8 @@ def counter(meta: Mapping[str, Any], view: int) -> Callable[[Tensor], Tensor]:
         total: Tensor = opacities.new_zeros(opacities.shape[-1], dtype=torch.int64)
         rows = max(1, PIXELS // width)
         for first in range(0, height, rows):
-            # Pixels without remaining light are skipped like opaque pixels, so unmarked pixels get
-            # no light.
+            # Pixels without remaining transmittance are skipped like opaque pixels, so set the
+            # transmittance of unmarked pixels to 0.
             light = opacities.new_zeros((*opacities.shape[:-1], height, width))
             band = slice(first, first + rows)
             light[view, 0, band] = marked[band].to(light)

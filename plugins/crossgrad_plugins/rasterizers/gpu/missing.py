@@ -34,21 +34,26 @@ def compiler_missing(package: str) -> str | None:
     if nvcc is None:
         home = _cuda_home()
         return (
-            f"rasterizer {package} compiles its kernels when it is first used, and there is no "
-            f"nvcc{f' in {home}, where CUDA_HOME or CUDA_PATH points' if home else ''}: install "
-            f"the CUDA toolkit {wanted or ''} and set CUDA_HOME, or choose --rasterizer gswarp, "
-            "which needs a driver only"
+            f"rasterizer {package} compiles its kernels at first use, and nvcc was not "
+            f"found{(f' in {home}, where CUDA_HOME or CUDA_PATH points' if home else '')}: "
+            f"install the CUDA toolkit {wanted or ''} and set CUDA_HOME, or choose "
+            "--rasterizer gswarp, which needs only a driver"
         )
     if shutil.which("ninja") is None and not _own_ninja().is_file():
-        return f"rasterizer {package} compiles its kernels and finds no ninja: pip install ninja"
+        return (
+            f"rasterizer {package} compiles its kernels, and ninja was not found: pip install ninja"
+        )
     if shutil.which(os.environ.get("CXX", "c++")) is None:
-        return f"rasterizer {package} compiles its kernels and finds no C++ compiler: install g++"
+        return (
+            f"rasterizer {package} compiles its kernels, and no C++ compiler was found: install g++"
+        )
     found = nvcc_version(nvcc)
     if found is not None and wanted is not None and found.split(".")[0] != wanted.split(".")[0]:
         return (
-            f"rasterizer {package} cannot compile its kernels: nvcc ({nvcc}) is of CUDA {found}, "
-            f"torch {torch.__version__} was built for CUDA {wanted}; install the toolkit of that "
-            "version and set CUDA_HOME, or the torch that was built for this one"
+            f"rasterizer {package} cannot compile its kernels: nvcc ({nvcc}) belongs to "
+            f"CUDA {found}, but torch {torch.__version__} was built for CUDA {wanted}; "
+            "install the toolkit of that version and set CUDA_HOME, or install a torch "
+            f"that was built for CUDA {found}"
         )
     return None
 

@@ -72,7 +72,7 @@ class _Nested(torch.autograd.Function):
             [output for output, _ in known],
             wanted,
             [gradient for _, gradient in known],
-            retain_graph=True,  # There may be another backward pass.
+            retain_graph=True,  # Another backward pass may follow.
             allow_unused=True,
         )
         by_tensor = {id(each): gradient for each, gradient in zip(wanted, found, strict=True)}

@@ -58,7 +58,7 @@ def self_test(rasterizer: Rasterizer, device: str) -> None:
         except Exception as error:
             raise _refused(rasterizer, "cannot draw", f"{type(error).__name__}: {error}") from error
         if wrong := difference(found, expected):
-            raise _refused(rasterizer, "draws a known scene wrongly", wrong)
+            raise _refused(rasterizer, "renders a known scene incorrectly", wrong)
 
 
 def known_scene(device: str, *, harmonics: bool) -> tuple[Gaussians, Camera]:
@@ -104,7 +104,7 @@ def difference(found: Look, expected: Look) -> str:
     error = (found.image - expected.image).abs()
     if not (error.max() < PIXEL and error.mean() < MEAN):
         return (
-            f"pixels are up to {float(error.max()):.2g} off, {float(error.mean()):.2g} on average"
+            f"pixels differ by up to {float(error.max()):.2g}, {float(error.mean()):.2g} on average"
         )
     if not abs(found.loss - expected.loss) < MEAN * expected.loss:
         return f"the loss is {found.loss:.6g}, not {expected.loss:.6g}"
@@ -113,7 +113,7 @@ def difference(found: Look, expected: Look) -> str:
         apart, length = float((other - gradient).norm()), float(gradient.norm())
         if not apart <= GRADIENT * length:
             share = apart / length if length else inf
-            return f"the gradient of the {name} is {share:.2g} of its length off"
+            return f"the gradient of the {name} differs by {share:.2g} of its length"
     return ""
 
 
@@ -129,6 +129,7 @@ def _refused(rasterizer: Rasterizer, what: str, found: str) -> UserError:
         where="--rasterizer, before the first step",
         expected="the image, loss and gradients of rasterizer torch",
         found=found,
-        todo="run the command once more, as first processes on a fresh machine are known to fail; "
-        "if it stays, install packages that fit torch's CUDA version, or use --rasterizer torch",
+        todo="run the command again, because the first process on a fresh machine can "
+        "fail; if it fails again, install packages that match torch's CUDA version, "
+        "or use --rasterizer torch",
     )

@@ -138,7 +138,7 @@ def backward(
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
         opacities=np.empty(count, np.float32),
-        # With harmonics, the colour gradients of Gaussians that were not drawn are never read.
+        # With harmonics, the colour gradients of Gaussians that were not rendered are never read.
         colors=(np.zeros if gaussians.dc is None else np.empty)((count, 3), np.float32),
         dc=_room(frame, "sh_dc", gaussians.dc),
         rest=_room(frame, "sh_rest", gaussians.rest) if harmonics else None,
@@ -375,7 +375,9 @@ def _bin(
     columns = (camera.width + TILE_WIDTH - 1) // TILE_WIDTH
     rows = (camera.height + TILE_HEIGHT - 1) // TILE_HEIGHT
     if room.sum() > np.iinfo(np.int32).max:
-        raise MemoryError(f"{room.sum()} pairs of a Gaussian and a tile are too many")
+        raise MemoryError(
+            f"the image has {room.sum()} pairs of a Gaussian and a tile, which is too many"
+        )
     order, keys, slots = collect(projected.drawn, room, depths, buckets)
     tile_of_slot = np.empty(slots, np.int32)
     counts = np.zeros((PARTS, columns * rows), np.int32)

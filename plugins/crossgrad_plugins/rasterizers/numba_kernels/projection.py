@@ -229,7 +229,7 @@ def _record_block(
         if limits is not None:
             published, within = square(k, width, height, found)
             if z > near and z < math.inf:
-                # Visible for the published code, even if it touches no pixel.
+                # The Gaussian is visible for the published code, even if it touches no pixel.
                 radii[i] = published
         if not (z > near and z < math.inf and opacity >= ALPHA_THRESHOLD and opacity < math.inf):
             continue

@@ -281,7 +281,7 @@ def plain_shape(
     inverse_c, slope, variance, decay = get_four(found, _INVERSE_C, k)
     log_opacity = get(found, _LOG_OPACITY, k)
     reach = _reach(log_opacity)
-    # The sums are NaN or infinite if any term is, and then they fail the comparison.
+    # If any term is NaN or infinite, the sums are too, and they fail the comparison.
     if not (
         det > 0.0
         and reach >= 0.0

@@ -39,14 +39,15 @@ def order_by_depth(depths: NDArray[np.float64], items: NDArray[np.int32]) -> NDA
     for i in range(count):
         least, most = min(least, bits[i] >> _DROPPED), max(most, bits[i] >> _DROPPED)
     of_key, of_place = _width(most - least), _width(count - 1)
-    # Needed only for about a million items whose depths span all orders of magnitude.
+    # This branch is needed only for about a million items whose depths span all orders of
+    # magnitude.
     coarser = max(0, of_key + of_place - 63)
     of_key -= coarser
-    # At least one pass, because the number of bits must not be negative.
+    # Use at least one pass, because the number of bits must not be negative.
     passes = max(1, (of_key + _DIGIT - 1) // _DIGIT)
     of_digit = (of_key + passes - 1) // passes
     last_bin = (1 << of_digit) - 1
-    # Unsigned indices, so that the compiled code does not check for negative values.
+    # Use unsigned indices, so that the compiled code does not check for negative values.
     bins = np.zeros((passes, last_bin + 1), np.uint32)
     packed, spare = np.empty(count, np.int64), np.empty(count, np.int64)
     for i in range(count):

@@ -70,7 +70,8 @@ def composite_tiles(
     Returns:
         `channels` [H, W, 5], `touched` [V] bool and `blended` [V] int64 as in `composite`.
     """
-    # The backward pass of an embedding adds in a fixed order on every device; indexing may not.
+    # The backward pass of an embedding adds in a fixed order on every device; indexing may use any
+    # order.
     tiles = torch.split(embedding(lists.rows, table), lists.sizes)
     again = len(lists.rows) * TILE**2 > REMEMBERED_ENTRIES
     images, touched, blended = [], [], []
@@ -159,9 +160,10 @@ def _blends(table: Tensor, centers: Tensor, drawing: Drawing) -> tuple[Tensor, T
     alpha = alpha.clamp(max=drawing.max_alpha)
     touching = alpha >= ALPHA_THRESHOLD
     alpha = torch.where(touching, alpha, 0.0)
-    after = (1 - alpha).cumprod(-1)  # transmittance behind each Gaussian, if nothing stops
+    # Transmittance behind each Gaussian if compositing does not stop.
+    after = (1 - alpha).cumprod(-1)
     before = torch.cat([torch.ones_like(after[:, :1]), after], -1)[:, :-1]
-    # Transmittance never rises, so everything behind the first Gaussian that stops is excluded too.
+    # Transmittance never rises, so all Gaussians behind the first one that stops are excluded too.
     blended = touching & (after >= TRANSMITTANCE_STOP)
     return touching, blended, torch.where(blended, alpha * before, 0.0)
 

@@ -73,7 +73,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> Pro
     row_v = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1)
     jacobian = torch.stack([row_u, row_v], 1)  # [N, 2, 3]
 
-    # The covariance is factor @ factor.T. For a zero quaternion, all of this is NaN.
+    # The covariance is factor @ factor.T. For a zero quaternion, all values are NaN.
     axes = unit_rotation_matrices(quats / quats.norm(dim=-1, keepdim=True)) * scales[:, None, :]
     factor = jacobian @ pose[:3, :3] @ axes  # [N, 2, 3]
     first, second = factor.unbind(1)

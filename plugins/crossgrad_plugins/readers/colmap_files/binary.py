@@ -115,7 +115,7 @@ def check_point_ids(ids: NDArray[np.uint64], path: Path) -> None:
 
 def _twice(what: str, number: int, path: Path) -> UserError:
     return UserError(
-        f"two {what} of the COLMAP model have one id",
+        f"two {what} of the COLMAP model have the same id",
         where=path,
         found=f"id {number}",
         todo="export the model again",
@@ -154,7 +154,7 @@ class _Walk:
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise UserError(
-                "the file is cut short",
+                "the file is incomplete: its end is missing",
                 where=self.path,
                 expected=f"at least {self.at} bytes",
                 found=f"{len(self.data)} bytes",
@@ -186,7 +186,7 @@ class _Walk:
         """Refuse a file that was not read to its end."""
         if self.at != len(self.data):
             raise UserError(
-                "the file goes on behind its last record",
+                "the file continues after its last record",
                 where=self.path,
                 expected=f"{self.at} bytes",
                 found=f"{len(self.data)} bytes",
@@ -214,10 +214,10 @@ def _read_cameras(file: _Walk) -> Iterator[tuple[int, Calibration]]:
         camera, number, width, height = (int(value) for value in file.unpack(_CAMERA))
         if number not in models:
             raise UserError(
-                f"unknown camera model number {number}",
+                f"the camera model number {number} is unknown",
                 where=file.path,
                 expected=", ".join(f"{i} {name}" for i, (name, _) in sorted(models.items())),
-                todo="the file is damaged or of a newer COLMAP: try a newer pycolmap",
+                todo="the file is damaged, or a newer COLMAP wrote it: try a newer pycolmap",
             )
         name, count = models[number]
         params = file.unpack(struct.Struct(f"<{count}d"))
@@ -247,7 +247,8 @@ def _read_points(file: _Walk) -> NDArray[np.void]:
         for _ in range(number):
             starts.append(at)
             at += fixed + _TRACK_ELEMENT * track_length(data, at + _POINT.itemsize)[0]
-    except (struct.error, OverflowError):  # past the end, or too large an offset
+    except (struct.error, OverflowError):
+        # The track is longer than the file, or the offset is too large.
         at += fixed
     file.skip(at - file.at)
     file.end()

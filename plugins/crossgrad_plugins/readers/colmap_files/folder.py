@@ -37,11 +37,11 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
         if has_model(scene / wanted):
             return scene / wanted, []
         raise UserError(
-            "the COLMAP model asked for is not there",
+            "the COLMAP model that reader.model names does not exist",
             where=scene / wanted,
             expected="cameras and images, as .bin or .txt",
             found=", ".join(str(p.relative_to(scene)) for p in find_models(scene)) or "no model",
-            todo="name one of those that were found, or leave reader.model out",
+            todo="name one of the listed models, or leave reader.model out",
         )
     models = find_models(scene)
     if not models:
@@ -52,8 +52,10 @@ def choose_model(scene: Path, wanted: str | None) -> tuple[Path, list[str]]:
         return best, []
     others = ", ".join(f"{m.relative_to(scene)} {counts[m]}" for m in models if m != best)
     return best, [
-        f"COLMAP: {best.relative_to(scene)} is taken, it has most images ({counts[best]}); left "
-        f"out: {others}"
+        (
+            f"COLMAP: {best.relative_to(scene)} is used, because it has the most images "
+            f"({counts[best]}); left out: {others}"
+        )
     ]
 
 
@@ -70,19 +72,19 @@ def check_scene_folder(scene: Path) -> None:
             return
         if scene.exists():
             raise UserError(
-                "a scene is a folder, not a file", where=scene, todo=f"try {scene.parent}"
+                "the scene must be a folder, not a file", where=scene, todo=f"use {scene.parent}"
             )
         near = _similar_folder(scene)
     except OSError as error:
         raise UserError(
-            "the scene cannot be read",
+            "the scene folder cannot be read",
             where=scene,
             found=str(error),
             todo="check the permissions of the folder",
         ) from error
-    check = "check the path (of a run that goes on: `scene:` in its config.yaml)"
+    check = "check the path (for a resumed run: `scene:` in its config.yaml)"
     hint = f"did you mean {near}?" if near else check
-    raise UserError("the scene folder is not there", where=scene, todo=hint)
+    raise UserError("the scene folder does not exist", where=scene, todo=hint)
 
 
 def _check_not_within_sparse(scene: Path) -> None:
@@ -90,10 +92,10 @@ def _check_not_within_sparse(scene: Path) -> None:
     within = [parent for parent in (place, place.parent) if parent.name == "sparse"]
     if within and not (scene / "images").is_dir():
         raise UserError(
-            "the path leads into a scene",
+            "the path points to a folder inside a scene",
             where=scene,
-            expected="the folder that holds images/ and sparse/",
-            todo=f"try {within[0].parent}",
+            expected="the folder that contains images/ and sparse/",
+            todo=f"use {within[0].parent}",
         )
 
 
@@ -109,14 +111,15 @@ def _similar_folder(scene: Path) -> Path | None:
 def _no_model(scene: Path) -> UserError:
     below = sorted(path.name for path in scene.iterdir())
     return UserError(
-        "the scene has no COLMAP model, which says where each photo was taken from",
+        "the scene has no COLMAP model, which contains the camera poses of the photos",
         where=scene,
         expected="images/ with the photos and sparse/0/ with cameras, images and points3D, as .bin "
         "or .txt",
         found=", ".join(below[:8]) or "an empty folder",
-        todo="name the folder that holds sparse/; of photos alone `crossgrad prepare PHOTOS SCENE` "
-        "makes a scene, and `crossgrad run PHOTOS --prepare` trains on it at once "
-        "(docs/prepare.md); docs/readers.md lists the other formats of poses",
+        todo="name the folder that contains sparse/; for photos without poses, `crossgrad "
+        "prepare PHOTOS SCENE` makes a scene, and `crossgrad run PHOTOS --prepare` "
+        "also trains on it (docs/prepare.md); docs/readers.md lists other pose "
+        "formats",
     )
 
 

@@ -94,7 +94,7 @@ class _Lines:
             where=f"{self.path}, line {self._number}",
             expected=expected,
             found=line.decode("utf-8", errors="replace"),
-            todo="mend the line, or export the model again",
+            todo="correct the line, or export the model again",
         )
 
 
@@ -115,7 +115,7 @@ def _number(word: bytes) -> float:
     Raises:
         ValueError: The word is not a number.
     """
-    if b"_" in word:  # Python's digit groups
+    if b"_" in word:  # Python would accept digit groups with underscores.
         raise ValueError(word)
     return float(word)
 
@@ -148,7 +148,7 @@ def _read_images(lines: _Lines) -> Iterator[tuple[int, ColmapImage]]:
         except (ValueError, IndexError):
             lines.wrong(line, _IMAGE)
         if number in seen:
-            lines.wrong(line, f"an IMAGE_ID that occurs once, not {number} again")
+            lines.wrong(line, f"an IMAGE_ID that occurs only once, unlike {number}")
         seen.add(number)
         points = _read_observations(lines)
         yield number, ColmapImage(name, camera, pose[:4], pose[4:], points)

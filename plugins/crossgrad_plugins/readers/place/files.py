@@ -85,11 +85,11 @@ def _row(path: Path, line: int, words: list[str]) -> Numbers:
 
 def _wrong(path: Path, expected: str, found: str) -> UserError:
     return UserError(
-        "the list of places cannot be read",
+        "the list of photo positions cannot be read",
         where=path,
         expected=expected,
         found=found,
-        todo="mend it (docs/coordinates.md shows its form), or take it away",
+        todo="correct it (docs/coordinates.md describes the format), or remove it",
     )
 
 
@@ -154,10 +154,10 @@ def of_priors(path: Path, names: Collection[str]) -> Measured:
             return measured(found, f"priors in {path.name}")
     except (sqlite3.Error, OSError, UnicodeError) as error:
         raise UserError(
-            "the database of COLMAP cannot be read",
+            "the COLMAP database cannot be read",
             where=path,
             found=str(error),
-            todo="make it again with COLMAP, or take it away",
+            todo="create it again with COLMAP, or remove it",
         ) from error
 
 
@@ -174,7 +174,8 @@ def _positions(
     """
     found = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
     tables = {row[0] for row in islice(found, most)}
-    if not {"images", "pose_priors"} <= tables:  # Views may compute without an end.
+    # A view of the database may compute without an end.
+    if not {"images", "pose_priors"} <= tables:
         return
     there = {row[1] for row in database.execute("PRAGMA table_info(pose_priors)")}
     column = next((name for name in _COLUMNS if name in there), None)

@@ -24,13 +24,13 @@ from crossgrad_core.scene.wording import count
 from crossgrad_plugins.readers._json import Fields, read_object
 from crossgrad_plugins.readers.place.headers import Measured, of_headers
 
-# Most scenes have no place, so modules that compute with places are imported only when needed.
+# Most scenes are not georeferenced, so modules for positions are imported only when needed.
 if TYPE_CHECKING:
     from crossgrad_plugins.georeference.ellipsoid import Place
     from crossgrad_plugins.georeference.frames import Fit
     from crossgrad_plugins.georeference.on_earth import OnEarth
 
-#: Files in the scene's folder: OpenDroneMap's list of photo places, and COLMAP's databases.
+#: Files in the scene's folder: OpenDroneMap's list of photo positions, and COLMAP's databases.
 _LIST: Final = "geo.txt"
 _DATABASES: Final = ("database.db", "colmap/database.db")
 
@@ -60,9 +60,9 @@ def by_gps(scene: Scene, raw: RawScene, named: Path | None = None) -> Scene:
                 notes.append(f"{measured.source}: {count(measured.flat, 'photo')} without altitude")
             elif measured.strangers:
                 names, first = count(len(measured.strangers), "name"), measured.strangers[0]
-                notes.append(f"{measured.source}: {names}, such as {first}, and none of a photo")
+                notes.append(f"{measured.source}: {names} without a photo, such as {first}")
             elif named is not None:
-                notes.append(f"{measured.source}: no photo of the scene is there, or has a place")
+                notes.append(f"{measured.source}: it contains no position for a photo of the scene")
             continue
         found = _fitted(scene, shown, measured)
         if not isinstance(found, str):
@@ -85,8 +85,9 @@ def _sources(
         if is_file(path):
             try:
                 yield _listed(path, names)
-            except UserError as error:  # A run does not need it.
-                notes.append(f"{path.name} tells no places: {error.what} ({error.found})")
+            except UserError as error:
+                # A run does not need the georeference, so the error becomes a note.
+                notes.append(f"{path.name} contains no positions: {error.what} ({error.found})")
     yield of_headers({view.name: _file_of(view, raw) for view in scene.views}, "GPS of the photos")
 
 
@@ -105,7 +106,7 @@ def _file_of(view: View, raw: RawScene) -> Path:
     """Return the photo's own file, because a smaller copy may lack the EXIF header."""
     path = raw.images / view.name
     if isinstance(view.photo, FilePhoto) and not is_file(path):
-        return view.photo.source.path  # Found by another suffix.
+        return view.photo.source.path  # The file was found with another suffix.
     return path
 
 
@@ -114,9 +115,9 @@ def _named(path: Path, names: list[str]) -> Measured:
         return of_headers({name: path / name for name in names}, f"GPS of the photos in {path}")
     if not is_file(path):
         raise UserError(
-            "what tells the places of photos is not there",
+            "the file or folder with the photo positions does not exist",
             where=f"reader.gps={path}",
-            expected="a folder with the photos as they were taken, or a list as geo.txt",
+            expected="a folder with the original photos, or a list such as geo.txt",
             todo="check the path",
         )
     from crossgrad_plugins.readers.place.files import of_list
@@ -182,11 +183,11 @@ def by_code(scene: Scene, code: str) -> Scene:
     origin = place_at(point) if np.isfinite(point).all() else None
     if origin is None:
         raise UserError(
-            "the scene is not where its coordinate system is",
+            "the cameras are outside the area of their coordinate system",
             where=where,
             expected="cameras on Earth",
-            found=f"their middle at {', '.join(f'{value:.6g}' for value in middle)}",
-            todo="check the code, and that the poses are in it",
+            found=f"the centre of the cameras at {', '.join(f'{value:.6g}' for value in middle)}",
+            todo="check the code, and check that the poses use this coordinate system",
         )
     frame = projection.near(origin.to_enu, np.zeros(3), where).inverse
     source = f"its coordinates in {code.upper()}"

@@ -99,13 +99,13 @@ def check_options(name: str, options: Iterable[str]) -> None:
     known: tuple[str, ...] = import_module(ENGINES[name]).OPTIONS
     if unknown := sorted(set(options) - set(known)):
         raise UserError(
-            f"the engine {name} has no such option"
+            f"the engine {name} does not have this option"
             if known
             else f"the engine {name} has no options",
             where="--engine-option",
             expected=listed(known) if known else "",
             found=listed(unknown),
-            todo="leave it out",
+            todo="leave the option out",
         )
 
 

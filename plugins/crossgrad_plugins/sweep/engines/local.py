@@ -69,7 +69,7 @@ class _WorkerPool:
 def _workers(work: Work) -> list[Worker]:
     machine = work.machine
     if machine is None:
-        raise ValueError("this machine is not divided")
+        raise ValueError("the work does not say how to divide this machine among runs")
     return [
         work.worker(str(number), cores, machine.memory)
         for number, cores in enumerate(machine.cores, 1)

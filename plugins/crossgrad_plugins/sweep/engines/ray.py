@@ -111,12 +111,12 @@ def _connected(work: Work) -> ModuleType:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
-            "the Ray cluster does not answer",
+            "the Ray cluster does not respond",
             where="--engine-option address",
             found=" ".join(str(error).split()),
-            todo="start it with `ray start --head`, and name the address that it prints",
+            todo="start it with `ray start --head`, and give the address that it prints",
         ) from error
-    for number, handler in handlers.items():  # Ray installs its own handlers.
+    for number, handler in handlers.items():  # Ray installs its own signal handlers.
         signal.signal(number, handler)
     found: ModuleType = ray
     return found

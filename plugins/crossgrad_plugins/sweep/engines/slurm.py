@@ -151,10 +151,10 @@ def _executor(work: Work, submitit: ModuleType) -> Any:  # noqa: ANN401 - an exe
         executor = submitit.AutoExecutor(folder=work.out / "slurm" / "%j", cluster=cluster)
     except (RuntimeError, ValueError) as error:
         raise UserError(
-            "there is no such cluster here",
+            "no Slurm cluster is available on this machine",
             where="--engine slurm",
             found=" ".join(str(error).split()),
-            todo="start the sweep where sbatch and srun are, or try it out with "
+            todo="start the sweep on a machine with sbatch and srun, or test it with "
             "--engine-option cluster=local",
         ) from error
     sbatch = {f"slurm_{name}": work.options[name] for name in SBATCH if name in work.options}
@@ -179,7 +179,7 @@ def _minutes(work: Work) -> int:
     if text.isdecimal() and int(text):
         return int(text)
     raise UserError(
-        "the time of a job is no number of minutes",
+        "the time limit of a job is not a whole number of minutes",
         where="--engine-option time",
         expected="a whole number above 0",
         found=text,

@@ -33,23 +33,23 @@ HALO = CHANNELS * RADIUS
 # Space for a tile with twice the halo on both sides, and for vectors that start before its end.
 _ROOM = CHANNELS * TILE_COLUMNS + 4 * HALO + CHANNELS * WINDOW + 3 * WIDE
 STRIDE = _ROOM + -_ROOM % WIDE
-#: Ring of s - centre.
+#: Position of the ring of s - centre.
 SUM = 0
-#: Ring of d - centre.
+#: Position of the ring of d - centre.
 DIFFERENCE = SUM + SLOTS * STRIDE
-#: Ring of 1 if a pixel counts, else 0.
+#: Position of the ring of the mask: 1 for a pixel that counts, else 0.
 KEEP = DIFFERENCE + SLOTS * STRIDE
-#: s, s^2, d, d^2 of two rows, summed down the columns.
+#: Position of s, s^2, d, d^2 of two rows, summed down the columns.
 PARTIAL = KEEP + SLOTS * STRIDE
-#: Rings of a, b, c.
+#: Position of the rings of a, b, c.
 BY_MEAN = PARTIAL + 8 * STRIDE
 BY_SUM_VARIANCE = BY_MEAN + SLOTS * STRIDE
 BY_DIFFERENCE_VARIANCE = BY_SUM_VARIANCE + SLOTS * STRIDE
-#: a, b, c of two rows, summed down the columns.
+#: Position of a, b, c of two rows, summed down the columns.
 BACK = BY_DIFFERENCE_VARIANCE + SLOTS * STRIDE
-#: One row of results.
+#: Position of one row of results.
 LINE = BACK + 6 * STRIDE
-#: The centres that are subtracted from s and from d.
+#: Positions of the centres that are subtracted from s and from d.
 CENTRE_SUM = LINE + STRIDE
 CENTRE_DIFFERENCE = CENTRE_SUM + STRIDE
 #: Total number of floats.
@@ -73,7 +73,7 @@ def set_centres(
     """
     top, bottom, left, right = box
     for channel in range(CHANNELS):
-        count = 1e-9  # if nothing is kept, the sums are 0, and so are the centres
+        count = 1e-9  # If no pixel is kept, the sums are 0, and so are the centres.
         sum_x, sum_y = 0.0, 0.0
         for row in range(top, bottom, 8):
             for column in range(left, right):
@@ -92,7 +92,7 @@ def set_centres(
             scratch[CENTRE_DIFFERENCE + j] = centre_difference
 
 
-# Loops run over views from index 0, because LLVM does not vectorise with possibly negative indices.
+# Let loops use views from index 0, because LLVM does not vectorise indices that can be negative.
 
 
 @part
@@ -147,7 +147,7 @@ def load_row(
     begin, end = 0, 0
     if 0 <= row < height:
         begin, end = max(0, -first), min(count, CHANNELS * width - first)
-    # x and y are loaded first, and are then replaced by s and d in place.
+    # Load x and y first; s and d then replace them in place.
     for ring in (s, d, keep):
         fill(scratch, ring, begin, _ZERO)
         fill(scratch, ring + end, count - end, _ZERO)

@@ -136,7 +136,8 @@ def _respond(
         dx = offsets - broadcast_four_wide(rows, row + ROW_CENTRE)
         power = fnma(decay * dx, dx, broadcast_four_wide(rows, row + ROW_EXPONENT))
         touched = power >= load_wide(constants, TOUCHED)
-        # Alpha is undefined (possibly NaN) where a pixel is not touched: select, never multiply.
+        # If a pixel is not touched, alpha is undefined (possibly NaN): select values, never
+        # multiply.
         alpha = smaller(exp2(power, terms), load_wide(constants, LARGEST_ALPHA))
         alpha = where(touched, alpha, zero)
         store(responses, at + _ALPHA, alpha)
@@ -274,7 +275,7 @@ def _gather(
     sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, sum_abs_x, sum_abs_y = _moments(
         patches, records, record, rows, base, constants, absolute, responses
     )
-    # In the order of the layout.
+    # The order is the order of the fields in the layout.
     red, green = halves_added(sum_red), halves_added(sum_green)
     store(partials, partial, sums(sum_1, sum_d, sum_y, sum_dd, sum_yy, sum_dy, red, green))
     partials[partial + SUM_BLUE] = total(halves_added(sum_blue))
@@ -349,7 +350,7 @@ def _gather_analytic(
         if absolute is not None:
             sum_abs_x = sum_abs_x + magnitude(fnma(sine, sv, cosine * su))
             sum_abs_y = sum_abs_y + magnitude(fma(cosine, sv, sine * su))
-    # In the order of the layout.
+    # The order is the order of the fields in the layout.
     eight = sums(
         halves_added(sum_1),
         halves_added(sum_u),
@@ -404,7 +405,7 @@ def _backward(
             prefetch(records, np.intp(entries[min(entry + 2 * BATCH, stop - 1), 0]) * RECORD)
             prefetch_write(partials, np.intp(entries[entry, 1]) * PARTIAL)
             batch[filled] = entry
-            # Branch-free: an entry without a mask is overwritten by the next entry.
+            # Branch-free code: the next entry overwrites an entry without a mask.
             filled += np.intp(masks[entry] != 0)
             entry += 1
         for k in range(filled):
@@ -425,7 +426,7 @@ def _backward(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,
                     partials, partial,
                 )  # fmt: skip
-            # Two variants: most Gaussians are never capped, and their variant has less work.
+            # There are two variants, because most Gaussians are never capped and need less work.
             elif records[record + LOG_OPACITY] <= constants[CAPPED]:
                 _gather(
                     patches, records, record, rows, base, state, constants, v_depth, absolute,

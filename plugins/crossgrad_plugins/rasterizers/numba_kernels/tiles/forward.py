@@ -77,8 +77,8 @@ from crossgrad_plugins.rasterizers.numba_kernels.tiles.pixel_states import (
     row_of,
 )
 
-#: Number of entries whose reach is computed before any of them is blended. This hides the latency
-#: of their memory reads and row extents. Finished patches are detected once per batch.
+#: Number of entries whose reach is computed before any of them is blended, which hides the latency
+#: of memory reads and row extents. Finished patches are detected once per batch.
 BATCH = 16
 
 # Side of the squares in which limits are counted, pixels; and the patches of the first column of
@@ -208,7 +208,8 @@ def _blend(
         else:
             alpha, left = _coverage(left, patch, offsets, rows, row, records, record, constants)
             touched = alpha >= least
-        # Alpha is undefined (possibly NaN) where a pixel is not touched: select, never multiply.
+        # If a pixel is not touched, alpha is undefined (possibly NaN): select values, never
+        # multiply.
         alpha = where(touched, smaller(alpha, most), zero)
         before = load_wide(state, at + _T)
         weight = alpha * before
@@ -361,7 +362,7 @@ def _composite(
                 reached &= _within(limits, np.intp(entries[k, 0]), left)
             masks[k] = np.uint64(reached)
             batch[filled] = k
-            # Branch-free: an entry that reaches nothing is overwritten by the next entry.
+            # Branch-free code: the next entry overwrites an entry that reaches nothing.
             filled += np.intp(reached != np.uint64(0))
         for k in range(filled):
             record = np.intp(entries[batch[k], 0]) * RECORD

@@ -33,11 +33,11 @@ from crossgrad_plugins.rasterizers.numba_kernels.layout import (
 )
 
 _PLACES = [(x, y) for x in range(SIDE) for y in range(SIDE)]
-# From two rows of eight pixels and two more rows: the left patch and the right patch.
+# Arranges two rows of eight pixels and two more rows as the left patch and the right patch.
 _left_patch, _right_patch = (
     picking([y * LANES + start + x for x, y in _PLACES]) for start in (0, SIDE)
 )
-# From the left and the right patch: the first two and the last two rows of pixels.
+# Arranges the left and the right patch as the first two and the last two rows of pixels.
 _first_rows, _last_rows = (
     picking([x // SIDE * WIDE + x % SIDE * SIDE + y for y in rows for x in range(LANES)])
     for rows in ((0, 1), (2, 3))
@@ -196,7 +196,7 @@ def start_tile(
         state[:] = np.float32(0.0)
         for patch in range(PATCHES):
             store(state, patch * STATE + PASSED, splat_wide(np.float32(-1.0)))
-    # Pairs of complete patches first, then the remaining pixels one by one.
+    # Process pairs of complete patches first, then the remaining pixels one by one.
     whole_high, whole_wide = high - high % SIDE, wide - wide % LANES
     for y in range(0, whole_high, SIDE):
         for x in range(0, whole_wide, LANES):
