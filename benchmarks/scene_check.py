@@ -187,9 +187,9 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
     warned = sum(not each.found for each in right)
     yield ""
     yield (
-        f"Kinds and strengths that cost {FALL:g} dB or more in the mean: {found} of {len(hard)} "
-        f"scenes found. Trained scenes that fall by {FALL:g} dB or more: {found_fallen} of "
-        f"{len(fallen)} found. Right scenes: {warned} of {len(right)} got a warning."
+        f"Kinds and strengths with a mean fall of {FALL:g} dB or more: {found} of {len(hard)} "
+        f"scenes found. Trained scenes with a fall of {FALL:g} dB or more: {found_fallen} of "
+        f"{len(fallen)} found. Correct scenes: {warned} of {len(right)} got a warning."
     )
 
 

@@ -44,7 +44,7 @@ PAIRS = {
     ),
 }
 #: Title of each grid of rates -> ending of its arms' names.
-RATES = {"each at its best rates": ", best", "at the published rates": ""}
+RATES = {"at the best rates": ", best", "at the published rates": ""}
 
 
 def differences(runs: Runs, ending: str) -> Iterator[str]:

@@ -61,7 +61,7 @@ def test_both_experiments_are_stated_with_equal_draws(name):
 
 @pytest.mark.parametrize("name", ["README.md", "crossgrad plan"])
 def test_the_other_experiment_at_equal_seconds_is_stated(name):
-    best = TWO_VIEWS.partition("## Each at its best rates")[2]
+    best = TWO_VIEWS.partition("## At the best rates")[2]
     assert of_row("| seconds | overall |", best) in found_in(TEXTS[name]())
 
 
