@@ -50,7 +50,7 @@ def trained(
         why = _failure(list(map(str, command)), examples, limit)
     reached = [_stop(folder, step) for step in stops if _told(folder, step).is_file()]
     if not why and len(reached) < len(stops):
-        why = f"it wrote no figures after {stops[-1]} steps"
+        why = f"gsplat's trainer wrote no figures after {stops[-1]} steps"
     return reached, why
 
 

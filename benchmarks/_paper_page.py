@@ -16,7 +16,7 @@ from crossgrad_plugins.compare.run import Run
 
 #: Arms whose runs contain probes of the gradients.
 WATCHED = ("one view, 2x stretched", "symmetric")
-#: What is equal in a comparison of two views with one view -> the two arms.
+#: Equal quantity of a comparison -> the arm with two views and the arm with one view.
 EQUAL = {
     "equal steps": ("two random views", "one view, 1x"),
     "equal views": ("two random views", "one view, 2x stretched"),
@@ -26,7 +26,7 @@ EQUAL = {
         "one view, 2x stretched, published rates",
     ),
 }
-#: Differences of the paper below this value, in dB, count as none.
+#: Differences in the paper below this value, in dB, count as equal.
 _SAME = 0.1
 _HEAD = "| {} | the paper | command | ours | verdict |"
 
@@ -194,7 +194,7 @@ def _expected(tables: Tables, table: Table, method: str) -> Expected:
 
 
 def _differences(tables: Tables, table: Table, method: str) -> dict[str, float]:
-    """Return scene -> PSNR of a method minus the reference, or the figures of a table of gains."""
+    """Return scene -> PSNR minus the reference's PSNR. A table of gains gives its own figures."""
     gains = values(tables, table.id, method, "PSNR_gain")
     if gains or table.reference is None:
         return gains

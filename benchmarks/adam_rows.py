@@ -1,4 +1,4 @@
-"""Median milliseconds of a sparse Adam step: with the rows that are drawn, or with all rows.
+"""Time an Adam step of the drawn rows, compared with a step of all rows.
 
     python benchmarks/adam_rows.py [--rows N] [--reps N]
 
@@ -22,7 +22,7 @@ from crossgrad_core.numerics.threads import configure_threads
 from crossgrad_core.training.adam import late
 from crossgrad_core.training.adam.adam import counted
 
-#: Rows that are drawn together, number of alternating choices of rows, and shares.
+#: Number of adjacent rows that are drawn together, number of alternating choices, and shares.
 RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 

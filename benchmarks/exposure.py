@@ -1,4 +1,4 @@
-"""Differences in exposure between the photos of scenes, by SfM tracks, for docs/exposure.md.
+"""Measure differences in exposure between photos from SfM tracks, for docs/exposure.md.
 
     python benchmarks/exposure.py SCENE [SCENE ...]
 
@@ -21,7 +21,7 @@ HEADER = (
 
 
 def row(name: str, told: int, gains: TrackGains, seconds: float) -> str:
-    """Return the line of a scene. `told` photos have an EXIF header with their exposure."""
+    """Return the line of a scene. `told` photos have an exposure in their EXIF header."""
     known = gains.gains[gains.known]
     ends = f"{known.min():+.2f} .. {known.max():+.2f}" if len(known) else "-"
     auto = "gain" if gains.differ else "none"
