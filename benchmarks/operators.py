@@ -1,4 +1,4 @@
-"""Cost of the operators, compared with plain additions of the same gradients.
+"""Measure the cost of operators, compared with plain additions of the same gradients.
 
 One JSON line per operator:
 

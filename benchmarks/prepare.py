@@ -1,4 +1,4 @@
-"""Duration of `crossgrad prepare`, number of registered photos, and accuracy, in a table.
+"""Measure time, registered photos and accuracy of `crossgrad prepare`, in a table.
 
     python benchmarks/prepare.py PHOTOS SCENE [--truth MODEL ...] [-- OPTION ...]
 
@@ -91,7 +91,7 @@ def rows(scene: Path, truth: Poses) -> list[str]:
                       f"{np.median(angles):.3f}", f"{(distances <= CLOSE).sum()}"]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     if truth:
-        lines.append(f"\nsize of the scene: {size:.1f} units of the truth")
+        lines.append(f"\nsize of the scene: {size:.1f} units of the true model")
     return lines
 
 

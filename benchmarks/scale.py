@@ -1,4 +1,4 @@
-"""Step time and peak memory by number of Gaussians, image size, K and threads: table and figure.
+"""Measure step time and peak memory by number of Gaussians, image size, K and threads.
 
     python benchmarks/scale.py [--full] [--only TEXT] [--reps N] [--out DIR]
 
@@ -218,7 +218,7 @@ def setup_of(cell: Cell, **options: object) -> "Setup":
             "max_gaussians": cell.gaussians,
             "growth": "unbounded",
             "schedule_unit": "steps",
-            "rules": {"dropout": False},  # Each photo sees all that is in front of it.
+            "rules": {"dropout": False},  # Each photo sees all Gaussians in front of it.
             **options,
         }
     )
@@ -332,7 +332,9 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="the whole table: half an hour")
+    parser.add_argument(
+        "--full", action="store_true", help="measure the whole table, which takes half an hour"
+    )
     parser.add_argument("--only", default="", help="only groups with this in their title")
     parser.add_argument("--reps", type=int, default=15)
     parser.add_argument("--out", type=Path, help="folder for scale.json and scale.svg")

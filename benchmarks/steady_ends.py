@@ -1,4 +1,4 @@
-"""A table of the jitter of the test PSNR at the end of runs, for finished runs.
+"""Print the jitter of the test PSNR at the end of finished runs, as a table.
 
     crossgrad sweep benchmarks/grids/steady_ends.yaml --scene SCENE
     python benchmarks/steady_ends.py runs/sweeps/steady_ends

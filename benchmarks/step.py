@@ -1,4 +1,4 @@
-"""Median seconds of one whole training step on a fixed case, as one JSON line.
+"""Measure the median seconds of a whole training step on a fixed case, as one JSON line.
 
 A step has the same parts as in a run: decode with SH degree 3, render, loss against a random photo,
 backward pass, and one Adam step. The Adam step of positions is along the axes of their Gaussians.

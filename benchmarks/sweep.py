@@ -1,4 +1,4 @@
-"""Throughput of a sweep with several workers, compared with the same runs in sequence.
+"""Compare the throughput of a sweep with several workers with the same runs in sequence.
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
@@ -51,7 +51,7 @@ def by_hand(arguments: argparse.Namespace, folder: Path, count: int) -> float:
     ) for number in range(count)]  # fmt: skip
     for run in runs:
         if run.wait():
-            raise SystemExit("a run failed; `crossgrad run` says why")
+            raise SystemExit("a run failed; start it with `crossgrad run` to see the reason")
     return time.monotonic() - start
 
 
