@@ -1,4 +1,4 @@
-"""Correct scenes in memory, and changes that make them contradict themselves."""
+"""Correct scenes in memory, and changes after which a scene contradicts itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class Model:
         translations: [V, 3].
         calibrations: [V, 4] fx, fy, cx, cy.
         photos: [V] of [H, W, 3].
-        seen: [V] rows of points.
+        seen: [V] indices of the points that each view observes.
         points: [P, 3].
         colors: [P, 3] uint8.
     """

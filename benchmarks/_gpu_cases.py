@@ -16,7 +16,7 @@ OPERATORS = ("sum", "mean", "pcgrad", "cagrad", "upgrad", "symmetric")
 SIZES, PIXELS = (100_000, 1_000_000, 3_000_000), 1.0
 #: Lengths of runs with the default settings of `crossgrad run`.
 USUAL = (1_000, 7_000, 30_000)
-#: Steps of a long run that have a row, in addition to the last step.
+#: Steps of a long run that get a row in the table, in addition to the last step.
 STOPS = (7_000, 15_000)
 
 

@@ -3,7 +3,8 @@
     crossgrad sweep benchmarks/grids/backbones.yaml
     python benchmarks/arms.py runs/sweeps/backbones > tables.md
 
-Values are means over seeds, with standard deviations if there are several seeds. Imports no torch.
+Values are means over seeds, with standard deviations if there are several seeds. This script does
+not import torch.
 """
 
 import argparse

@@ -53,7 +53,7 @@ def on_one_view(setup: Setup, state: TrainState) -> Setup:
 
 
 def drawn(setup: Setup, state: TrainState) -> Gaussians:
-    """Return the Gaussians of the single view that touch a pixel."""
+    """Return the Gaussians that touch a pixel of the single view."""
     camera = setup.train_views[0].camera
     with torch.no_grad():
         gaussians = setup.backbone.decode(
@@ -65,7 +65,7 @@ def drawn(setup: Setup, state: TrainState) -> Gaussians:
 
 
 def as_vanilla(setup: Setup, gaussians: Gaussians) -> TrainState:
-    """Return a vanilla state of these Gaussians."""
+    """Return a vanilla training state that contains these Gaussians."""
     if gaussians.colors is not None:
         dc = ((gaussians.colors - 0.5) / SH_C0)[:, None, :]
         gaussians = replace(gaussians, colors=None, sh_dc=dc, sh_rest=None)

@@ -48,7 +48,7 @@ class Band:
 
 
 def bands_of(capture: Capture, folders: Sequence[str], count: int) -> list[Band]:
-    """Return each folder's views in `count` bands of equal numbers, near bands first."""
+    """Return each folder's views in `count` bands with equal numbers of views, near bands first."""
     found = capture.scene
     unit = found.similarity.scale
     bands = []

@@ -3,9 +3,9 @@
     python benchmarks/few_photos.py OUT --photos 8 14 --draw 1 SCENES/ochota_kap_hybrid_gain ...
     crossgrad sweep benchmarks/grids/few_photos.yaml --threads 1 --scene OUT/... --scene SCENE
 
-Makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of training
-photos drawn at random, and a list of the scene's held-out photos. The program prints the median
-number of training photos in which a point is visible.
+The program makes OUT/SCENE-8 and so on. Each folder contains links to photos and cameras, a list of
+training photos drawn at random, and a list of the scene's held-out photos. The program prints the
+median number of training photos in which a point is visible.
 """
 
 import argparse

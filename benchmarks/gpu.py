@@ -62,7 +62,8 @@ class Short:
     Args:
         scene: SCENE.
         kept: The file, with one JSON line per case.
-        place: Scene, GPU and commit of the figures. Figures with another place are not used.
+        place: Scene, GPU and commit of the figures. Figures of another scene, GPU or commit are not
+            used.
     """
 
     def __init__(self, scene: Path, kept: Path, place: str) -> None:
@@ -157,7 +158,7 @@ def finished(folder: Path) -> Path | None:
 
 
 def measured(case: Case, scene: Path, out: Path) -> tuple[Path | None, str]:
-    """Return the folder of the case's finished run, trained now if missing, or None and why."""
+    """Train the case's run if it is missing. Return its folder, or None and the reason."""
     folder = out / "runs" / case.name
     if (run := finished(folder)) is not None:
         return run, ""

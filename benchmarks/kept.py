@@ -22,7 +22,7 @@ from crossgrad_core.system.text_files import csv_bytes
 
 #: The table of a sweep, which assigns each run to a configuration.
 TABLE = "runs.csv"
-#: The rows of that table, the first row being its header.
+#: Rows of this table. The first row is the header.
 Rows: TypeAlias = Sequence[Sequence[str]]
 
 #: Files of a run that are packed. The second line is written by the observer `diagnostics`, and

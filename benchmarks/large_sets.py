@@ -11,9 +11,10 @@ one process works, the other process is stopped. The first process trains on all
 process trains on only the 28 photos, which are in its memory before it begins. Both measure wall
 time, including decoding.
 
-Prints the seconds to the first step, the seconds per step in each pass over the photos, their ratio
-to the other process in the same turns, and resident memory. `--distorted` uses a camera with lens
-distortion. `--warm` starts with the photos that an earlier run of the same `--folder` left on disk.
+The program prints the seconds to the first step, the seconds per step in each pass over the photos,
+and resident memory. It also prints the ratio of seconds to the other process in the same turns.
+`--distorted` uses a camera with lens distortion. `--warm` starts with the photos that an earlier
+run of the same `--folder` left on disk.
 """
 
 import argparse
@@ -33,7 +34,7 @@ from _machine import code, facts
 
 #: Enlargement of the bundled photos.
 SCALE = 10
-#: Standard deviation of the grain, grey levels, and quality of the JPEG files: about 4 MB each.
+#: Standard deviation of the grain in grey levels, and JPEG quality. A file has about 4 MB.
 GRAIN, QUALITY = 4.0, 92
 BUNDLED = Path(__file__).parents[1] / "examples" / "scenes" / "boruszyn"
 

@@ -2,11 +2,11 @@
 
     python benchmarks/prepare_pairs.py PHOTOS SCENE --truth MODEL [--truth MODEL ...] [--map]
 
-For each two folders, the table shows the number of pairs with verified matches, by the number of
-matches, and the number of wrong pairs. A pair is wrong if fewer than half of its matches are within
-four pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only
-the correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any
-selection of pairs.
+For each pair of folders, the table counts the photo pairs with verified matches and the wrong photo
+pairs, by number of matches. A pair is wrong if fewer than half of its matches are within four
+pixels of the epipolar lines of the true poses. With `--map`, cameras are found again with only the
+correct pairs, at COLMAP's thresholds and at half of them. This is an upper bound for any selection
+of pairs.
 """
 
 import argparse

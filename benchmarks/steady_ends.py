@@ -4,7 +4,7 @@
     python benchmarks/steady_ends.py runs/sweeps/steady_ends
 
 For each run, a straight line is fitted to the PSNR of the evaluations in the last tenth. The
-jitter is the deviation from this line. Imports no torch.
+jitter is the deviation from this line. This script does not import torch.
 """
 
 import argparse

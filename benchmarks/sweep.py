@@ -4,8 +4,8 @@
 
 Times three sweeps of the same runs: in sequence with one thread, in sequence with as many threads
 as there are workers, and with all workers, each with one thread. For comparison, it also times as
-many simultaneous `crossgrad run` processes, started by hand, and a single one. The figures are only
-meaningful on a machine without other work.
+many simultaneous `crossgrad run` processes, started by hand, and a single process. The figures are
+only meaningful on a machine without other work.
 """
 
 import argparse

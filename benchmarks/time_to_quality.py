@@ -175,7 +175,7 @@ def table(given: argparse.Namespace) -> None:
     old: dict[tuple[str, str], dict[int, Row]] = {}
     for (scene, lengths), codes in cases:
         if "old" in codes:
-            # A code that ran alone is compared with the first runs of the same length as `old`.
+            # If a code ran without `old`, compare it with the first runs of `old` of equal length.
             old[scene, lengths] = codes["old"]
             first, _, unit = lengths.partition(" ")
             alone = " ".join([first.split(":")[0], *([unit] if unit else [])])

@@ -202,7 +202,7 @@ def _vector(row: Array) -> Vector:
 
 
 def walk(rng: np.random.Generator, town: Town, count: int, width: int) -> list[View]:
-    """Return street photos along or across the road, with nothing closer than 4 m in the middle."""
+    """Return street photos along or across the road, without objects within 4 m in the middle."""
     views: list[View] = []
     while len(views) < count:
         line = rng.integers(-1, 2) * town.pitch + rng.uniform(-0.4, 0.4) * town.road
@@ -261,7 +261,7 @@ def _tracks(
     points: Array,
     source: Integers,
 ) -> list[list[int]]:
-    """Return for each point its photos, starting with the photo from which it was taken."""
+    """Return the photos of each point, beginning with the photo from which the point was taken."""
     sees = np.array([_sees(v, d, points) for v, d in zip(views, depths, strict=True)])
     kinds = np.array([view.kind for view in views])
     tracks = []

@@ -7,7 +7,7 @@
 
 Each arm occurs twice: at its own best factor of the learning rates on each scene, and at the
 published rates. Differences are paired by scene and seed. Verdicts are computed as in
-`crossgrad compare` and corrected over each table. Imports no torch.
+`crossgrad compare` and corrected over each table. This script does not import torch.
 """
 
 import argparse

@@ -117,7 +117,7 @@ class Projection:
 
     @cached_property
     def reach(self) -> tuple[Array, Array]:
-        """[2] and [2], the least and the greatest x / z and y / z for the Jacobian."""
+        """[2] and [2]: the smallest and the largest x / z and y / z that the Jacobian uses."""
         focal, center = np.diag(self.k)[:2], self.k[:2, 2]
         low, high = -center / focal, (np.array(self.size) - center) / focal
         margin = (MARGIN - 1) / 2 * (high - low)
