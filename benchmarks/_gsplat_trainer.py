@@ -32,7 +32,7 @@ class Stop:
 def trained(
     examples: Path, scene: Path, runs: Path, stops: Sequence[int], limit: float | None
 ) -> tuple[list[Stop], str]:
-    """Train up to the last stop if it is missing. Return the reached stops and a failure text.
+    """Train to the last stop, unless its figures exist. Return the reached stops and a failure.
 
     Args:
         examples: The folder of gsplat's examples.

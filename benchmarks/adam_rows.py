@@ -27,7 +27,7 @@ RUN, CHOICES, SHARES = 64, 8, (0.1, 0.2, 0.3, 0.5, 0.7)
 
 
 def milliseconds(count: int, share: float, most: float, reps: int) -> float:
-    """Return the median milliseconds of a step with the flush, for [count, 15, 3] elements."""
+    """Return the median milliseconds of a step including the flush, for [count, 15, 3] elements."""
     late.MOST_ROWS = most  # type: ignore[misc] - both ways are measured
     rng = np.random.default_rng(0)
     param, state, rows_late = torch.randn(count, 15, 3), AdamState(), late.Late()

@@ -1,4 +1,4 @@
-"""Compare the throughput of a sweep with several workers with the same runs in sequence.
+"""Measure the throughput of a sweep with several workers, relative to the same runs in sequence.
 
     python benchmarks/sweep.py [SCENE] [--runs 6] [--steps 400] [--max-size 400] [--workers 2]
 
