@@ -88,7 +88,7 @@ def _opening(claims: Claims, results: Results, outcomes: Mapping[Outcome, int]) 
         "[`crossgrad compare`](../compare.md).",
         "- `plain` is the difference in plain PSNR. If the exposure of a scene is uneven, plain "
         "PSNR mostly depends on the guessed exposure of held-out photos. Different arms "
-        "then have similar values.",
+        "then have a similar plain PSNR.",
         "- A claim that two arms are equal holds if the 90 % interval lies within the margin of "
         "0.1 dB.",
         "- A claim that one arm is better holds if the 95 % interval excludes zero.",
@@ -372,8 +372,8 @@ def _trajectories(results: Results) -> Iterator[str]:
         "Each row is one probe. A probe measures gradients at frozen parameters.",
         "",
         "- Conflict rates and ratios are means over seeds.",
-        "- Variances and their 95 % intervals are from the first seed. The probed views count as a "
-        "sample.",
+        "- Variances and their 95 % intervals are from the first seed. The intervals treat the "
+        "probed views as a sample.",
         "- The first conflict rate joins all blocks into one vector. The rate in brackets is the "
         "mean over single blocks.",
         "- A negative sigma_b^2 is an estimate that does not clearly differ from 0.",
