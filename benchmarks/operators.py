@@ -183,7 +183,7 @@ def _context(gradients: SeparateGradients) -> AggregateContext:
 
 
 def _arithmetic(operator: Operator, views: int) -> float | None:
-    """Return microseconds of `transform` for six blocks, or None for other than matrix operators."""
+    """Return microseconds of `transform` for six blocks, or None for other operators."""
     if not isinstance(operator, MatrixOperator):
         return None
     context = _context(_apart(_gradients(views, 6_000)))
